@@ -157,7 +157,7 @@ class Emulation:
         return ThreadImager(setup)
 
     async def open(self) -> None:
-        """Open truth and links and switch the device on; its time stands still until `begin`.
+        """Open truth and links and switch the device on; its time is stopped until `begin`.
 
         Raises
         ------
@@ -261,7 +261,7 @@ class Emulation:
             head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
 
     def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
-        """Return the truth of this head: at the mount of a configuration, or else that of its profile."""
+        """Return the truth of this head, at the mount of a configuration, else of its profile."""
         mount = config.mount or self.profile.truth.mount
         return mounted(truth, None if mount is None else mount.build())
 

@@ -97,7 +97,7 @@ class Head:
         return self._faults
 
     def open_logs(self, options: RunOptions) -> None:
-        """Open the truth log, and that of a recording."""
+        """Open the truth log, and the recording's."""
         wall_times = self.emulation.clock.speed > 0.0
         if options.truth_log is not None:
             path = path_of_head(options.truth_log, self.number)
@@ -237,7 +237,7 @@ class Run:
         return line
 
     async def close(self) -> None:
-        """Close control channel, console, emulations and logs, whatever fails to close."""
+        """Close control channel, console, emulations and logs, even if one fails to close."""
         closers: list[Callable[[], object]] = [*reversed(self._closers)]
         self._closers.clear()
         closers += [head.emulation.close for head in reversed(self.heads)]
@@ -263,7 +263,7 @@ class Run:
             await self._open_server(control, clients)
 
     def _open_recorders(self, path: Path, clients: Sequence[ObcClient]) -> None:
-        """Begin to record each head to an MCAP file of its own."""
+        """Start recording each head to its own MCAP file."""
         from starhil.emulator.console.recorder import McapRecorder
 
         for head, client in zip(self.heads, clients, strict=True):

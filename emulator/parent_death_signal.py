@@ -1,4 +1,4 @@
-"""Ends a child process when its parent ends, whatever the cause."""
+"""Ends a child process when its parent ends for any reason."""
 
 from __future__ import annotations
 

@@ -75,9 +75,9 @@ class CameraConfig(Strict):
     fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
     """Field of view from edge to edge along a row; 42 if neither this nor `focal_px` is given."""
     focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
-    """Focal length along x and y, in place of `fov_deg`."""
+    """Focal length along x and y, instead of `fov_deg`."""
     centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
-    """Where the optical axis meets the pixel array; the middle if left out."""
+    """Where the optical axis meets the pixel array; default: the middle."""
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
     """Projection of the lens."""
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
@@ -154,7 +154,7 @@ class RadiationConfig(Strict):
 
 
 class ImagesConfig(Strict):
-    """Images from elsewhere in place of rendered ones; `[camera]` is then the camera that takes them."""
+    """Source of images instead of rendered ones; `[camera]` then describes the camera that takes them."""
 
     folder: str = ""
     """Folder of PNG, TIFF or JPEG images, taken in the order of their names; relative to the profile's folder."""
@@ -192,7 +192,7 @@ class TimingConfig(Strict):
     readout_s: FrameSeconds = 0.020
     """Read-out of the detector."""
     detect_s: FrameSeconds = 0.040
-    """Detection, whatever the number of stars."""
+    """Detection, for any number of stars."""
     detect_per_star_s: Annotated[float, Field(ge=0.0, le=0.01)] = 0.00005
     """Detection, in addition for each star."""
     identify_lost_s: FrameSeconds = 0.020
@@ -207,7 +207,7 @@ class SerialConfig(Strict):
     port: str = "auto"
     """`auto` (a pty), a device path, `listen://HOST:PORT`, or `off`."""
     dialect: Literal["a", "b", "c"] = "b"
-    """Form of the replies: `a` as to a CubeComputer, `b` stand-alone node, `c` generation 2."""
+    """Format of replies: `a` to a CubeComputer, `b` stand-alone node, `c` generation 2."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
@@ -253,7 +253,7 @@ class Profile(Strict):
     name: str = "ideal"
     """Name in messages and on the control channel."""
     unit: str = DEFAULT_UNIT
-    """Interface definition: the name of a unit that ships with starhil, or a folder relative to the profile."""
+    """Interface definition: name of a bundled unit, or a folder relative to the profile."""
     run: RunConfig = RunConfig()
     """Seed, clock, algorithm, files."""
     catalog: CatalogConfig = CatalogConfig()
@@ -287,7 +287,7 @@ class Profile(Strict):
     calibration: dict[str, Any] = Field(default_factory=dict)
     """Notes that `starhil calibrate` writes for people; not used."""
     health: dict[str, float] = Field(default_factory=dict)
-    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit; 0 unless given."""
+    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit; default: 0."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Defaults of device parameters, named as in the interface definition."""
 
@@ -310,7 +310,7 @@ class Profile(Strict):
 
     @property
     def unit_source(self) -> str:
-        """The unit for `load_unit`: a name that ships, else a folder relative to the profile's file."""
+        """The unit for `load_unit`: a bundled unit's name, else a folder relative to the profile's file."""
         if self.unit in bundled_units():
             return self.unit
         return str(self.folder / Path(self.unit).expanduser())

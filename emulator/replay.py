@@ -157,7 +157,7 @@ class _PlayedTransport(Transport[Item]):
         return True
 
     async def drain(self) -> None:
-        """Nothing ever waits."""
+        """Nothing is ever pending."""
 
     async def close(self) -> None:
         """Nothing is open."""

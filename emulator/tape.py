@@ -2,7 +2,7 @@
 
 Between two entries the model computes alone. An entry is what makes it compute: input on a link, an event
 that is due, a reply of the pipeline, a message of a feed, a command on the control channel, a write that has
-ended. While an entry is processed the clock stands still, so that a run on the real clock can be repeated on
+ended. While an entry is processed the clock stops, so that a run on the real clock can be repeated on
 the stepped clock to the byte.
 
 A recording is a folder: `run.json` (profile and version), `events.jsonl` (entries and output, one JSON
@@ -35,7 +35,7 @@ STATE_FOLDER: Final = "state"
 
 
 class Tape(Protocol):
-    """What stands between an emulation and the outside: a recorder, or a player."""
+    """Interface between an emulation and the outside: a recorder, or a player."""
 
     @property
     def plays(self) -> bool:
@@ -71,7 +71,7 @@ class Tape(Protocol):
 
 
 class LatchedClock:
-    """A clock that stands still while an entry is processed.
+    """A clock that stops while an entry is processed.
 
     Parameters
     ----------

@@ -86,7 +86,7 @@ class TruthLog:
     """A CSV file with one row per exposure, written without buffering and never in part.
 
     One emulator at a time writes to a file. When writing fails, as on a full disk, a warning is logged,
-    the file ends with the last complete row and the run goes on.
+    the file ends with the last complete row and the run continues.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ class TruthLog:
             self._write_row([_format_cell(name, value) for name, value in row.items()])
         except OSError as error:
             log.warning(
-                "truth log %s: cannot be written (%s); it ends before frame %d, the run goes on",
+                "truth log %s: cannot be written (%s); it ends before frame %d; the run continues",
                 self._path,
                 error.strerror,
                 measurement.counter,

@@ -203,7 +203,7 @@ class AsyncObcClient:
     async def wait_unsolicited(
         self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
     ) -> Reading:
-        """Return the next unsolicited telemetry of a row; that of other rows is dropped.
+        """Return the next unsolicited telemetry of a row; other rows are dropped.
 
         Parameters
         ----------

@@ -1,7 +1,7 @@
 """Quaternions (x, y, z, w) from ICRS to the sensor frame, and attitude errors, in plain Python.
 
 The bench has its own quaternion algebra, to share no numerics with the unit under test.
-Conventions (roll, sensor axes, scalar last) are those of the interface definition's attitude rows.
+Conventions (roll, sensor axes, scalar last) are as in the interface definition's attitude rows.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from starhil.protocol.transports import open_can
 HOST: Final = 1
 DEVICE: Final = 4
 TALKER: Final = 0x20
-"""CAN address of the other traffic's sender; it speaks to LISTENER, an address nobody has."""
+"""CAN address of the other traffic's sender; it sends to LISTENER, an unused address."""
 LISTENER: Final = 0x21
 ECHO: Final = 0x22
 """CAN address at which the traffic process echoes requests, for the latency of the machine."""

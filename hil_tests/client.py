@@ -93,7 +93,7 @@ class ObcClient:
         """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel.
 
         On CAN it is a CANopen master if that is all that the unit has there.
-        `unit` is the name of a unit that ships with starhil, a folder, or a definition.
+        `unit` is the name of a bundled unit, a folder, or a definition.
         """
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")

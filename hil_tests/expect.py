@@ -63,7 +63,7 @@ def operand(value: Any, reader: TableReader, key: str, known: frozenset[str]) ->
 
 
 def resolve(value: Operand, variables: Mapping[str, Value]) -> Value:
-    """Return the value that an operand stands for at this moment."""
+    """Return the current value of an operand."""
     return variables[value.name] if isinstance(value, Variable) else value
 
 

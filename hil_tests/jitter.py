@@ -20,7 +20,7 @@ from starhil.protocol.transports import CanTransport, open_can
 
 HOST: Final = 1
 WARM_UP: Final = 3
-"""Messages left out at the start."""
+"""Number of messages ignored at the start."""
 ANSWER_S: Final = 2.0
 
 SYNC: Final = 0x080

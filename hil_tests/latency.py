@@ -2,7 +2,7 @@
 
 An emulator process is asked for telemetry over its pty and over a CAN hub, one request at a time,
 after random pauses. In between, the same bytes go to a process that only echoes them over a pty:
-its latency is that of the machine, with which the emulator's latency is compared.
+its latency is due to the machine alone; the emulator's latency is compared with it.
 """
 
 from __future__ import annotations

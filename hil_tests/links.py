@@ -138,7 +138,7 @@ class SerialHostLink(HostLink[bytes]):
     spec : str
         `/dev/…` or `socket://host:port`.
     dialect : str, optional
-        Form of the replies, for a unit that has several: `b` unless given.
+        Format of replies, if the unit has several; default: `b`.
     baud : int
         Bit rate of a real line.
     log : WireLog, optional

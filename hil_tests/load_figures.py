@@ -42,7 +42,7 @@ class CanLoad:
     """Refusals, replies with a wrong length or value, and framing faults."""
     latency: Spread
     machine: Spread
-    """Latency of an echo process on the same bus, which is that of the machine."""
+    """Latency of an echo process on the same bus: the machine's share."""
 
     @property
     def good(self) -> bool:

@@ -41,7 +41,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "--starhil-unit",
         default=None,
         metavar="UNIT",
-        help="name or folder of the unit's definition (default: that of the profile, or cubestar)",
+        help="name or folder of the unit's definition (default: the profile's, or cubestar)",
     )
     group.addoption("--starhil-profile", metavar="PROFILE", help="profile of the emulator")
     group.addoption(

@@ -20,7 +20,7 @@ PASSED: Final = "passed"
 FAILED: Final = "failed"
 SKIPPED: Final = "skipped"
 NOT_RUN: Final = "not run"
-"""Of a case that a run did not come to; a JUnit file has it as skipped."""
+"""Status of a case that was not run; skipped in a JUnit file."""
 SHOWN_VALUES: Final = 6
 """Values of a row that the one line of a step shows."""
 

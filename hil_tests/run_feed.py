@@ -1,4 +1,4 @@
-"""Reports the results of a run to the console of a running emulator, while the run goes on."""
+"""Reports the results of a run to the console of a running emulator, as they arrive."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class RunFeed:
         try:
             self._waiting.put_nowait({"event": "result", "result": content})
         except queue.Full:
-            log.debug("console: a result was left out")
+            log.debug("console: a result was dropped")
 
     def close(self) -> None:
         """Report the end, once everything before it was sent."""
@@ -96,7 +96,7 @@ class RunFeed:
             self._waiting.put({"event": "end"}, timeout=ENDED_WITHIN_S)
             self._waiting.put(None, timeout=ENDED_WITHIN_S)
         except queue.Full:
-            log.debug("console: the end of the run was left out")
+            log.debug("console: the end of the run was dropped")
         self._thread.join(ENDED_WITHIN_S)
         self._connection.close()
 
@@ -106,7 +106,7 @@ class RunFeed:
                 self._post(event)
             except (OSError, http.client.HTTPException, BenchError) as error:
                 log.warning(
-                    "%s: the console takes no more reports (%s); the run goes on", self._address, error
+                    "%s: the console accepts no more reports (%s); the run continues", self._address, error
                 )
                 while self._waiting.get() is not None:
                     pass
@@ -128,7 +128,7 @@ class RunFeed:
 
 
 def console_address(view: str, emulator: EmulatorProcess | None) -> str:
-    """Return the address of the console; for `auto` print and return that of the started emulator.
+    """Return the address of the console; for `auto`, print and return the started emulator's.
 
     Raises
     ------

@@ -27,7 +27,7 @@
     attitude = { within_arcsec = 30, roll_within_arcsec = 120 }
 
 Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names
-are those of the interface definition; the error for an unknown one names file, step and near
+come from the interface definition; the error for an unknown one names file, step and near
 matches.
 """
 

@@ -55,7 +55,7 @@ class SessionRequest:
     keep_going: bool = False
     quiet: bool = False
     view: str | None = None
-    """Address of the console that shows the results; `auto` with `start`: that of the started emulator."""
+    """Address of the console that shows the results; `auto` with `start`: the started emulator's."""
 
 
 def find_script(path: Path) -> Path:

@@ -40,7 +40,7 @@ def temporary_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Remove a folder that nobody has locked."""
+    """Remove a folder that no process has locked."""
     try:
         lock = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CLOEXEC)
     except OSError:  # another kind of folder, one being created, or another user's

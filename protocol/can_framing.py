@@ -141,7 +141,7 @@ def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
 
     Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is first, body … and last,
     each with the counter. Burst packets are segmented telemetry with the burst's id. Public sources confirm the three
-    types, but not this layout, nor that of bursts; both are ours.
+    types, but neither this layout nor the burst layout; both are ours.
     """
     if reply.kind is ReplyKind.ECHO:
         raise ProtocolError("CAN has no echo messages")

@@ -42,7 +42,7 @@ NO_CHECK: Final = Check(0, frozenset(), lambda _covered: b"")
 def build_check(
     model: CheckModel, byte_order: Order, custom: Mapping[str, CheckFunction] | None = None
 ) -> Check:
-    """Return the check that a definition selects; `custom` holds those of its plugin by name.
+    """Return the check that a definition selects; `custom` holds the plugin's checks by name.
 
     Raises
     ------

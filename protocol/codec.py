@@ -398,7 +398,7 @@ class Row:
         Raises
         ------
         FieldError
-            The text names row.field, the value and what is allowed.
+            The text names row.field, the value and the allowed values.
         """
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()

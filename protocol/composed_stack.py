@@ -309,7 +309,7 @@ class ComposedStack(SerialStack):
     def measure(self, header: Header, body: bytes, data_size: Callable[[Envelope], int]) -> int | None:
         """Return the size of the body that begins with these bytes, or None if they are too few.
 
-        `data_size` returns that of the data where the header carries no length. Raises BodySizeError.
+        `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.
         """
         try:
             envelope = header.unpack(body)
@@ -449,6 +449,6 @@ def _build_framing(link: SerialLinkModel, custom: Mapping[str, Framing]) -> Fram
                 raise IcdError(f"link.serial.framing: the plugin has no framing named {model.name!r}")
             return custom[model.name]
         case CubeSpaceFraming():
-            raise IcdError("link.serial.framing: cubespace has a codec of its own")
+            raise IcdError("link.serial.framing: cubespace has its own codec")
         case _:
             assert_never(model)

@@ -1,7 +1,7 @@
-"""The device model: the parameters, quantities and actions of the emulated star sensor, whatever its interface.
+"""The device model: the parameters, quantities and actions of the emulated star sensor, for any interface.
 
 `configs/units/model.toml` declares them; units bind the fields of their rows to them by name. The functions that compute
-quantities and perform actions are those of the emulator.
+quantities and perform actions belong to the emulator.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class DeviceModel:
 
 
 def generic(name: str) -> str:
-    """Return a name with `[n]` in place of its number."""
+    """Return a name with its number replaced by `[n]`."""
     return _NUMBER.sub("[n]", name)
 
 

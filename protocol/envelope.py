@@ -173,13 +173,13 @@ class Header:
                 return None
             value = field.from_bytes(body[position : position + field.size])
             if field.const is not None and value != field.const and field.role != "address":
-                raise HeaderError(f"header has {value:#x} in place of {field.const:#x}")
+                raise HeaderError(f"header has {value:#x}, expected {field.const:#x}")
             if field.role is not None:
                 values[field.role] = value
             for bit in field.bits:
                 found = value >> bit.shift & bit.mask
                 if bit.const is not None and found != bit.const:
-                    raise HeaderError(f"header has bits {found:#x} in place of {bit.const:#x}")
+                    raise HeaderError(f"header has bits {found:#x}, expected {bit.const:#x}")
                 if bit.role is not None:
                     values[bit.role] = found
             if "class" in values and not klass:
@@ -192,7 +192,7 @@ class Header:
     def data_size(self, envelope: Envelope) -> int:
         """Return the bytes of data that the length of a header promises.
 
-        Raises HeaderError if the length is shorter than what it counts.
+        Raises HeaderError if the length is less than the size of the parts it counts.
         """
         data = envelope.values["length"] - self.length(envelope.size, 0)
         if data < 0:

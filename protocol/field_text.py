@@ -24,7 +24,7 @@ _BRACES: Final = re.compile(r"\{([^{}]*)\}")
 
 
 def fields_of(text: str) -> list[FieldModel]:
-    """Return the fields that a text stands for.
+    """Return the fields of a text.
 
     Raises IcdError with what is wrong, without row and file.
     """
@@ -82,7 +82,7 @@ def _number(key: str, word: str) -> int | float:
 
 
 def _names(pattern: str) -> list[str]:
-    """Return the names that a pattern with braces stands for, the last braces the fastest."""
+    """Expand a pattern with braces to names; the last braces vary fastest."""
     parts = [
         [part] if index % 2 == 0 else _choices(part) for index, part in enumerate(_BRACES.split(pattern))
     ]

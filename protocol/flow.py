@@ -17,7 +17,7 @@ TURN: Final = 4 * 1024
 work for a device."""
 
 WINDOW: Final = 16 * 1024
-"""Size of each buffer along a connection, bytes: what waits there delays what follows."""
+"""Size of each buffer along a connection, bytes; buffered bytes delay later ones."""
 
 
 KEEPALIVE: Final = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 3}

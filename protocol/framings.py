@@ -322,7 +322,7 @@ class _CountedDeframer(_Collector[_Message]):
             return False
         if self._buffer[head + size : whole] != self._end:
             found = bytes(self._buffer[head + size : whole]).hex(" ").upper()
-            text = f"{found} in place of the end of a message"
+            text = f"{found} instead of the end of a message"
             return self._reject(LinkFault(FaultKind.UART_PROTOCOL, text), whole)
         result = self._interpret(bytes(self._buffer[head : head + size]))
         if isinstance(result, LinkFault):

@@ -120,7 +120,7 @@ class _Client(TurnProtocol):
             self._hub.distribute(self, frames)
 
     def close(self) -> None:
-        """Drop the connection and all that waits for it."""
+        """Drop the connection and its queue."""
         if self._transport is not None:
             self._transport.abort()
 

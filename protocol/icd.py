@@ -130,7 +130,7 @@ class InterfaceDefinition:
         return next((row for row in found if row is not None and row.kind == "telemetry"), None)
 
     def kind_of_id(self, row_id: int) -> RequestKind:
-        """Return what an id stands for where no class says so; an unknown one is taken for a telecommand."""
+        """Return the kind of an ID in a unit without classes; an unknown ID is taken as a telecommand."""
         first = self.first_telemetry_id
         telemetry = row_id in self.telemetry_by_id if first is None else row_id >= first
         return RequestKind.TELEMETRY if telemetry else RequestKind.TELECOMMAND
@@ -141,9 +141,9 @@ class InterfaceDefinition:
         return Request(RequestKind(row.kind), row.id, data, source, klass=row.klass)
 
     def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
-        """Return a request by id, which need not be that of a row, and by class where the unit has classes.
+        """Return a request by ID, which need not belong to a row, and by class if the unit has classes.
 
-        Without a class: that of the first row with this id, else the first.
+        Default class: of the first row with this ID, else the first class.
         """
         if not self.classes:
             return Request(self.kind_of_id(row_id), row_id, data)
@@ -174,7 +174,7 @@ class InterfaceDefinition:
         return next((name for name, known in numbers.items() if known == number), "unpublished code")
 
     def enum(self, name: str) -> EnumDefinition:
-        """Return an enumeration of the unit, else that of the device model."""
+        """Return an enumeration of the unit, else of the device model."""
         return self.enums[name] if name in self.enums else self.model.enums[name]
 
     @property

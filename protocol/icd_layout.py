@@ -51,7 +51,7 @@ class Layout:
         self.size = 0
 
     def include(self, row: Row) -> None:
-        """Append the fields of another row; telemetry reports those of a telecommand as they were last accepted."""
+        """Append the fields of another row; telemetry reports a telecommand's fields as last accepted."""
         moved = {slot.index: self._slot(slot.type, slot.size, slot.order) for slot in row.slots}
         for item in row.fields:
             field = replace(item, slot=moved[item.slot.index])
@@ -77,7 +77,7 @@ class Layout:
 
     def _add_repeat(self, model: FieldModel, repeat: RepeatModel, where: str) -> None:
         if model.model_fields_set - {"repeat", "doc"}:
-            raise IcdError(f"{where}: `repeat` stands alone, with its own fields")
+            raise IcdError(f"{where}: `repeat` allows no other keys but `doc`")
         group = [single for item in repeat.fields for single in self._of_text(item)]
         if any(item.repeat is not None or item.count is not None for item in group):
             raise IcdError(f"{where}: a repeated group holds neither `repeat` nor `count`")
@@ -86,7 +86,7 @@ class Layout:
                 self._place(item, where, f"_{number}", number)
 
     def _of_text(self, model: FieldModel) -> list[FieldModel]:
-        """Return the fields that a text stands for, or the field itself."""
+        """Return the fields of a text, or the field itself."""
         if model.text is None:
             return [model]
         where = f"{self._where}: field {model.text!r}"
@@ -254,7 +254,7 @@ def mapped(
             ) from None
         names = [text_of(value) for value in (given if isinstance(given, list) else [given])]
         if not names or any(name in values or name in aliases for name in names):
-            raise IcdError(f"{where}: map: {wire}: no value, or one that stands twice")
+            raise IcdError(f"{where}: map: {wire}: no value, or a duplicate one")
         values[names[0]] = number
         aliases |= dict.fromkeys(names[1:], names[0])
     return EnumDefinition("map", "", values), aliases

@@ -129,10 +129,10 @@ class RepeatModel(_Model):
 
 
 class FieldModel(_BoundModel):
-    """One field of a row; unused and sent as zeros if it has no name. A text in place of the table is its `text`."""
+    """One field of a row; unused and sent as zeros if it has no name. A string instead of a table is its `text`."""
 
     text: str | None = None
-    """Fields in short, as in `i16 mag{0,1}_{x,y,z} uT 0.01`, in place of all other keys."""
+    """Short form of one or several fields, such as `i16 mag{0,1}_{x,y,z} uT 0.01`, instead of all other keys."""
     count: Annotated[int, Field(ge=2, le=64)] | None = None
     """Expands to the fields name_1 … name_count; `[n]` in a quantity's or argument's name is the number."""
     repeat: RepeatModel | None = None
@@ -187,11 +187,11 @@ class RowModel(_Model):
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
     fields: list[FieldModel] | None = None
-    """Fields, in their order on the wire, after those of `include`; each is a table or a text."""
+    """Fields, in their order on the wire, after those of `include`; each is a table or a string (`text`)."""
     include: list[str] | None = None
     """Rows whose fields this row concatenates, in order."""
     unbound: Literal["zeros"] | None = None
-    """`zeros`: fields that are bound to nothing are sent as zeros on purpose; without it they are an error."""
+    """`zeros`: fields without a binding are sent as zeros; default: they are an error."""
     readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
     """ID of the telemetry that reports the arguments that a telecommand named `set_…` was last accepted with; it has the name without `set_`."""
     action: str | None = None

@@ -155,9 +155,9 @@ class MessageClass:
     code: int | None = None
     """In a request."""
     reply: int | None = None
-    """In the reply; that of the request unless given."""
+    """Code in a reply; default: the request's."""
     unsolicited: int | None = None
-    """In telemetry that nobody asked for; that of the reply unless given."""
+    """Code in unsolicited telemetry; default: the reply's."""
 
 
 @dataclass(frozen=True, slots=True)

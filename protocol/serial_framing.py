@@ -247,7 +247,7 @@ def encode_request(request: Request, *, stuff_id: bool = True) -> bytes:
 def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
     """Frame a device's reply in a dialect.
 
-    In dialects a and b the NACK of a telemetry request is the error code in place of the telemetry; no public source
+    In dialects a and b the NACK of a telemetry request is the error code instead of the telemetry; no public source
     shows that form, it is ours. Burst packets have the same form in all dialects.
 
     Raises
@@ -374,7 +374,7 @@ class HostReceiver(_Receiver[Reply]):
         return request.kind is RequestKind.TELECOMMAND or size != len(body)
 
     def _generation_1(self, row_id: int, data: bytes, size: int | None) -> Reply | LinkFault:
-        """Interpret a reply of generation 1; `size` is that of the telemetry row, if known."""
+        """Interpret a reply of generation 1; `size` is the size of the telemetry row, if known."""
         if row_id >= FIRST_TELEMETRY_ID:
             self._expected = None
             if len(data) == 1 and size not in (None, 1):

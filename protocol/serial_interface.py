@@ -1,4 +1,4 @@
-"""The two ends of a serial link: what an emulator and an OBC use, whatever the unit."""
+"""The two ends of a serial link, for emulator and OBC of any unit."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class RowShape:
     request_size: int = 0
     """Data bytes of the request: parameters of a telecommand."""
     reply_size: int = 0
-    """Data bytes of the reply: those of the telemetry."""
+    """Number of data bytes in the reply."""
     answers: tuple[str, ...] = ("reply",)
     """`echo` and `reply`, in the order in which the device sends them."""
 

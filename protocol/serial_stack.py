@@ -23,12 +23,12 @@ from starhil.protocol.values import IcdError
 
 
 class CubeSpaceStack(SerialStack):
-    """The serial link of the CubeSpace family; its style is the reply dialect, b unless given.
+    """The serial link of the CubeSpace family; its style is the reply dialect, by default b.
 
     Attributes
     ----------
     dialect
-        The only dialect of the unit, whatever the style; None if it has all.
+        The unit's only dialect, for any style; None if it has all.
     """
 
     def __init__(self, link: SerialLinkModel) -> None:

@@ -1,4 +1,4 @@
-"""Units of measure of quantities and fields, and the factors between those of one kind."""
+"""Units of measure of quantities and fields, and the factors between units of one kind."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ ANSWER_WITHIN_S: Final = 300.0
 """Longest wait for an answer in lock-step, seconds: a first start of the emulator compiles."""
 
 EARTH_RADIUS_M: Final = 6.3e6
-"""Positions nearer to the origin than this are not those of an orbit about the Earth, and are not sent."""
+"""Positions nearer to the origin are not on an Earth orbit, and are not sent."""
 
 NANOSECONDS: Final = 1e9
 
@@ -46,7 +46,7 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
     lockstep : bool
         Wait for the answer to each message; over TCP only.
     epoch_unix_s : float, optional
-        Date of simulation time zero, as Unix time; without it the date is that of the emulator.
+        Date of simulation time zero, as Unix time; default: the emulator's.
 
     Attributes
     ----------

@@ -16,7 +16,7 @@ def project_version() -> str:
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
 
 
-def test_the_installed_version_is_that_of_the_project():
+def test_the_installed_version_matches_the_project():
     assert importlib.metadata.version("starhil") == project_version()
 
 
@@ -33,7 +33,7 @@ def test_the_citation_names_the_version():
     assert re.findall(r"^version: (.*)$", text, re.MULTILINE) == [project_version()]
 
 
-def test_the_changelog_begins_with_what_is_unreleased_and_then_the_version():
+def test_the_changelog_starts_with_unreleased_and_then_the_version():
     text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
     titles = re.findall(r"^## \[(.*?)\]( - \d{4}-\d\d-\d\d)?$", text, re.MULTILINE)
     assert titles[0] == ("Unreleased", "")

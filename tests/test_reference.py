@@ -47,7 +47,7 @@ def reference() -> ModuleType:
     return module
 
 
-def test_the_tables_of_the_reference_pages_are_those_of_the_code(reference):
+def test_the_tables_of_the_reference_pages_match_the_code(reference):
     pages = reference.pages()
     assert {"cli.md", "control.md", "profile.md"} <= {page.name for page in pages}
     for page in pages:

@@ -34,7 +34,7 @@ def test_the_unit_of_the_page_has_no_errors_and_the_exchange_that_is_shown(tmp_p
     assert result.stdout.endswith(end.replace("lynx", str(tmp_path / "lynx")))
 
 
-def test_client_of_the_page_prints_what_is_shown(tmp_path, monkeypatch):
+def test_the_client_of_the_page_prints_the_output_shown(tmp_path, monkeypatch):
     monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(FakePipeline().handle))
     profile = Profile.model_validate(
         {

@@ -199,7 +199,7 @@ def main() -> int:
     )
     console.print(
         "Next: .venv/bin/starhil run --serial auto --can off, then open the port of its ready line with your OBC software; "
-        "with --view, a page shows what it sees."
+        "with --view, a page shows its images."
     )
     return 0 if good else 1
 

@@ -11,7 +11,7 @@ matter:
 
 memory        may grow by 8 MB, since the allocator fluctuates. In 15 minutes about 4500 frames and 60 sessions lie
               between the two thirds, so a leak of 2 kB per frame or 140 kB per session fails.
-descriptors   may not grow: every round ends in the same state, with nobody connected.
+descriptors   may not grow: every round ends in the same state, without any client.
 latency       p99 may grow by half plus 10 ms; growing lists or queues would exceed this in time.
 
 Prints one line per round and the figures at start and end; exit status 1 on growth or a failed session.
@@ -181,7 +181,7 @@ class Control:
 
 
 class Soak:
-    """A running emulator with its hub, and what is done to it in a round."""
+    """A running emulator with its hub, and the actions of a round."""
 
     def __init__(self, emulator: EmulatorProcess, hub: EmulatorProcess, folder: Path) -> None:
         self._emulator, self._hub, self._folder = emulator, hub, folder

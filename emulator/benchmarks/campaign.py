@@ -77,7 +77,7 @@ class CampaignPlan:
     algorithm : star identification algorithm, as in a device profile.
     chunk : frames per chunk, the unit of work and of resumption.
     unknown_field : the field of view is not known to the identification, which searches for it as
-        `starhil identify --fov auto` does; the time for detection is part of that of identification.
+        `starhil identify --fov auto` does; identification time then includes detection.
     """
 
     frames: int
@@ -318,7 +318,7 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     """Summarise the rows (RECORD) of a campaign: counts, errors in arcseconds, times in milliseconds.
 
     `wrong` counts valid attitudes off by more than 0.1° in boresight or roll. `pole_frames` and `ra_wrap_frames`
-    count frames with a celestial pole, or RA 0°, in the field; `…_valid` those of them that are valid.
+    count frames with a celestial pole, or RA 0°, in the field; `…_valid` how many of them are valid.
     `normalised_squared_error` is the mean of the squared error over its covariance. If the body rate varies,
     `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 … °/s.
     """

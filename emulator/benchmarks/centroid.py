@@ -138,14 +138,14 @@ def measure_centroids(
     seed : int
         Seed of attitudes, directions and noise.
     sensor : optional
-        The default of the product unless given.
+        Default: the product's.
     progress : callable, optional
         Receives a line about each step.
 
     Returns
     -------
     list of CentroidRow
-        By rate and magnitude; bins without stars are left out.
+        By rate and magnitude; bins without stars are omitted.
     """
     if frames < 1 or not rates_deg_s:
         raise EmulatorError(

@@ -90,7 +90,7 @@ WRONG_ROLL_ARCSEC: Final = 3600.0
 attitude of the true matches is within these of it: two or three stars close together determine no attitude better."""
 
 PEER_LIMIT_V: Final = 5.5
-"""Least faint limit of the databases of peers and published algorithms: otherwise that of the scenes."""
+"""Lowest magnitude limit of the databases of third-party solvers and published algorithms; otherwise the scenes'."""
 
 _BLEND_PX: Final = 2.0
 _DEEPER_V: Final = 0.5
@@ -246,7 +246,7 @@ def _by_field(rows: Sequence[str], camera: Camera) -> dict[tuple[Camera, float],
 
 
 class _Field:
-    """A camera with the sky that its scenes are made of, and the solvers for it.
+    """A camera, the sky of its scenes, and the solvers for it.
 
     Parameters
     ----------
@@ -265,7 +265,7 @@ class _Field:
     def add(
         self, names: Sequence[str], made: list[dict[str, Any]], skipped: dict[str, str], *, raw: bool
     ) -> None:
-        """Make solvers; append what they take to `made`, and why others are left out to `skipped`."""
+        """Make solvers; append their costs to `made`, and the reasons why others are skipped to `skipped`."""
         camera = self.maker.camera
         warm = self.maker.scene(SceneSettings(float(self.known.v[-1]), 0.5), np.random.default_rng(1))
         for name in names:

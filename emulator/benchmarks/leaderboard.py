@@ -48,7 +48,7 @@ def markdown(answer: Answer, command: str) -> str:
         f"| {_text(entry['build_s'], 2)} | {_text(entry['memory_mb'], 0)} |"
         for entry in answer["solvers"]
     ]
-    lines += ["", *(f"- {name}: left out, {why}" for name, why in answer["skipped"].items())]
+    lines += ["", *(f"- {name}: skipped, {why}" for name, why in answer["skipped"].items())]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
     lines += ["", f"Seed {answer['seed']}. Versions: {versions}.", ""]
     return "\n".join(lines)

@@ -47,7 +47,7 @@ CEDAR_TIMEOUT_MS: Final = 5000.0
 EVEN_PER_FIELD: Final = 12
 """Maximum number of evenly spread guide stars in the solid angle of a field around any of them."""
 MIN_SIGMA_PX: Final = 0.1
-"""Lowest centroid noise that a raw published algorithm is told."""
+"""Lowest centroid noise passed to a raw published algorithm."""
 MIN_FEATURE_FIELD_DEG: Final = 30.0
 """Narrowest field for which a feature database (lsi, rsi) is built: its size grows with the inverse square of the field."""
 

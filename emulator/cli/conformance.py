@@ -41,7 +41,7 @@ def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, st
 def command(
     patterns: Annotated[
         list[str] | None,
-        typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'; default: all."),
+        typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'. Default: all."),
     ] = None,
     unit: UnitChoice = None,
     serial: SerialPort = None,

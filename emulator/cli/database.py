@@ -15,43 +15,49 @@ from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 
 group = typer.Typer(
-    help="Build or inspect feature databases of the LSI and RSI algorithms.", no_args_is_help=True
+    help="Build or inspect databases of the LSI and RSI algorithms: feature vectors of overlapping patches of the sky.",
+    no_args_is_help=True,
 )
 
 
 @group.command("build")
 def build(
-    overlap: Annotated[float, typer.Option(help="Overlap of neighbouring frames in percent, such as 99.5.")],
+    overlap: Annotated[
+        float, typer.Option(help="Overlap of neighbouring sky patches in percent, such as 99.5.")
+    ],
     geometry: Annotated[
-        str, typer.Option(help="planar (the thesis) or spherical (a real camera).")
+        str, typer.Option(help="planar (flat RA–Dec plane, as in the thesis) or spherical (a real camera).")
     ] = "planar",
     output: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--output", help=output_help("File to write; without it the database is discarded.")
+            "-o",
+            "--output",
+            help=output_help("File to write; without it, the database is built and discarded."),
         ),
     ] = None,
     kappa: Annotated[
-        float | None, typer.Option(help="Brightness limit κ, magnitudes; default 11.5 planar, 5.0 spherical.")
+        float | None, typer.Option(help="Magnitude limit κ; default: 11.5 planar, 5.0 spherical.")
     ] = None,
     direction: Annotated[
         str | None,
         typer.Option(
-            help="Stars kept: faintest (a ≥ κ) or brightest (a ≤ κ); default faintest planar, brightest spherical."
+            help="Stars kept: faintest (magnitude ≥ κ) or brightest (magnitude ≤ κ); default: faintest planar, brightest spherical."
         ),
     ] = None,
     band: Annotated[
-        str | None, typer.Option(help="Magnitude band: hp or v; default hp planar, v spherical.")
+        str | None, typer.Option(help="Magnitude band: hp or v; default: hp planar, v spherical.")
     ] = None,
     fov: Annotated[
-        float | None, typer.Option(help="Frame width, degrees; default 40 planar, 42 spherical.")
+        float | None, typer.Option(help="Width of a sky patch, degrees; default: 40 planar, 42 spherical.")
     ] = None,
     full_field: Annotated[
-        bool, typer.Option("--full-field", help="Square frames instead of circular ones; not roll-invariant.")
+        bool,
+        typer.Option("--full-field", help="Square patches instead of circular ones; not roll-invariant."),
     ] = False,
     epoch: Annotated[
         float | None,
-        typer.Option(help="Epoch of the positions, Julian year; default 1991.25 planar, 2026 spherical."),
+        typer.Option(help="Epoch of the positions, Julian year; default: 1991.25 planar, 2026 spherical."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""`starhil features`: the feature vector of one catalogue frame."""
+"""`starhil features`: the feature vector of a patch of the catalogue's sky."""
 
 from __future__ import annotations
 
@@ -17,38 +17,41 @@ _KEYS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
 
 def command(
     ra_corner: Annotated[
-        float | None, typer.Option(help="Right ascension of the frame's lower-left corner, degrees (planar).")
+        float | None, typer.Option(help="Right ascension of the patch's lower-left corner, degrees (planar).")
     ] = None,
     dec_corner: Annotated[
-        float | None, typer.Option(help="Declination of the frame's lower-left corner, degrees (planar).")
+        float | None, typer.Option(help="Declination of the patch's lower-left corner, degrees (planar).")
     ] = None,
-    ra: Annotated[float | None, typer.Option(help="Right ascension of the frame's centre, degrees.")] = None,
-    dec: Annotated[float | None, typer.Option(help="Declination of the frame's centre, degrees.")] = None,
-    kappa: Annotated[float, typer.Option(help="Brightness limit κ, magnitudes.")] = 11.5,
+    ra: Annotated[float | None, typer.Option(help="Right ascension of the patch's centre, degrees.")] = None,
+    dec: Annotated[float | None, typer.Option(help="Declination of the patch's centre, degrees.")] = None,
+    kappa: Annotated[float, typer.Option(help="Magnitude limit κ.")] = 11.5,
     direction: Annotated[
-        str, typer.Option(help="Stars kept: faintest (a ≥ κ, as in the thesis) or brightest (a ≤ κ).")
+        str,
+        typer.Option(
+            help="Stars kept: faintest (magnitude ≥ κ, as in the thesis) or brightest (magnitude ≤ κ)."
+        ),
     ] = "faintest",
     geometry: Annotated[
         str,
         typer.Option(
-            help="planar (degrees in the flat RA–Dec plane) or spherical (pixels of a 937-pixel camera)."
+            help="planar (degrees in the flat RA–Dec plane, as in the thesis) or spherical (pixels of a 937-pixel camera)."
         ),
     ] = "planar",
     fov: Annotated[
         float | None,
-        typer.Option(help="Frame width, degrees; default 40 planar (as published), 42 spherical."),
+        typer.Option(help="Width of the patch, degrees; default: 40 planar (as published), 42 spherical."),
     ] = None,
-    band: Annotated[str, typer.Option(help="Magnitude used as brightness: hp or v.")] = "hp",
+    band: Annotated[str, typer.Option(help="Magnitude band: hp or v.")] = "hp",
     full_field: Annotated[
-        bool, typer.Option("--full-field", help="Use the square frame instead of its inscribed circle.")
+        bool, typer.Option("--full-field", help="Square patch instead of its inscribed circle.")
     ] = False,
     epoch: Annotated[
         float | None,
-        typer.Option(help="Epoch of the positions, Julian year; default 1991.25 planar, 2026 spherical."),
+        typer.Option(help="Epoch of the positions, Julian year; default: 1991.25 planar, 2026 spherical."),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of a catalogue frame."""
+    """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of a patch of the catalogue's sky."""
     from starid.thesis.database import sky_of
 
     parameters = frame_parameters(

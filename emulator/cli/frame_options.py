@@ -57,7 +57,7 @@ def frame_parameters(
 
 
 def frame_catalog(geometry: str, epoch: float | None) -> StarCatalog:
-    """Load the catalogue at an epoch, by default that of the geometry."""
+    """Load the catalogue at an epoch; default: the geometry's."""
     from starid.catalog import load_catalog
 
     default = PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH

@@ -24,15 +24,15 @@ CanChannel: TypeAlias = Annotated[
 ]
 SerialDialect: TypeAlias = Annotated[
     str | None,
-    typer.Option(
-        "--dialect", help="Format of serial replies, of a unit that has several: a, b (default) or c."
-    ),
+    typer.Option("--dialect", help="Format of serial replies, if the unit has several: a, b (default) or c."),
 ]
 HostAddress: TypeAlias = Annotated[int, typer.Option("--host-address", help="CAN address of the OBC.")]
 DeviceAddress: TypeAlias = Annotated[int, typer.Option("--device-address", help="CAN address of the device.")]
 CanopenNode: TypeAlias = Annotated[
     int | None,
-    typer.Option("--canopen", min=1, max=127, help="Node ID of the CANopen slave on the CAN channel."),
+    typer.Option(
+        "--canopen", min=1, max=127, help="Also test the CANopen node with this ID on the CAN channel."
+    ),
 ]
 Unit: TypeAlias = Annotated[
     str,
@@ -57,8 +57,8 @@ ConsoleAddress: TypeAlias = Annotated[
     typer.Option(
         "--view",
         metavar="[ADDRESS]",
-        help="Show the results on a console as they arrive: the address on the ready line of `starhil run --view`; "
-        "without one, and with --start, that of the emulator started here.",
+        help="Show the results on a console as they arrive. ADDRESS: from the ready line of `starhil run --view`; "
+        "default, with --start: the emulator started here.",
     ),
 ]
 

@@ -71,7 +71,7 @@ def report_stream(output: Path | None) -> TextIO:
 
 
 def print_text(text: str) -> None:
-    """Print a document as UTF-8, whatever the locale."""
+    """Print a document as UTF-8 in any locale."""
     sys.stdout.flush()
     sys.stdout.buffer.write(text.encode())
     sys.stdout.buffer.flush()

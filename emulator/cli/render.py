@@ -59,9 +59,7 @@ def command(
     as_annotated: Annotated[
         bool, typer.Option("--annotate", help="Stretch the image and mark the stars on it.")
     ] = False,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="Print the truth of the image as one JSON object.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the truth of the image as JSON.")] = False,
 ) -> None:
     """Render an image of the sky; the same options give the same bytes."""
     from starhil.emulator.sensor.renderer import Renderer

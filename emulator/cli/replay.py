@@ -1,4 +1,4 @@
-"""`starhil replay`: play a recorded run again, and compare."""
+"""`starhil replay`: replay a recorded run and compare."""
 
 from __future__ import annotations
 
@@ -8,14 +8,16 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import AsJson
+
 
 def command(
-    folder: Annotated[Path, typer.Argument(help="Folder written by starhil run --record.")],
-    json_output: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    folder: Annotated[Path, typer.Argument(help="Folder written by `starhil run --record`.")],
+    as_json: AsJson = False,
 ) -> int:
-    """Play a recorded run on the stepped clock, and compare what the device sends and measures, byte by byte.
+    """Replay a recorded run on the stepped clock and compare what the device sends and measures, byte by byte.
 
-    Exit status 0 if all is equal, 1 if anything differs.
+    Exit status 0: identical, 1: something differs.
     """
     import asyncio
     import json
@@ -23,7 +25,7 @@ def command(
     from starhil.emulator.replay import replay
 
     report = asyncio.run(replay(folder))
-    if json_output:
+    if as_json:
         print(json.dumps(dataclasses.asdict(report)))
     else:
         units = {"serial": "bytes"}

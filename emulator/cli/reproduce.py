@@ -1,4 +1,4 @@
-"""`starhil reproduce`: repeat the experiments of the thesis and compare with the published results."""
+"""`starhil reproduce`: repeat the experiments of the thesis and compare the results with the published ones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from starhil.emulator.cli.options import AsJson
 
 def command(
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="[NAME]...", help="Experiments; default: all.")
+        list[str] | None, typer.Argument(metavar="NAME", help="Experiments. Default: all.")
     ] = None,
     output: Annotated[
         Path,
@@ -25,11 +25,15 @@ def command(
         bool, typer.Option("--quick", help="Run a subset that takes a few minutes, with its checks.")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 2,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     list_only: Annotated[bool, typer.Option("--list", help="List the experiments and exit.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat the experiments of the thesis: tables, figures, and report.md with published and measured values.
+    """Repeat the experiments of the thesis that the LSI and RSI algorithms come from.
+
+    E. O. Özyurt, A Feedback Star Identification Algorithm via Regularized Pattern Recognition Using
+    a Unique Feature Extraction, Istanbul Technical University. Writes tables, figures, and report.md
+    with published and measured values.
 
     A second run in the same folder resumes the first and skips experiments finished with the
     same parameters. The report covers all finished experiments in the folder. Exit status 1 if

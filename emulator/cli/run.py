@@ -14,53 +14,64 @@ from starhil.emulator.cli.output import output_help, prepare_output
 def command(
     profile: Annotated[
         str | None,
-        typer.Argument(help="Name of a device profile, or path of a profile file.", show_default="cubestar"),
+        typer.Argument(help="Device profile: a name or a TOML file.", show_default="cubestar"),
     ] = None,
     unit: UnitChoice = None,
     head: Annotated[
         list[str] | None,
         typer.Option(
-            help="Profile of one of several heads, in place of PROFILE; repeat it for each. They share the clock, "
-            "and the truth of the first one at their own mounts."
+            help="Emulate several heads: give --head PROFILE for each, instead of PROFILE. All heads share one clock and the "
+            "first head's truth; each has its own mount."
         ),
     ] = None,
     serial: Annotated[
-        str | None, typer.Option(help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off.")
+        str | None,
+        typer.Option(
+            help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off. Default: the profile's (auto)."
+        ),
     ] = None,
     dialect: Annotated[
         str | None,
         typer.Option(
             help="Format of serial replies: a for OBC software written for the CubeComputer (replies start with the "
-            "message ID), b for a stand-alone node (no ID; default), c for generation 2. With the wrong dialect, "
-            "values are shifted by one byte."
+            "message ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
+            "one byte. Default: the profile's (b)."
         ),
     ] = None,
     can: Annotated[
         str | None,
-        typer.Option(help="CAN link: auto (vcan0 if available, else the TCP hub), a channel, or off."),
+        typer.Option(
+            help="CAN link: auto (vcan0 if available, else the TCP hub), a channel, or off. Default: the profile's (auto)."
+        ),
     ] = None,
     canopen: Annotated[
         int | None,
-        typer.Option(min=0, max=127, help="Node ID of a CANopen slave on the CAN channel; 0: off."),
+        typer.Option(
+            min=0, max=127, help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0)."
+        ),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of all noise.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Random seed. Default: the profile's (1).")] = None,
     clock: Annotated[
-        str | None, typer.Option(help="Simulation clock: real, scaled:FACTOR or stepped.")
+        str | None,
+        typer.Option(
+            help="Simulation clock: real, scaled:FACTOR, or stepped (advances only on request, for repeatable runs). "
+            "Default: the profile's (real)."
+        ),
     ] = None,
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for state kept across restarts, such as saved parameters; default: keep nothing."
+            help="Folder for state that survives restarts, such as saved parameters. Default: nothing is kept."
         ),
     ] = None,
     symlink: Annotated[
-        Path | None, typer.Option(help="Symbolic link to the pty, removed at the end.")
+        Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")
     ] = None,
     control: Annotated[
         str,
         typer.Option(
-            help="Control channel: off, auto (a Unix socket for this user alone), unix:/PATH, "
-            "or HOST:PORT (open to every local user)."
+            help="Control channel: off, auto (a Unix socket for this user only), unix:/PATH, "
+            "or HOST:PORT (open to all local users)."
         ),
     ] = "off",
     control_token: Annotated[
@@ -79,37 +90,37 @@ def command(
     scenario: Annotated[
         str,
         typer.Option(
-            help="Scenario of timed faults and attitude changes: a TOML file, or a name in configs/scenarios."
+            help="Scenario of timed faults and attitude changes: the name of a bundled scenario, or a TOML file."
         ),
     ] = "",
     view: Annotated[
         str,
         typer.Option(
             metavar="[HOST:PORT]",
-            help="Serve the console, a web page, at this address; default 127.0.0.1 and a free port. The ready line "
-            "has the page's address with its token.",
+            help="Serve the console, a web page; the ready line has its address. Without HOST:PORT: a free port of "
+            "127.0.0.1.",
         ),
     ] = "off",
     record: Annotated[
         list[Path] | None,
         typer.Option(
-            help="Folder for a recording of the run, for starhil replay, or MCAP file (*.mcap) of images, truth, "
-            "telemetry and events, for Foxglove. Missing folders are created. May be repeated."
+            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove). Missing folders are created. "
+            "Repeatable."
         ),
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", help="Override a key of the profile: section.key=value. May be repeated."),
+        typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
     ] = None,
     log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
 ) -> None:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
-    One line on stdout, `ready serial=… dialect=… can=… seed=…`, reports that it accepts commands, and where.
+    A line on stdout, `ready serial=… dialect=… can=… seed=…`, reports that the emulator accepts commands, and where.
     """
     from starhil.emulator.pipeline.worker_process import take_worker
 
-    worker = take_worker()  # first of all: it starts up in parallel with the imports below
+    worker = take_worker()  # first, to start up in parallel with the imports below
 
     import asyncio
     import gc
@@ -225,7 +236,7 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
 
 
 def _folder_of_head(folder: Path, number: int) -> Path:
-    """Return the state folder of a head: of the second head, `head-2` in that of the first."""
+    """Return the state folder of a head; the second head's is `head-2` in the first head's."""
     return folder if number == 1 else folder / f"head-{number}"
 
 

@@ -23,9 +23,7 @@ from starhil.emulator.cli.options import (
 
 
 def command(
-    script: Annotated[
-        Path, typer.Argument(help="Session script (TOML), or the name of one that ships with starhil.")
-    ],
+    script: Annotated[Path, typer.Argument(help="Name of a bundled session, or a TOML script.")],
     unit: UnitChoice = None,
     serial: SerialPort = None,
     can: CanChannel = None,
@@ -38,9 +36,7 @@ def command(
     ] = None,
     junit: JunitFile = None,
     view: ConsoleAddress = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="Truth log that the emulator writes (run --truth-log).")
-    ] = None,
+    truth: Annotated[Path | None, typer.Option(help="Truth log of the emulator (run --truth-log).")] = None,
     dialect: SerialDialect = None,
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
     host_address: HostAddress = 1,
@@ -48,7 +44,7 @@ def command(
     keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run a session script step by step.
+    """Run a session (a TOML script of telecommands, reads and expectations).
 
     Exit status 0: passed, 1: a step failed, 2: invalid input. SIGINT, SIGTERM and SIGHUP end
     the session and the emulator it started; the remaining steps are reported as not run, and

@@ -116,11 +116,11 @@ class Console:
 
     @staticmethod
     async def _guarded(loop: Callable[[], Awaitable[None]]) -> None:
-        """Repeat a loop's turn for ever; a turn that fails is logged."""
+        """Repeat a loop's turn until cancelled; a turn that fails is logged."""
         while True:
             try:
                 await loop()
-            except Exception as error:  # noqa: BLE001 (the run goes on without this turn)
+            except Exception as error:  # noqa: BLE001 (the run continues without this turn)
                 log_internal_error("console", error)
                 await asyncio.sleep(STATUS_S)
 
@@ -141,7 +141,7 @@ class Console:
         self._viewers_changed()
 
     def _viewers_changed(self) -> None:
-        """Make no previews, and listen to no wire, unless somebody looks."""
+        """Make previews and record traffic only while a page is open."""
         watchers = self._emulation.imager.watchers
         if any(viewer.frames for viewer in self.viewers):
             watchers.add(self)
@@ -176,7 +176,7 @@ class Console:
             for viewer in receivers:
                 viewer.send(text)
 
-    # --- what is listened to ---
+    # --- listeners ---
 
     def _frame_published(self, measurement: Measurement) -> None:
         known = len(self.history.reasons)

@@ -23,7 +23,7 @@ COLUMNS: Final = (
 )  # fmt: skip
 """Columns of a row: times in seconds, errors and sigmas in arcseconds, rates in degrees/s, angles in degrees.
 
-`mode` is an index of `MODES`, `reason` one of the history's `reasons`. NaN stands for what is not known.
+`mode` is an index of `MODES`, `reason` one of the history's `reasons`. NaN: unknown.
 """
 
 MODES: Final = tuple(mode.value for mode in Mode)
@@ -116,7 +116,7 @@ def json_row(row: list[float]) -> list[float | None]:
 def frame_message(measurement: Measurement, row: list[float]) -> bytes:
     """Return a frame as a page receives it: `F`, the sizes of two JSON objects, these, and the JPEG.
 
-    The first object has the frame's numbers, the second what is drawn over the image.
+    The first object has the frame's numbers, the second the overlay of the image.
     """
     preview = measurement.result.preview
     numbers = json.dumps(

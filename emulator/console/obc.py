@@ -201,7 +201,7 @@ class ConsoleObc:
         return rows[name]
 
     def session(self, title: str) -> str:
-        """Return the noted transactions as a session script (TOML); pauses between them become waits.
+        """Return the recorded transactions as a session script (TOML); pauses between them become waits.
 
         Raises
         ------

@@ -25,7 +25,7 @@ async def open_obc(
     make_client
         Makes the OBC.
     closers
-        Gets the closers of what is opened, in that order.
+        Receives a function to close each opened resource, in order of opening.
     """
     icd, parameters = emulation.icd, emulation.device.parameters
     separate: Link | None = None
@@ -56,7 +56,7 @@ async def open_obc(
 
 
 def _open_virtual_bus(emulation: Emulation) -> Link:
-    """Return a link of the device to a virtual CAN bus that nobody else uses."""
+    """Return a link of the device to a private virtual CAN bus."""
     from starhil.protocol.transports.can import open_can
 
     transport = open_can(f"virtual:starhil-console-{os.getpid()}-{id(emulation)}")

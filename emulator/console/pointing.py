@@ -33,7 +33,7 @@ def pointing_request(
     ----------
     wanted
         `kind`: `slew`, `rate` or `fixed`. For a slew and `fixed`, `to`: `star` (a name, or HIP and its number), or
-        `ra_deg` and `dec_deg`; `roll_deg` is kept if left out. An empty `to` is the present attitude. For a slew,
+        `ra_deg` and `dec_deg`; without `roll_deg`, the roll stays. An empty `to` is the current attitude. For a slew,
         `max_rate_deg_s`. For `rate`, `rate_deg_s`: three numbers, in the sensor frame.
     truth
         Present truth of the sensor, as the control channel answers it.

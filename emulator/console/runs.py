@@ -1,4 +1,4 @@
-"""Session and conformance runs that report their results here while they go on."""
+"""Session and conformance runs that report their results here while they run."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STATUSES: Final = ("passed", "failed", "skipped", "not run")
 
 @dataclass
 class Run:
-    """One run: what it is, and its results so far."""
+    """One run: its description and its results so far."""
 
     run: str
     kind: str

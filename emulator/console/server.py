@@ -150,7 +150,7 @@ class ConsoleServer:
         return web.json_response({"ok": True})
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
-        """Connect a page: what it asks for is answered, and what it has subscribed to is sent."""
+        """Connect a page: answer its requests and send what it has subscribed to."""
         console = self._console(request)
         if sum(len(each.viewers) for each in self._consoles) >= MAX_VIEWERS:
             return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are open already\n")
@@ -203,7 +203,7 @@ async def _answer(console: Console, viewer: Viewer, request: dict[str, object]) 
 
 
 async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:
-    """Send what is queued for a page until it has gone."""
+    """Send a page its queued messages until it closes."""
     with contextlib.suppress(ConnectionError):
         await viewer.pump()
     await socket.close()

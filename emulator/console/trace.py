@@ -129,7 +129,7 @@ class WireTrace:
         self._new.append(entry)
 
     def drain(self) -> tuple[list[dict[str, Any]], int]:
-        """Return the new items, decoded, and the number of items left out."""
+        """Return the new items, decoded, and the number of items skipped."""
         left_out = max(0, len(self._new) - DECODED_PER_TURN)
         for _ in range(left_out):
             self._new.popleft()

@@ -177,7 +177,7 @@ class ControlServer:
             writer.close()
 
     async def answer(self, line: bytes | str | None) -> Answer:
-        """Execute one request and return its answer; None stands for a line that was too long."""
+        """Execute one request and return its answer; None: a line that was too long."""
         if line is None:
             return {"ok": False, "error": f"line too long: at most {MAX_LINE} bytes"}
         try:

@@ -66,7 +66,7 @@ class DeviceFault(Strict):
     """A fault of the device."""
 
     stuck: bool = False
-    """Unresponsive: requests are neither counted nor answered; exposures go on."""
+    """Unresponsive: requests are neither counted nor answered; exposures continue."""
     error: str | None = None
     """Enter the error mode with this error, a name of the enumeration `device_error`."""
     reset: str | None = None
@@ -97,7 +97,7 @@ class WireFault(Strict):
 
 
 class FaultRequest(Strict):
-    """One `fault` request; levels that are left out keep their faults."""
+    """One `fault` request; omitted levels keep their faults."""
 
     optical: SkyValues | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
@@ -106,7 +106,7 @@ class FaultRequest(Strict):
     serial: WireFault | None = None
     """What goes wrong on the serial line."""
     can: WireFault | None = None
-    """Faults of outgoing CAN frames, those of CANopen too."""
+    """Faults of outgoing CAN frames, CANopen included."""
 
 
 class Faults:

@@ -13,7 +13,7 @@ TOML, one `[[at]]` table per event, in any order::
     clear_faults = true
 
 `fault` and `truth` have the keys of the control channel's `fault` and `set_truth`. Events occur in
-simulation time, at the same exposures whatever the clock. Names, links and truth files are checked
+simulation time, at the same exposures on any clock. Names, links and truth files are checked
 when the run starts. A scenario cannot set a live feed, as opening its socket takes time.
 """
 
@@ -63,7 +63,7 @@ class ScenarioEvent(Strict):
         return self
 
     def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path, at_s: float) -> Action:
-        """Return the action of the event at a simulation time; what it needs is read and checked now."""
+        """Return the action of the event at a simulation time; its files and values are read and checked now."""
         if self.fault is not None:
             faults.check(self.fault)
         config = self.truth

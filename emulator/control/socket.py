@@ -40,7 +40,7 @@ class ControlSocket:
         try:
             self._remove_stale()
             self.socket.bind(str(path))
-            path.chmod(PRIVATE_SOCKET)  # nobody can connect before it listens
+            path.chmod(PRIVATE_SOCKET)  # no client can connect before it listens
             self._file = path.lstat()
             self.socket.listen()
         except (OSError, ValueError) as error:  # a path with a zero byte is a ValueError

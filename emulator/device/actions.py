@@ -1,9 +1,9 @@
 """The actions of the device: a function for each name that `configs/units/model.toml` declares.
 
-An action gets its arguments by name, range-checked and in the declared units. It returns the messages that follow
-the answer, if there are any. It raises `Refused` to answer with an error; `argument` in it names the argument at fault.
-An action that continues in the background says so in the acknowledge, and ends it itself; its telecommand is answered
-at once, unless the action is in `ANSWERED_WHEN_DONE`.
+`starhil.emulator.device.bindings.TelecommandBinding.execute` calls them. An action gets its arguments by name, range-checked
+and in the declared units, and returns the messages that follow the answer, if there are any. To answer with an error, it raises
+`Refused`, whose `argument` names the argument at fault. An action that continues in the background marks the acknowledge as
+continuing and ends it itself; its telecommand is answered at once, unless the action is in `ANSWERED_WHEN_DONE`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from starhil.protocol.messages import ErrorCode, Reply
 from starhil.protocol.values import MessageError, Value
 
 Arguments: TypeAlias = Mapping[str, Any]
-"""Values by argument; `parameters` has those of fields that name a parameter."""
+"""Values by argument; `parameters` holds the values of fields that name a parameter."""
 Action: TypeAlias = Callable[[Device, Arguments, Acknowledge], list[Reply] | None]
 
 PARAMETERS: Final = "parameters"
@@ -156,7 +156,7 @@ def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowle
 
 
 def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
-    """Send a list of telemetry rows unasked, in place of the last list."""
+    """Send a list of telemetry rows unsolicited, instead of the previous list."""
     rate_hz = float(arguments["rate"])
     wanted = []
     for name, row_id in arguments.items():

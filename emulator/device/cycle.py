@@ -4,7 +4,7 @@ Exposures start on a grid of the update period. Read-out, detection and identifi
 in the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On other
 clocks, a result that the machine delivers later is published when it arrives, and flagged as late.
 When the machine falls behind by `MAX_PENDING` requests, or at high rates by the modelled time of the
-steps, exposures are skipped: the last attitude stays valid until it is too old, and tracking goes on
+steps, exposures are skipped: the last attitude stays valid until it is too old, and tracking continues
 from it.
 """
 
@@ -318,7 +318,7 @@ class FrameCycle:
         try:
             return state.completed(unix_s, self.orbit)
         except EmulatorError as error:
-            log.warning("%s; the run goes on without an orbit", error)
+            log.warning("%s; the run continues without an orbit", error)
             self.orbit = None
             return state.completed(unix_s, None)
 
@@ -409,7 +409,7 @@ class FrameCycle:
         self._publish_in_order(frame, known_ns)
 
     def _publish_in_order(self, frame: _Frame, known_ns: int) -> None:
-        """Publish a result, after those of all earlier exposures."""
+        """Publish a result, after the results of all earlier exposures."""
         frame.finished_ns = known_ns
         while self._in_flight and self._in_flight[0].finished_ns is not None:
             first = self._in_flight.popleft()

@@ -50,7 +50,7 @@ PIPELINE_ENDED: Final = "pipeline_ended"
 
 
 def outcome(work: Callable[[], None]) -> EmulatorError | None:
-    """Do some work and return its error, whatever it was, or None."""
+    """Do some work and return the error that it raised, or None."""
     try:
         work()
     except EmulatorError as error:
@@ -376,7 +376,7 @@ def orbit_of(profile: Profile) -> Orbit | None:
     Raises
     ------
     EmulatorError
-        Its values are not those of an orbit.
+        The values do not describe an orbit.
     """
     if profile.orbit is None:
         return None

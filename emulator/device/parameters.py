@@ -80,7 +80,7 @@ class Parameters(Mapping[str, ParameterValue]):
     icd
         Interface definition, with names, types and limits.
     defaults
-        Defaults of this device that differ from those of the definition.
+        Defaults of this device that differ from the definition's.
 
     Raises
     ------

@@ -49,7 +49,7 @@ class PowerModel:
 
     The imager is switched on before an exposure; exposure and processing follow, then the transfer of the result, and
     the unit idles until the imager is switched on for the next frame. Where the period is too short for all of them,
-    idling is left out first, then the transfer.
+    idling is shortened first, then the transfer.
     """
 
     def __init__(self, config: PowerConfig) -> None:

@@ -90,7 +90,7 @@ def _turns(device: Device) -> list[np.ndarray]:
 
 @cache
 def axes_turns(conventions: Conventions) -> list[np.ndarray]:
-    """Return the rotation vector from the sensor's axes to those of the reported frame, radians."""
+    """Return the rotation vector from the sensor's axes to the reported frame's, radians."""
     matrix = np.array(conventions.rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
     sine = float(np.linalg.norm(axis))
@@ -98,7 +98,7 @@ def axes_turns(conventions: Conventions) -> list[np.ndarray]:
 
 
 def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
-    """Return the rotation vectors from the sensor frame to the reported frame, radians; zero angles are left out.
+    """Return the rotation vectors from the sensor frame to the reported frame, radians; zero angles are omitted.
 
     The reported frame is the sensor frame turned by alpha about x, then by beta about its new y, then by gamma about
     its new z.

@@ -26,7 +26,7 @@ BY_PARAMETERS = "parameters"
 class Requests:
     """Executes telecommands and answers telemetry requests for the rows of the interface definition.
 
-    Refusals carry an `ErrorCode`; each link turns it into what stands for it on its bus.
+    Refusals carry an `ErrorCode`; each link translates it for its bus.
 
     Parameters
     ----------
@@ -198,7 +198,7 @@ class Requests:
         except (Refused, MessageError) as refused:
             acknowledge.end(refused.code, refused.index)
             return refused.code, []
-        except Exception as error:  # noqa: BLE001 (the OBC gets an answer whatever happens)
+        except Exception as error:  # noqa: BLE001 (the OBC always gets an answer)
             log_internal_error(f"telecommand {request.id}", error)
             acknowledge.end(ErrorCode.INTERNAL)
             return ErrorCode.INTERNAL, []

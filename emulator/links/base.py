@@ -158,7 +158,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._schedule_flush()
 
     def _reset_receiver(self) -> None:
-        """Discard input that is incomplete or waits, as the device has restarted."""
+        """Discard incomplete and pending input, as the device has restarted."""
         self._receiver = self._new_receiver()
         self._held_input.clear()
         self._pending_request = None

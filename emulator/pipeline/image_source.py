@@ -1,4 +1,4 @@
-"""Images from elsewhere in place of rendered ones: a folder of photographs, a camera, or a video."""
+"""Images from a folder of photographs, a camera or a video, instead of rendered ones."""
 
 from __future__ import annotations
 

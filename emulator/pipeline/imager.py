@@ -77,7 +77,7 @@ class _RequestQueue:
         await self._idle.wait()
 
     def _with_preview(self, request: PipelineRequest) -> PipelineRequest:
-        """Return the request, with a preview if somebody looks at the frames."""
+        """Return the request, with a preview if anything shows the images."""
         if self.watchers and isinstance(request, FrameRequest):
             return replace(request, preview=True)
         return request
@@ -153,7 +153,7 @@ class ProcessImager(_RequestQueue):
         return await self._started
 
     async def restart(self) -> PipelineReady:
-        """Start another worker in place of one that has ended, and wait until it is ready.
+        """Start another worker after one has ended, and wait until it is ready.
 
         Raises
         ------
@@ -242,7 +242,7 @@ class ThreadImager(_RequestQueue):
         return await self._started
 
     async def restart(self) -> PipelineReady:
-        """Start another thread in place of one that has ended, and wait until it is ready.
+        """Start another thread after one has ended, and wait until it is ready.
 
         Raises
         ------
@@ -266,7 +266,7 @@ class ThreadImager(_RequestQueue):
     def _run_thread(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
         try:
             self._serve(requests)
-        except BaseException as error:  # noqa: BLE001 (whatever ends the thread, its pending requests must fail)
+        except BaseException as error:  # noqa: BLE001 (its pending requests must fail)
             self._in_loop(self._pipeline_ended, f"pipeline thread: ended: {one_line(error)}")
 
     def _serve(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:

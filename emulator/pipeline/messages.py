@@ -44,7 +44,7 @@ class PipelineSetup:
     dark_frames
         Frames averaged into the dark frame that is subtracted from each image; 0: none.
     images
-        Images from elsewhere in place of rendered ones: keys of a profile's `[images]`.
+        Source of images instead of rendered ones: keys of a profile's `[images]`.
     """
 
     camera: dict[str, Any]
@@ -130,9 +130,9 @@ class FrameRequest:
     faults
         Fields of the sky objects that the control channel overrides.
     temperature_c
-        Temperature of detector and lens, °C; None: that of the sensor model.
+        Temperature of detector and lens, °C; None: the sensor model's.
     particles_s
-        Particles per second that hit the detector, in addition to those of the sky.
+        Particles per second that hit the detector, in addition to the sky's.
     upsets
         Bits that radiation has flipped in the unit's star catalogue.
     unix_s
@@ -167,7 +167,7 @@ class FrameRequest:
 
 @dataclass(frozen=True)
 class Preview:
-    """An image for display, and what is in it.
+    """An image for display, and its overlay.
 
     Attributes
     ----------

@@ -365,7 +365,7 @@ def _within_margin(
 
 
 def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:
-    """Return what is known of the image, with the thresholds of the device's parameters."""
+    """Return statistics of the image, with the thresholds in the device's parameters."""
     return replace(
         known,
         threshold_sigma=settings.detection_threshold,

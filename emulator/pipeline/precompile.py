@@ -21,7 +21,7 @@ def kernel_cache_was_cold() -> bool:
 
 
 def start_helper() -> subprocess.Popen[bytes]:
-    """Start the process that compiles the star identifier; the caller waits for it."""
+    """Start the process that compiles the star identifier; the caller must wait for it."""
     return subprocess.Popen(
         [sys.executable, "-m", "starhil.emulator.pipeline.precompile"], stdin=subprocess.DEVNULL
     )

@@ -92,7 +92,7 @@ def make_preview(
     found: Detections | None = None,
     solution: Solution | None = None,
 ) -> Preview:
-    """Make the preview of a frame; detections are left out of one that was not solved.
+    """Make the preview of a frame; without detections if it was not solved.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def make_overlay(
     found: Detections | None = None,
     solution: Solution | None = None,
 ) -> Overlay:
-    """Return what is drawn over a frame."""
+    """Return the overlay of an image."""
     height, width = frame.image.shape
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V

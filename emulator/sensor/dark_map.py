@@ -19,7 +19,7 @@ _LONGEST_S: Final = 1.0
 
 @dataclass(frozen=True)
 class DarkMap:
-    """The dark signal of each pixel above that of most.
+    """The dark signal of each pixel above the typical one.
 
     Attributes
     ----------

@@ -100,7 +100,7 @@ class SensorModel:
     dark_doubling_c : float
         Rise of the temperature that doubles the dark current, °C; 5 to 8 for silicon.
     row_time_s : float
-        Time from the exposure of one row to that of the next, seconds: 0 for a global shutter, which exposes all rows
+        Time from the exposure of one row to the next, seconds: 0 for a global shutter, which exposes all rows
         at once. The middle row of a rolling shutter is exposed at the time of the frame.
     boresight_drift_x, boresight_drift_y, boresight_drift_z : float
         Rotation of the optics relative to the mounting about the axes of the sensor frame, arcseconds/°C.

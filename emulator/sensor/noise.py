@@ -109,7 +109,7 @@ def fill_normal(
 ) -> None:
     """Fill `normal` (2·LANES,) with standard normal deviates.
 
-    Box–Muller on 32-bit uniforms, so that the tails reach 6.7 standard deviations; the logarithm is that of Cephes
+    Box–Muller on 32-bit uniforms, so that the tails reach 6.7 standard deviations; the logarithm is from Cephes
     (`logf`), sine and cosine minimax polynomials on a quarter turn, all within 1e-6.
     """
     _next_bits(state, bits_a)

@@ -61,7 +61,7 @@ class StarTruth:
     magnitude : ndarray (n,)
         V magnitude.
     visible : ndarray (n,) of bool
-        False for stars that are hidden or left out.
+        False for hidden or omitted stars.
     """
 
     hip: npt.NDArray[np.int32]

@@ -29,7 +29,7 @@ SUN_RADIUS_M: Final = 6.957e8
 MOON_RADIUS_M: Final = 1.7374e6
 EARTH_RADIUS_M: Final = 6.371e6
 SMALLEST_EARTH_RAD: Final = math.radians(0.1)
-"""Angular radius below which the Earth is left out."""
+"""Angular radius below which the Earth is not drawn."""
 MOON_DISTANCE_M: Final = 3.844e8
 """Mean distance of the Moon, for which its magnitude is given."""
 

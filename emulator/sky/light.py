@@ -10,7 +10,8 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.directions import disc_in_field, icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Sensitivity, fill, interpolated
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth

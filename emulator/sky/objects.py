@@ -196,7 +196,7 @@ class SkyObjects:
     false_star_magnitudes : (float, float)
         Range of the magnitudes of false stars, brighter first; uniformly distributed.
     missing_stars : int
-        Number of catalogue stars left out, the brightest of the field.
+        Number of catalogue stars omitted, the brightest in the field.
     cosmic_rays_s : float
         Mean number of particles per second that hit the detector, each leaving a streak.
     blank : bool

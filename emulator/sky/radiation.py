@@ -29,7 +29,7 @@ def sub_satellite_point(position_m: npt.ArrayLike, unix_s: float) -> tuple[float
     position_m : array (3,)
         Position in GCRS, metres; precession since J2000 (0.4° by 2026) is neglected.
     unix_s : float
-        Time, taken as UT1. The Earth rotation angle is that of IERS Conventions 2010, equation 5.15.
+        Time, taken as UT1. The Earth rotation angle is equation 5.15 of the IERS Conventions 2010.
     """
     x, y, z = (float(value) for value in np.asarray(position_m, dtype=np.float64) / 1000.0)
     distance = math.sqrt(x * x + y * y + z * z)

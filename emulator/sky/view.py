@@ -48,7 +48,7 @@ class SkyView:
 
 
 def has_aberration(values: Mapping[str, Any]) -> Any:
-    """Return whether a table `[sky]` shows stars with aberration: what it says, else whether it has a date."""
+    """Return whether a table `[sky]` shows stars with aberration: its key `aberration`, else whether it has a date."""
     return values.get("aberration", values.get("date") is not None or values.get("bodies") == BODIES[1])
 
 
@@ -99,11 +99,11 @@ class Sky:
         Parameters
         ----------
         unix_s
-            Date, Unix time; None: only what is typed in.
+            Date, Unix time; None: only bodies that are given.
         position_m, velocity_m_s
             Relative to the Earth's centre, GCRS (3,); None: at the centre.
         faults
-            Fields of `SkyObjects` in place of the profile's.
+            Fields of `SkyObjects` that replace the profile's.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Sky:
         return SkyView(objects, observer if self._moving else None)
 
     def _with_bodies(self, objects: SkyObjects, observer: Observer) -> SkyObjects:
-        """Add the bodies of the date, but those that are typed in; what the Earth hides is left out."""
+        """Add the bodies of the date, except given ones and bodies hidden by the Earth."""
         changes: dict[str, Any] = {"planets": objects.planets + planets_seen_by(observer)}
         earth = objects.earth or earth_seen_by(observer, self._styles["earth"])
         changes["earth"] = earth

@@ -21,7 +21,7 @@ GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
 
 _LEAST_E: Final = 0.05
-"""Light of the atmosphere that is left out, electrons."""
+"""Light of the atmosphere that is neglected, electrons."""
 
 _ERROR_E: Final = 1.0
 """Largest error of light that is interpolated in a cell, electrons."""
@@ -105,7 +105,7 @@ class WideEarth:
 
 @inner
 def _glow(height: Line, line: Line, first: int, last: int) -> None:
-    """Brightness of the atmosphere over that of the disc in some cells, from its height at every `GLARE_STEP`-th column."""
+    """Brightness of the atmosphere relative to the disc's in some cells, from its height at every `GLARE_STEP`-th column."""
     for i in range(first, last):
         start, end = height[i], height[i + 1]
         if max(start, end) <= 0.0:

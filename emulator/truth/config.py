@@ -83,9 +83,9 @@ class AttitudeConfig(Strict):
     dec_deg: Annotated[float, Field(ge=-90.0, le=90.0)] | None = None
     """Declination of the boresight."""
     roll_deg: Turn | None = None
-    """Angle by which celestial north is turned counter-clockwise in the image; 0 if left out."""
+    """Angle by which celestial north is turned counter-clockwise in the image; default: 0."""
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
-    """Quaternion ICRS to sensor, scalar last, of length 1; in place of the angles."""
+    """Unit quaternion, ICRS to sensor, scalar last; instead of the angles."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -96,7 +96,7 @@ class AttitudeConfig(Strict):
             if abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
                 raise ValueError("quaternion_xyzw is not of length 1")
         elif self.ra_deg is None or self.dec_deg is None:
-            raise ValueError("give ra_deg and dec_deg (roll_deg is 0 if left out), or quaternion_xyzw")
+            raise ValueError("give ra_deg and dec_deg (roll_deg defaults to 0), or quaternion_xyzw")
         return self
 
     def build(self) -> Attitude:
@@ -125,7 +125,7 @@ class MountConfig(Strict):
     matrix: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
     """The sensor's x, y and z axis in the body frame, as three rows."""
     euler_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
-    """Angles by which the body axes are turned, one after the other, to become those of the sensor, as 42 has them."""
+    """Angles of the successive rotations from the body axes to the sensor's, in 42's convention."""
     sequence: Annotated[str, Field(pattern="^[123]{3}$")] = "321"
     """Axes of `euler_deg`: 1 is x, 2 is y, 3 is z."""
 
@@ -167,7 +167,7 @@ class FixedConfig(Strict):
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """The attitude."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
@@ -184,7 +184,7 @@ class RateConfig(Strict):
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the rotation begins now."""
@@ -258,7 +258,7 @@ class SlewConfig(Strict):
     repeat: bool = False
     """Begin again after the last segment."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -278,7 +278,7 @@ class FileConfig(Strict):
     repeat: bool = False
     """Begin again after the last row."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth is then the body's."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
@@ -300,9 +300,9 @@ class LiveConfig(Strict):
     convention: Literal["rotation", "attitude"] = "rotation"
     """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42, Basilisk and most textbooks."""
     order: Literal["xyzw", "wxyz"] = "xyzw"
-    """Where the scalar of `q` stands: last or first."""
+    """Position of the scalar in `q`: last or first."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
-    """Silence after which the attitude stands still and is flagged `stale`."""
+    """Silence after which the attitude is held and flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
     """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds of simulation time."""
     lockstep: bool = False
@@ -310,7 +310,7 @@ class LiveConfig(Strict):
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude before the first message."""
     mount: MountConfig | None = None
-    """Mount of the sensor: the messages are then those of the body."""
+    """Mount of the sensor on the body; the messages then describe the body."""
 
     @model_validator(mode="after")
     def _answers_have_a_way_back(self) -> Self:
@@ -349,7 +349,7 @@ class Config42(Strict):
     orbit: Annotated[int, Field(ge=0, le=999)] = 0
     """Number of its reference orbit, i of `Orb[i]`."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
-    """Silence after which the attitude stands still and is flagged `stale`."""
+    """Silence after which the attitude is held and flagged `stale`."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude before the first message."""
     mount: MountConfig | None = None

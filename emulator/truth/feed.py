@@ -66,7 +66,7 @@ class LiveFeed:
         self._writers: set[asyncio.StreamWriter] = set()
 
     async def start(self, socket: Socket, host: str, port: int) -> str:
-        """Listen, or begin to connect; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
+        """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
 
         Raises
         ------
@@ -145,7 +145,7 @@ class LiveFeed:
             writer.close()
 
     async def _answer(self, data: bytes, writer: asyncio.StreamWriter) -> None:
-        """Process one message from a connection, and answer it if its sender waits for that."""
+        """Process one message from a connection, and answer it if its sender expects an answer."""
         fault = await self.process(data)
         if self._lock_step is not None or self.truth.format.always_answers:
             writer.write(self.truth.format.answer(self._now_s(), fault))

@@ -18,7 +18,7 @@
     Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, both
     or none.
 ``unix_s``
-    Date, as Unix time. Optional; default: that of the run.
+    Date, as Unix time. Optional; default: the run's.
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class FeedFormat(Protocol):
 
     @property
     def always_answers(self) -> bool:
-        """Whether the sender waits for an answer without lock-step too."""
+        """Whether the sender expects an answer even without lock-step."""
 
 
 @dataclass(frozen=True)

@@ -229,7 +229,7 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
     both = [[name for name in names if name in columns] for names in (QUATERNION_COLUMNS, ANGLE_COLUMNS)]
     if all(both):
         raise EmulatorError(
-            f"{where}: columns {', '.join(both[0])} and {', '.join(both[1])} both give the attitude; leave out one set"
+            f"{where}: columns {', '.join(both[0])} and {', '.join(both[1])} both give the attitude; remove one set"
         )
     for needed in (QUATERNION_COLUMNS, ANGLE_COLUMNS):
         if "t" in columns and all(name in columns for name in needed):

@@ -25,7 +25,7 @@ class LockStep:
     Parameters
     ----------
     truth
-        Receives the messages; its timeline becomes that of the run.
+        Receives the messages; the run follows its timeline.
     now_s
         Returns the simulation time in seconds.
     step

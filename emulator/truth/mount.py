@@ -1,4 +1,4 @@
-"""The truth of a sensor from that of the body on which it is mounted."""
+"""The truth of a sensor, from the truth of the body that it is mounted on."""
 
 from __future__ import annotations
 
@@ -40,5 +40,5 @@ class MountedTruth:
 
 
 def mounted(body: TruthSource, mount: Attitude | None) -> TruthSource:
-    """Return the truth of a sensor; without a mount, its frame is that of the body."""
+    """Return the truth of a sensor; without a mount, its frame is the body frame."""
     return body if mount is None else MountedTruth(body, mount)

@@ -10,7 +10,7 @@ A message is a block of text lines that ends with ``[ENDMSG]``::
     [ENDMSG]
 
 ``qn`` is an attitude quaternion J2000 → body, scalar last: the conjugate of that used here. ``wn`` is the body rate in
-the body frame, rad/s. ``PosN`` and ``VelN`` are those of the reference orbit, to which ``SC[0].PosR`` and
+the body frame, rad/s. ``PosN`` and ``VelN`` belong to the reference orbit, to which ``SC[0].PosR`` and
 ``VelR`` are added. Older versions of 42 write no brackets, and ``qn`` of bodies only. 42 waits for four bytes,
 ``Ack`` and a zero, after each message if its blocking is on.
 """
@@ -83,7 +83,7 @@ class Format42:
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)
-        """Return what 42 waits for."""
+        """Return the answer that 42 expects."""
         return ACKNOWLEDGE
 
 

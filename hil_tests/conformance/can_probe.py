@@ -42,7 +42,7 @@ def segments(data: bytes) -> list[bytes]:
 
 
 class CanWire(PortProbe):
-    """Sends requests and decodes answers on a CAN bus, whatever the rows of the unit.
+    """Sends requests and decodes answers on a CAN bus, with any unit's rows.
 
     Parameters
     ----------

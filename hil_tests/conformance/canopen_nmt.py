@@ -136,7 +136,7 @@ def heartbeat_off(probe: CanopenProbe) -> None:
     probe.expect_silence(0x700 + probe.node, "heartbeat", 0.3)
 
 
-@ERROR_CONTROL.case("heartbeat-stopped", "heartbeat goes on in STOPPED", "CiA 301 7.3.2.2.5")
+@ERROR_CONTROL.case("heartbeat-stopped", "the heartbeat continues in STOPPED", "CiA 301 7.3.2.2.5")
 def heartbeat_stopped(probe: CanopenProbe) -> None:
     _prepare(probe)
     probe.command(STOP)

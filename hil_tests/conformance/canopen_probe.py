@@ -252,7 +252,7 @@ class CanopenProbe:
         self.send(0x600 + self.node, data.ljust(8, b"\0"))
 
     def abandon_transfer(self) -> None:
-        """Send an abort for the last transfer, so that none goes on from one case to the next."""
+        """Send an abort for the last transfer, so that no transfer continues into the next case."""
         self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
         self.drain()
 
@@ -275,7 +275,7 @@ class CanopenProbe:
     def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
         """Fail unless an SDO answer is an abort with one of the codes.
 
-        An empty multiplexer stands for any.
+        An empty multiplexer matches any.
         """
         expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
         if seen is None:
@@ -364,7 +364,7 @@ class CanopenProbe:
     def reset_to_stored_values(self) -> None:
         """Bring the node to PRE-OPERATIONAL with its stored values, if it boots.
 
-        Other cases than those of the boot-up go on without a boot-up message.
+        Cases that do not test the boot-up continue without a boot-up message.
         """
         self.abandon_transfer()
         self.command(RESET_COMMUNICATION)

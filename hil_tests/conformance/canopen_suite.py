@@ -38,7 +38,7 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
         canopen_design,
     )
 )
-"""Those of CiA 301, whatever the unit."""
+"""Cases of CiA 301, for any unit."""
 
 
 def canopen_suite(icd: InterfaceDefinition) -> tuple[Case[CanopenProbe], ...]:

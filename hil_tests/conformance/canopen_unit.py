@@ -136,7 +136,7 @@ def _case(
 
 
 def _turned(slot: Slot | None, data: bytes) -> bytes:
-    """Change bytes between the order of a slot and that of CANopen, little-endian."""
+    """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
     return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
 
 
@@ -167,7 +167,7 @@ def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Va
 
 
 def _written(entry: Entry, command: Row, data: bytes) -> bytes:
-    """Return what is written to an entry to execute a telecommand with this data."""
+    """Return the bytes to write to an entry to execute a telecommand with this data."""
     part = command.slots[0] if entry.part is None and len(command.slots) == 1 else entry.part
     if not data:
         return b"\x01"
@@ -266,7 +266,7 @@ def _accepted(entry: Entry, command: Row) -> Run:
 
 
 def _restarts(entry: Entry, command: Row, mode: Entry | None) -> Run:
-    """Have the unit restart, and wait until the mode that an entry reports is no longer that of booting."""
+    """Have the unit restart, and wait until the mode that an entry reports is no longer the boot mode."""
 
     def run(probe: CanopenProbe) -> None:
         probe.drain()
@@ -322,9 +322,7 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         entry.command.name: entry.command for entry in found if entry.command and entry.part
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
-        title = (
-            f"each entry of {command.name} keeps what was written to it, whatever is written to the others"
-        )
+        title = f"each entry of {command.name} keeps the value written to it when others are written"
         yield _case("records", command.name, title, _kept(command, members), clause_of_row(command))
 
 

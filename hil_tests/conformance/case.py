@@ -1,4 +1,4 @@
-"""A conformance case: what it checks, where that is written, and how it is run."""
+"""A conformance case: what it checks, its source, and its function."""
 
 from __future__ import annotations
 

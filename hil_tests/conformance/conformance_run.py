@@ -59,7 +59,7 @@ class ConformanceRequest:
     speed: float = 1.0
     times: ProbeTimes = field(default_factory=ProbeTimes)
     view: str | None = None
-    """Address of the console that shows the outcomes; `auto` with `start`: that of the started emulator."""
+    """Address of the console that shows the outcomes; `auto` with `start`: the started emulator's."""
 
 
 def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
@@ -176,7 +176,7 @@ def _run_on_links(
     can: str | None,
     on_outcome: Callable[[Outcome], None],
 ) -> None:
-    """Run the cases of one link after those of the other."""
+    """Run the cases of one link after the other's."""
     with ExitStack() as stack:
         mine = [item for item in cases if item.id.startswith("serial.")]
         if mine and serial is not None:
@@ -257,7 +257,7 @@ def _run_canopen(
     cases: Sequence[Case[Any]],
     on_outcome: Callable[[Outcome], None],
 ) -> None:
-    """Run the CANopen cases with the EDS of the request, else that of the product."""
+    """Run the CANopen cases with the EDS of the request, else the product's."""
     import canopen
     from canopen.objectdictionary import import_od
 

@@ -109,7 +109,7 @@ def block(probe: LinkProbe) -> None:
     check(bmp_file_size(data) > EDGE * EDGE, "a file larger than its pixels", bmp_file_size(data))
 
 
-@BURSTS.case("holes", "with a hole map only what is missing comes")
+@BURSTS.case("holes", "with a hole map only missing packets are sent")
 def holes(probe: LinkProbe) -> None:
     _save(probe)
     _load(probe, 0, 1000)

@@ -80,7 +80,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class ProbeTimes:
-    """How long the tester waits.
+    """Timeouts of the tester.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class ProbeTimes:
 
 
 class PortProbe(ABC):
-    """A port, its clock, and waiting on it, whatever is asked over it."""
+    """A port, its clock, and waiting on it, for any kind of traffic."""
 
     link: str
     """`serial` or `can`."""

@@ -122,7 +122,7 @@ class Probe(Protocol):
 
 
 def run_case(probe: Probe, case: Case[Any]) -> Outcome:
-    """Run one case on any link; whatever the device does, or the link, becomes an outcome."""
+    """Run one case on any link; any behaviour of device or link becomes an outcome."""
     probe.log.clear()
 
     def run() -> None:
@@ -221,7 +221,7 @@ def not_run(item: Case[Any], reason: str) -> Outcome:
 
 
 def case_of_run(identifier: str, title: str, clause: str = "starhil conformance") -> Case[Any]:
-    """Return a case that stands for something about the run, and is never run itself."""
+    """Return a case that reports something about the run, and is never run itself."""
     return Case(identifier, identifier.rpartition(".")[0], title, clause, lambda _probe: None)
 
 

@@ -21,12 +21,12 @@ CUBESTAR_ROWS: Final = frozenset(
 
 
 def is_cubestar(icd: InterfaceDefinition) -> bool:
-    """Return whether a unit has the rows that the cases of a CubeStar need; others get those of any unit."""
+    """Return whether a unit has the rows that the CubeStar's cases need; other units get derived cases."""
     return icd.telemetry.keys() >= CUBESTAR_ROWS
 
 
 def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on a serial line: those of a CubeStar, or those that its definition yields.
+    """Return the cases for a unit on a serial line: the CubeStar's, or cases derived from its definition.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
 
 
 def can_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on CAN: those of a CubeStar, or those that its definition yields.
+    """Return the cases for a unit on CAN: the CubeStar's, or cases derived from its definition.
 
     Raises
     ------

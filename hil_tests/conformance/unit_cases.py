@@ -44,7 +44,7 @@ def unit_cases(icd: InterfaceDefinition) -> list[Case[Any]]:
 def unit_row_cases(
     icd: InterfaceDefinition, stack: object = None, *, lengths: bool = True, clause: str
 ) -> list[Case[UnitProbe]]:
-    """Make the cases of the rows of a unit, whatever its link; `stack` is that of a serial line."""
+    """Make the cases of a unit's rows, for any link; `stack` is the serial line's, if it has one."""
     return [
         *_identifiers(icd, stack, clause),
         *_rows(icd),
@@ -352,7 +352,7 @@ def _settings(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
     for row in icd.telemetry.values():
         source = next((field.telecommand for field in row.named_fields.values() if field.telecommand), None)
         if source is not None and icd.telecommands[source].action in (None, "nothing"):
-            title = f"{row.name} reports what {source} has set, whatever the bytes"
+            title = f"{row.name} reports the bytes that {source} has set"
             run = _read_back(icd.telecommands[source], row, used)
             yield _case("settings", row.name, title, run, clause_of_row(row), intrusive=True)
 

@@ -229,7 +229,7 @@ class SerialUnitProbe(SerialWire, UnitProbe):
     # --- requests ---
 
     def expecting(self, *requests: Request) -> None:
-        """Note what is asked, in order."""
+        """Record the requests, in order."""
         for request in requests:
             row = self.icd.rows_by_key.get((request.klass, request.id))
             self._expected.append((request, row.size if row is not None and row.kind == "telemetry" else 0))

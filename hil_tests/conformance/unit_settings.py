@@ -54,7 +54,7 @@ class UnitSettings:
         return UnitSettings(running, stored, defaults, str(status["mode"]))
 
     def prepare(self, probe: LinkProbe) -> None:
-        """Give the cases a unit in standby with its own defaults, whatever was set before."""
+        """Give the cases a unit in standby with its own defaults."""
         probe.standby()
         set_parameters(probe, self.defaults)
 

@@ -1,4 +1,4 @@
-"""Tables of raw traffic on any link: what is answered, and which error flags it sets in `communication_status`."""
+"""Tables of raw traffic on any link: the expected answers, and the error flags set in `communication_status`."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class FlagRow:
     Attributes
     ----------
     id, title
-        Name of the case, and what is wrong with the traffic.
+        Name of the case, and the defect of the traffic.
     sent
         Raw traffic, as `LinkProbe.send_text` takes it.
     flags

@@ -48,7 +48,7 @@ class Application(Protocol):
         """Set a parameter; the value is within the limits of the interface definition."""
 
     def image(self, name: str) -> GreyImage:
-        """Return the image `frame` (the last of `take_image`) or `stored` (that of save_image)."""
+        """Return the image `frame` (from the last `take_image`) or `stored` (from save_image)."""
 
     def take_image(self, name: str) -> Deferred | None:
         """Take an image for reading."""

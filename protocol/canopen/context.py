@@ -9,7 +9,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.dictionary import Dictionary
 
 UNCONFIGURED: int = 0xFF
-"""Node-ID of a node that waits for LSS to assign one."""
+"""Node ID of a node without one, which LSS must assign."""
 
 
 class NmtState(IntEnum):

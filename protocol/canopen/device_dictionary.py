@@ -431,7 +431,7 @@ def span_of(slot: Slot) -> slice:
 
 
 def in_order(slot: Slot, data: bytes) -> bytes:
-    """Change bytes between the order of a slot and that of CANopen, little-endian."""
+    """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
     return data[::-1] if slot.order == "big" and slot.type != "bytes" else data
 
 
@@ -457,5 +457,5 @@ def _describe(member: ODVariable, fields: list[Field]) -> None:
 
 
 def _held_limits(kind: str, low: float, high: float) -> tuple[float, float]:
-    """Return limits that a number of a type can equal: the nearest f32 may lie just outside those of the definition."""
+    """Return limits that a number of a type can equal: the nearest f32 may lie just outside the definition's limits."""
     return (min(low, to_f32(low)), max(high, to_f32(high))) if kind == "f32" else (low, high)

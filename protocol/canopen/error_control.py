@@ -29,7 +29,7 @@ class Monitor:
 
 
 class ErrorControl:
-    """Produces the heartbeat of this node and supervises those of others.
+    """Produces the heartbeat of this node and supervises other nodes' heartbeats.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ class ReceivePdo:
         self.next_deadline: float | None = None
 
     def configure(self) -> None:
-        """Apply the current records; drop what waits for SYNC."""
+        """Apply the current records; drop messages that wait for SYNC."""
         self.records.changed = False
         self._objects = self.records.mapped()
         self._size = sum(mapped.size for mapped in self._objects)
@@ -178,7 +178,7 @@ class TransmitPdo:
             self._send()
 
     def tick(self) -> None:
-        """Send what is due by event or timer."""
+        """Send the PDOs that are due by event or timer."""
         deadline = self.next_deadline
         if deadline is None or self._context.now < deadline:
             return
@@ -243,7 +243,7 @@ class PdoService:
             transmitting.start()
 
     def stop(self) -> None:
-        """Leave OPERATIONAL: drop all that waits."""
+        """Leave OPERATIONAL: drop all pending messages."""
         for receiving in self.receiving:
             receiving.configure()
         for transmitting in self.transmitting:

@@ -117,7 +117,7 @@ def _serial() -> Section:
     choice = (
         "Dialect a is for OBC software written for the CubeComputer: a reply repeats the identifier. Dialect b is for software that "
         "talks to a stand-alone node: a reply begins with the data, and only the request says what they are. Dialect c is "
-        "generation 2. Nothing in a message names its dialect: with b in place of a, each value is read from the byte after its own and "
+        "generation 2. Nothing in a message names its dialect: with b instead of a, each value is read one byte late and "
         "telecommands seem unanswered."
     )
     return Section(

@@ -1,6 +1,6 @@
 """Serial transport over a pseudo-terminal, and the detection of who has its slave side open.
 
-A wire keeps nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while nobody has the
+A wire stores nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while no process has the
 slave side open. inotify reports the openings and closings when one peer leaves and another comes at once.
 """
 
@@ -192,7 +192,7 @@ class PtyTransport(PacedTransport):
         self._process_received(data)
 
     def _drop_unread(self, peers: PtyPeers) -> None:
-        """Drop what a peer that left has not read, and what is queued for it."""
+        """Drop bytes that a closed peer has not read, and bytes queued for it."""
         if peers.all_left():
             if self._writer is not None:
                 self._writer.clear()

@@ -76,7 +76,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         try:
             bus = await self._open_in_thread()
         except (can.CanError, OSError, ValueError, ImportError, TypeError) as error:
-            # not the system's text: that of python-can names the interface
+            # python-can's text, unlike the system's, names the interface
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             raise TransportError(f"CAN {self.description}: cannot open: {reason}") from None
         self._bus = bus
@@ -180,7 +180,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         return True
 
     def _send_queued(self) -> None:
-        """Send a few frames per turn; the kernel drops what is not read in between."""
+        """Send a few frames per turn; the kernel drops frames that are not read in between."""
         self._timer = None
         loop = asyncio.get_running_loop()
         for _ in range(SENDS_PER_TURN):

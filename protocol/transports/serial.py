@@ -55,7 +55,7 @@ def open_serial(
     if spec in ("auto", "pty"):
         return PtyTransport(pace, symlink)
     if symlink is not None:
-        raise TransportError(f"serial {spec}: a symlink goes only with a pseudo-terminal (auto)")
+        raise TransportError(f"serial {spec}: a symlink needs a pseudo-terminal (auto)")
     if spec.startswith(("socket://", "listen://")):
         host, port = _host_and_port(spec)
         transport = _ConnectTransport if spec.startswith("socket") else _ListenTransport

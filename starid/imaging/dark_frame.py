@@ -29,7 +29,7 @@ def without_dark(image: Counts, excess_dn: Array32) -> Counts:
     image : ndarray (h, w) of uint8 or uint16
         The image.
     excess_dn : ndarray (h, w)
-        Dark signal of each pixel above that of most, counts at the exposure and temperature of the image.
+        Dark signal of each pixel above the typical one, counts at the exposure and temperature of the image.
 
     Returns
     -------

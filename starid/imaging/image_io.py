@@ -89,7 +89,7 @@ def image_suffix(path: Path) -> str:
     Raises
     ------
     StaridError
-        The suffix is not that of a supported format, or the path is a folder.
+        The suffix is of no supported format, or the path is a folder.
     """
     if path.is_dir():
         raise StaridError(f"image {path}: is a folder; name a file in it")

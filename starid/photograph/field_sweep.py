@@ -47,7 +47,7 @@ class FieldSweep:
         self._searches: dict[Camera, RoughSearch] = {}
 
     def _search(self, camera: Camera) -> RoughSearch:
-        """Search for a field of about that of a camera; made when it is first needed."""
+        """Search for a field about as wide as a camera's; made when first needed."""
         if camera not in self._searches:
             self._searches[camera] = RoughSearch(camera, self._catalog, fov_tolerance=TOLERANCE)
         return self._searches[camera]

@@ -177,7 +177,7 @@ def even_choice(xy: Array, brightest: NDArray[np.intp], camera: Camera, depth: i
     brightest : ndarray (n,)
         Rows by falling flux.
     camera : Camera
-        Its width and height are those of the image.
+        Its width and height equal the image's.
     depth : int
         Detections of each cell.
     """

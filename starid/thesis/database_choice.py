@@ -23,7 +23,7 @@ _log = logging.getLogger(__name__)
 
 
 def given_database(path: Path, parameters: DatabaseParameters, stars: Collection[str]) -> FeatureDatabase:
-    """Load a database that somebody built, if it fits.
+    """Load a database file, if it fits.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def given_database(path: Path, parameters: DatabaseParameters, stars: Collection
         raise DatabaseError(f"database: {path} does not hold circles of the brightest stars; build it again")
     if made.band != parameters.band:
         raise DatabaseError(
-            f"database: {path} is made of {made.band} magnitudes; a sensor needs one with --band {parameters.band}"
+            f"database: {path} has {made.band} magnitudes; a sensor needs one with --band {parameters.band}"
         )
     if database.catalog_identity not in stars:
         raise DatabaseError(

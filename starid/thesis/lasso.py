@@ -1,4 +1,4 @@
-"""The LASSO path of a dictionary: all regularisation parameters at once, exactly, in microseconds.
+"""The LASSO path of a dictionary, eq. 2.34: all regularisation parameters at once, exactly, in microseconds.
 
 The solution of min 1/(2M)·‖ψ̂ − Tω‖² + λ‖ω‖₁ is piecewise linear in λ. With five features and nine columns it has a
 dozen or two breakpoints, which the least-angle regression of Efron et al. (2004) with the LASSO modification finds one
@@ -226,7 +226,7 @@ def optimality_gap(gram: Array, correlation: Array, penalty: float, omega: Array
 
 @compiled
 def lasso_path(dictionary: Array, observation: Array, lambdas: Array, weights: Array) -> bool:
-    """Solve the LASSO for all λ, eq. 2.34; return whether the path was followed (False: coordinate descent).
+    """Solve the LASSO for all λ; return whether the path was followed (False: coordinate descent).
 
     It is the least-squares problem of eq. 2.31 with the elastic-net penalty of eq. 2.32, P_a of eq. 2.33, at a = 1.
 

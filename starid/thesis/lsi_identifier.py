@@ -145,7 +145,7 @@ class LsiIdentifier(VerifiedIdentifier):
     catalog
         Default: the whole of Hipparcos at its default epoch.
     options
-        Default: those of `LsiOptions`.
+        Default: `LsiOptions()`.
     **changes
         Fields of `LsiOptions` that are to differ from it.
 

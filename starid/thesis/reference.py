@@ -1,9 +1,9 @@
-"""The thesis's three methods as printed, on scikit-learn: short, slow, and what the compiled code is checked against.
+"""The thesis's three methods as printed, on scikit-learn: short, slow, and the reference for the compiled code.
 
-Nearest neighbour, LASSO and density-based clustering stand here as their equations are written. The compiled code
+Nearest neighbour, LASSO and density-based clustering are written here as in their equations. The compiled code
 (`starid.thesis.cell_search`, `.lasso`, `.matlab_lasso`, `.fsf`) gives the same answers a hundred times faster; the tests
-compare the two. Use this module to read what the thesis does, or in the place of the compiled code where an answer is
-doubted: `LostInSpace(database, solver="sklearn")`, `solver = "sklearn"` in the table `[identifier]` of a profile, the solver
+compare the two. Read this module to see what the thesis does, or use it to verify an answer of the compiled code:
+`LostInSpace(database, solver="sklearn")`, `solver = "sklearn"` in the table `[identifier]` of a profile, the solver
 `lsi-sklearn` of `starhil bench identify`, and `ReferenceFilter` as the filter of `starid.thesis.rsi`.
 """
 

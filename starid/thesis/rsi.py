@@ -15,7 +15,7 @@ from starid.thesis.cme import CameraMotion, MotionModel, matched_motion
 from starid.thesis.false_stars import FalseStarFilter, ObservedFrame
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
-from starid.thesis.rsi_memory import AnswerMemory, Place
+from starid.thesis.rsi_memory import AnswerMemory, Prediction
 
 Mode = Literal["lsi", "rsi"]
 
@@ -23,7 +23,7 @@ _FEWEST_VOTES: Final = 2
 
 
 class RsiError(StaridError):
-    """Settings or frames that the recursive algorithm refuses."""
+    """Settings or frames that the recursive algorithm rejects."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,16 +39,16 @@ class RsiSettings:
     gamma_min_deg, gamma_scale, gamma_lsi_deg
         Γ_min, the factor of its growth, and the side from which on the whole database is searched at once.
     motion_threshold_deg
-        Distance beyond which a match does not count for the motion.
+        Distance beyond which a match is not used for the motion.
     motion_model
-        Transformation that the camera's motion is taken for; the thesis has an affine one.
+        Transformation that models the camera's motion; the thesis uses an affine one.
     angle_in_search
         Count the polar angle as a sixth feature of the search, as the thesis's worked example does. The frame must then
         not be turned by more than a few degrees.
     memory, agreement_deg
-        0: the thesis's algorithm, in which every frame's answer stands, and the last one is where the region of search
-        lies. Otherwise our addition: so many last answers, carried forward with the motion, vote, two of them agreeing
-        when they are within `agreement_deg`; what most agree on is the answer and the centre of the next region.
+        0: the thesis's algorithm, in which each answer is the centre of the next region of search. Otherwise our addition: this
+        many previous answers, carried forward with the motion, vote; two agree if they are within `agreement_deg`. The answer
+        that most agree on is the result and the centre of the next region.
     """
 
     tau: float = 0.5
@@ -77,22 +77,22 @@ class RsiSettings:
 
 @dataclass(frozen=True, eq=False)
 class RsiStep:
-    """What the algorithm made of one frame.
+    """Result of one image.
 
     Attributes
     ----------
     true_stars
-        Which objects the features were made of.
+        Which objects the features were computed from.
     motion
-        Camera motion since the frame before, where there was one.
+        Camera motion since the previous image, if it is known.
     estimate
-        Boresight and polar angle; None when no star was left to go by.
+        Boresight and polar angle; None if no star remained.
     roll_deg
-        Angle by which the frame is turned: observed polar angle less the estimated one, −180 … 180.
+        Roll of the image: observed polar angle less the estimated one, −180 … 180.
     valid
         False for no estimate or ε_ψ > K·τ.
     mode
-        How the search began: in the region ("rsi") or in the whole database ("lsi").
+        First search: in the region ("rsi") or in the whole database ("lsi").
     triggered
         The region's answer exceeded τ, and the whole database was searched as well.
     exceeded
@@ -147,14 +147,14 @@ class RecursiveIdentification:
     lost_in_space
         The LSI algorithm on a planar database.
     false_star_filter
-        Compares the frame before with the frame now; None trusts every object.
+        Compares the previous frame with the current one; None trusts every object.
     settings
         Thresholds and region of search.
 
     Raises
     ------
     RsiError
-        If the database is not planar: the recursive identifier of the product works on the sphere.
+        If the database is not planar; the product's recursive identifier works on the sphere.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class RecursiveIdentification:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past; the next frame is the first."""
+        """Start again: the next frame is the first."""
         self._before: ObservedFrame | None = None
         self._memory = AnswerMemory(max(self.settings.memory, 1), self.settings.agreement_deg)
         self._searches_all = True
@@ -202,7 +202,7 @@ class RecursiveIdentification:
             return RsiStep(true_stars, motion)
         observation = self._lsi.database.normalise(features)
         angle = features.theta_rad if self.settings.angle_in_search else math.nan
-        predicted = self._memory.place()
+        predicted = self._memory.prediction()
         start = time.perf_counter()
         cells = 0
         cell, distance = -1, math.inf
@@ -238,28 +238,28 @@ class RecursiveIdentification:
             lasso_s,
         )
 
-    def _trusts(self, place: Place) -> bool:
-        """Whether the region about a place is searched: not after a frame in doubt, unless several answers agree."""
-        return not self._searches_all or place.votes >= _FEWEST_VOTES
+    def _trusts(self, predicted: Prediction) -> bool:
+        """Whether the region around a prediction is searched: not after a doubtful frame, unless several answers agree."""
+        return not self._searches_all or predicted.votes >= _FEWEST_VOTES
 
     def _voted(self, estimate: LsiEstimate, features: FeatureVector) -> tuple[LsiEstimate, float]:
-        """Remember a valid answer; return the one to give and the roll: with a memory, what most answers agree on."""
+        """Remember a valid answer; return answer and roll: with a memory, those that most answers agree on."""
         roll = (features.theta_deg - math.degrees(estimate.theta_rad) + 180.0) % 360.0 - 180.0
         if estimate.error_psi <= self.settings.invalid_factor * self.settings.tau:
             self._memory.add(estimate.right_ascension_deg, estimate.declination_deg, roll)
         elif self.settings.memory == 0:
             self._memory.clear()
-        place = self._memory.place() if self.settings.memory > 0 else None
-        if place is None or place.votes < _FEWEST_VOTES:
+        agreed = self._memory.prediction() if self.settings.memory > 0 else None
+        if agreed is None or agreed.votes < _FEWEST_VOTES:
             return estimate, roll
-        theta = math.remainder(math.radians(features.theta_deg - place.roll_deg), 2.0 * math.pi)
+        theta = math.remainder(math.radians(features.theta_deg - agreed.roll_deg), 2.0 * math.pi)
         voted = replace(
             estimate,
-            right_ascension_deg=place.right_ascension_deg,
-            declination_deg=place.declination_deg,
+            right_ascension_deg=agreed.right_ascension_deg,
+            declination_deg=agreed.declination_deg,
             theta_rad=theta,
         )
-        return voted, place.roll_deg
+        return voted, agreed.roll_deg
 
     def _whole_database(
         self, observation: Array, angle: float, solution: LsiSolution
@@ -273,7 +273,7 @@ class RecursiveIdentification:
         return better, found - start, solved - found
 
     def _filtered(self, frame: ObservedFrame) -> tuple[Mask, CameraMotion | None]:
-        """Which objects are stars, and how they moved; without a frame before, or matches, all and None."""
+        """Return which objects are stars, and their motion; without a previous frame or matches, all and None."""
         everything = np.ones(len(frame), dtype=np.bool_)
         if self._before is None or self._filter is None:
             return everything, None

@@ -56,7 +56,7 @@ class RsiStatistics:
 
 @dataclass(frozen=True)
 class RsiOptions(LsiOptions):
-    """Settings of an RSI identifier: those of the LSI one, and these.
+    """Settings of an RSI identifier, in addition to the LSI identifier's.
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class RsiIdentifier(SingleCameraIdentifier):
     camera, catalog
         As in `LsiIdentifier`.
     options
-        Default: those of `RsiOptions`.
+        Default: `RsiOptions()`.
     **changes
         Fields of `RsiOptions` that are to differ from it.
     """
@@ -154,7 +154,7 @@ class RsiIdentifier(SingleCameraIdentifier):
     def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
         """Attitude from the region of search about a predicted one, or from the whole sky if that fails.
 
-        A prediction serves to place the region; neither its roll nor what it is off by within the region matters. Where the
+        A prediction only places the region; its roll, and its error within the region, do not matter. Where the
         window is wider than the region, the region is widened to it, up to the field of view.
         """
         true_stars, side = self._follow(measured.xy, measured.flux)
@@ -184,8 +184,8 @@ class RsiIdentifier(SingleCameraIdentifier):
         directions = self.camera.back_project(xy[usable])
         ahead = np.isfinite(directions).all(axis=1) & (directions[:, 2] > 0.0)
         usable = usable[ahead]
-        place = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
-        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), place)
+        positions = np.degrees(directions[ahead, :2] / directions[ahead, 2:3])
+        frame = ObservedFrame(-2.5 * np.log10(flux[usable]), positions)
         before, self._before = self._before, frame
         if before is None:
             return everything, self._settings.gamma_min_deg
@@ -218,11 +218,11 @@ class RsiIdentifier(SingleCameraIdentifier):
         cell, distance, _ = lsi.lost_in_space.nearest_in_region(
             observation, predicted.ra_deg, predicted.dec_deg, side_deg
         )
-        places = _spots(predicted, side_deg)
+        centres = _spots(predicted, side_deg)
         if cell >= 0:
             answer = lsi.lost_in_space.estimate(observation, cell, distance).mse
-            places = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], places])
-        for attitude, _ in lsi.attitudes(chosen, places):
+            centres = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], centres])
+        for attitude, _ in lsi.attitudes(chosen, centres):
             if attitude is None:
                 continue
             solution = lsi.verify(measured, attitude, WINDOW_PX)

@@ -1,7 +1,7 @@
-"""Answers of the last frames, carried forward with the measured motion, vote for where the camera looks now.
+"""Prediction of the boresight: a vote of the last answers, carried forward with the measured motion.
 
-Our addition to the recursive algorithm. The camera's motion is measured to hundredths of a degree, while an answer is now
-and then wrong by a degree, or by half the sky: answers that agree once the motion between them is taken out are right.
+Our addition to the recursive algorithm. The camera's motion is measured to hundredths of a degree, while an answer is
+occasionally wrong by a degree, or by half the sky. Answers that agree once the motion between them is removed are correct.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ _RA, _DEC, _ROLL, _TURN, _X, _Y = range(6)
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
-    """Where the camera looks.
+class Prediction:
+    """Predicted boresight and roll.
 
     Attributes
     ----------
     right_ascension_deg, declination_deg, roll_deg
-        Boresight and the angle by which the frame is turned, degrees.
+        Boresight and roll, degrees.
     votes
-        Number of answers that agree on it.
+        Number of answers that agree with it.
     """
 
     right_ascension_deg: float
@@ -41,7 +41,7 @@ class AnswerMemory:
     Parameters
     ----------
     size
-        Number of answers that are remembered.
+        Maximum number of answers.
     agreement_deg
         Distance within which two answers agree, degrees.
     """
@@ -52,25 +52,24 @@ class AnswerMemory:
         self._answers = np.empty((0, 6))
 
     def clear(self) -> None:
-        """Forget all answers, as when the motion since them is not known."""
+        """Discard all answers, for example because the motion since is unknown."""
         self._answers = np.empty((0, 6))
 
     def add(self, right_ascension_deg: float, declination_deg: float, roll_deg: float) -> None:
-        """Remember the answer of the frame at hand, degrees."""
+        """Add the answer of the current frame, degrees."""
         answer = np.array([[right_ascension_deg, declination_deg, roll_deg, 0.0, 0.0, 0.0]])
         self._answers = np.concatenate([self._answers, answer])[-self._size :]
 
     def carry(self, motion: CameraMotion) -> None:
-        """Go on to the next frame, to which the stars moved by `motion`."""
+        """Carry all answers to the next frame, in which the stars have moved by `motion`."""
         answers = self._answers
         answers[:, _TURN] += motion.rotation_deg
         answers[:, _X : _Y + 1] = motion.apply(answers[:, _X : _Y + 1])
 
-    def place(self) -> Place | None:
-        """The place in the frame at hand on which most answers agree; of equal numbers the latest; None without any.
+    def prediction(self) -> Prediction | None:
+        """Return the prediction that most answers agree on, the latest of several, or None without answers.
 
-        The answers' rolls, each turned on by the motion since, are voted on first, as the motion in the sky depends on
-        them.
+        The rolls, each carried forward with the motion, are voted on first, as the motion in the sky depends on them.
         """
         answers = self._answers
         if answers.shape[0] == 0:
@@ -90,7 +89,7 @@ class AnswerMemory:
         members = agrees[winner]
         east = float(np.median(_wrapped(ra[members] - ra[winner])))
         turn = float(np.median(_wrapped(rolls[members] - roll)))
-        return Place(
+        return Prediction(
             float((ra[winner] + east) % 360.0),
             float(np.median(dec[members])),
             float(_wrapped(np.array(roll + turn))),

@@ -38,7 +38,7 @@ UNREADABLE = (
 @pytest.mark.parametrize(
     ("mutant", "caught_by", "seen"), UNREADABLE, ids=lambda item: getattr(item, "name", "")
 )
-def test_frames_that_cannot_be_taken_apart_fail_their_cases_and_the_run_goes_on(mutant, caught_by, seen):
+def test_frames_that_cannot_be_parsed_fail_their_cases_and_the_run_continues(mutant, caught_by, seen):
     outcomes = run_cases(simulated_probe(load(mutant)), CANOPEN_CASES)
     assert [outcome.id for outcome in outcomes] == [case.id for case in CANOPEN_CASES]
     caught = next(outcome for outcome in outcomes if outcome.id == caught_by)

@@ -99,7 +99,7 @@ def assert_as_found(unit: SimulatedUnit) -> None:
 
 
 @pytest.mark.parametrize("link", ["serial", "can"])
-def test_cases_pass_whatever_was_set_and_leave_it_so(link):
+def test_cases_pass_with_any_settings_and_restore_them(link):
     cases = [
         case for case in SUITES[link] if case.id.split(".")[1] in ("modes", "store", "parameters", "reset")
     ]

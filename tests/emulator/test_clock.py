@@ -5,7 +5,7 @@ from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 
 
-def test_stepped_clock_stands_still_until_told():
+def test_the_stepped_clock_stands_still_until_stepped():
     clock = SteppedClock()
     assert clock.now_ns() == clock.now_ns() == 0
     clock.set_ns(1_500)
@@ -45,7 +45,7 @@ def test_unknown_clocks_are_rejected_in_one_line(text):
     assert "\n" not in str(refusal.value)
 
 
-def test_device_time_runs_on_from_what_it_was_set_to():
+def test_device_time_runs_on_from_the_set_time():
     clock = SteppedClock()
     time = DeviceTime(clock)
     clock.set_ns(5_000_000_000)

@@ -40,7 +40,7 @@ def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
     assert run(scenario, options=options).roll_deg == pytest.approx(25.0)
 
 
-def test_the_ready_line_tells_what_was_taken(run):
+def test_the_ready_line_names_links_seed_and_clock(run):
     async def scenario(emulation, line):
         words = dict(word.split("=", 1) for word in line.removeprefix("ready ").split())
         assert words["serial"].startswith("/dev/pts/")
@@ -88,7 +88,7 @@ def test_the_truth_log_has_a_row_a_frame(run, tmp_path):
     assert records[-1]["reason"] == "no_match"
 
 
-def test_a_truth_log_on_a_full_disk_ends_with_a_whole_row_and_the_run_goes_on(run, tmp_path, caplog):
+def test_a_truth_log_on_a_full_disk_ends_with_a_whole_row_and_the_run_continues(run, tmp_path, caplog):
     path = tmp_path / "truth.csv"
     room = len(",".join(COLUMNS)) + 700  # the head, a frame, and a part of the next
 
@@ -166,7 +166,7 @@ def test_a_scenario_happens_at_its_run_times(run, tmp_path):
         ('truth = { kind = "file", path = "gone.csv" }', "gone.csv: cannot be read"),
     ],
 )
-def test_what_a_scenario_cannot_do_is_rejected_at_the_start_and_not_counted(run, tmp_path, event, said):
+def test_an_impossible_scenario_event_is_rejected_at_the_start_and_not_counted(run, tmp_path, event, said):
     path = tmp_path / "day.toml"
     path.write_text(f"[[at]]\nrun_time_s = 90.0\n{event}\n")
     started = []
@@ -181,7 +181,7 @@ def test_what_a_scenario_cannot_do_is_rejected_at_the_start_and_not_counted(run,
     assert not started
 
 
-def test_a_truth_file_of_a_scenario_is_read_at_the_start_and_begins_at_its_run_time(run, tmp_path):
+def test_a_truth_file_of_a_scenario_is_read_at_the_start_and_starts_at_its_time(run, tmp_path):
     path, table = tmp_path / "day.toml", tmp_path / "table.csv"
     table.write_text("t,ra_deg,dec_deg,roll_deg\n0,10,0,0\n1,20,0,0\n")
     path.write_text(
@@ -236,7 +236,7 @@ def test_a_bad_scenario_is_named_with_file_and_key(tmp_path, text, said):
     assert "\n" not in str(refusal.value)
 
 
-def test_an_unknown_scenario_tells_the_known_ones():
+def test_an_unknown_scenario_is_answered_with_the_known_ones():
     with pytest.raises(EmulatorError, match="bad_day"):
         load_scenario("bad_dya")
 
@@ -257,7 +257,7 @@ def test_an_unknown_scenario_tells_the_known_ones():
         (RunOptions(), {"run": {"clock": "sundial"}}, "sundial"),
     ],
 )
-def test_what_cannot_be_had_is_said_in_one_line(run, options, overrides, said):
+def test_unavailable_resources_are_reported_in_one_line(run, options, overrides, said):
     async def scenario(_emulation, _line):
         pytest.fail("started")
 
@@ -291,7 +291,9 @@ def test_a_start_that_is_rejected_is_not_counted(run, tmp_path, monkeypatch):
     assert run(scenario, run=state) == 3
 
 
-def test_a_camera_beyond_its_parameters_is_rejected_and_all_is_given_back(run, tmp_path, monkeypatch):
+def test_a_camera_beyond_its_parameters_is_rejected_and_all_resources_are_released(
+    run, tmp_path, monkeypatch
+):
     link = tmp_path / "tty"
     links = {"serial": {"port": "auto", "symlink": str(link)}, "can": {"channel": "off"}}
     state = {"clock": "stepped", "state_dir": str(tmp_path)}
@@ -335,7 +337,7 @@ def test_a_truth_log_that_cannot_be_written_is_rejected(run, tmp_path):
 
 
 @pytest.mark.process
-def test_a_pipeline_that_dies_is_told_and_comes_back():
+def test_a_pipeline_that_dies_is_reported_and_restarted():
     profile = Profile.model_validate(
         {"links": {"serial": {"port": "off"}, "can": {"channel": "off"}}, "run": {"clock": "stepped"}}
     )
@@ -459,7 +461,7 @@ def test_an_observer_that_fails_stops_neither_the_frames_nor_the_other_observers
 
 
 @pytest.mark.parametrize("clock", ["stepped", "scaled:20"])
-def test_an_event_that_fails_is_logged_and_time_goes_on(run, caplog, clock):
+def test_an_event_that_fails_is_logged_and_time_continues(run, caplog, clock):
     async def scenario(emulation, _line):
         done = []
         now_ns = emulation.clock.now_ns()

@@ -69,7 +69,7 @@ def test_a_calibrated_camera_takes_the_place_of_the_field_of_view(tmp_path):
     assert "focal_px" not in load_profile(back).camera.values()
 
 
-def test_a_camera_of_its_own_is_known_exactly_unless_the_profile_says_otherwise(tmp_path):
+def test_a_profile_s_camera_is_known_exactly_by_default(tmp_path):
     mine = 'extends = "cubestar"\n[camera]\nfov_deg = 20.0\n'
     assert not load_profile(write(tmp_path, mine)).parameters.keys() & CALIBRATION
     corrected = load_profile(write(tmp_path, f"{mine}[parameters]\nk1 = -0.14\n")).parameters

@@ -37,7 +37,7 @@ def errors_arcsec(pipeline, parameters) -> list[float]:
 
 
 @pytest.mark.parametrize(("name", "noise_arcsec"), [("real_lens", 2.0), ("cubestar", 25.0)])
-def test_a_calibration_that_is_a_little_wrong_costs_what_a_data_sheet_allows(name, noise_arcsec):
+def test_a_slightly_wrong_calibration_stays_within_the_data_sheet(name, noise_arcsec):
     profile, icd = load_profile(name, ["run.clock=stepped"]), load_unit()
     pipeline = Pipeline(pipeline_setup(profile))
     constants = camera_constants(PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), 0.0))

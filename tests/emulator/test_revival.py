@@ -79,7 +79,7 @@ def test_modes_can_be_commanded_again_when_the_pipeline_is_back(run, others):
 
 
 @pytest.mark.parametrize("program", [ENDS_AT_ONCE, REJECTS, ENDS_WHEN_READY])
-def test_a_pipeline_that_does_not_come_back_is_given_up_until_a_reset(run, caplog, program):
+def test_a_pipeline_that_does_not_restart_is_abandoned_until_a_reset(run, caplog, program):
     programs = [ANSWERING, *[program] * ATTEMPTS, ANSWERING]
 
     async def scenario(emulation, started):

@@ -146,7 +146,7 @@ def test_the_real_sky_gives_the_true_attitude(stepped):
     assert frame["total_arcsec"] == pytest.approx(error.total_arcsec, abs=0.1)
 
 
-def test_an_image_is_what_the_sensor_saw(stepped):
+def test_a_downloaded_image_is_the_exposed_one(stepped):
     stepped.command("save_image", image_size="size_128")
     stepped.do("step", seconds=2.0)
     assert stepped.read("image_status")["percent"] == 100

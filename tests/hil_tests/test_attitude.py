@@ -48,7 +48,7 @@ def test_the_boresight_points_where_ra_and_dec_say(ra, dec, roll, expected):
 
 @given(angles, declinations, angles)
 @settings(max_examples=200, deadline=None, derandomize=True)
-def test_rows_of_the_matrix_are_those_of_the_convention(ra, dec, roll):
+def test_rows_of_the_matrix_follow_the_convention(ra, dec, roll):
     alpha, delta, rho = (math.radians(v) for v in (ra, dec, roll))
     north = (-math.sin(delta) * math.cos(alpha), -math.sin(delta) * math.sin(alpha), math.cos(delta))
     east = (-math.sin(alpha), math.cos(alpha), 0.0)
@@ -100,7 +100,7 @@ def test_the_vector_part_alone_gives_the_attitude(ra, dec, roll):
 @pytest.mark.parametrize(
     "values", [(0.0, 0.0, 0.0, 0.0), (1.0, 1.0, 0.0, 0.0), (math.nan, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0)]
 )
-def test_what_is_no_attitude_is_rejected(values):
+def test_an_invalid_attitude_is_rejected(values):
     with pytest.raises(BenchError, match="quaternion"):
         unit(values)
 

@@ -157,7 +157,7 @@ def test_a_bad_device_on_serial_is_found(fault: Answer, dialect: Dialect) -> Non
     assert not load.good
 
 
-def test_a_device_that_sends_nothing_unasked_is_told() -> None:
+def test_a_device_without_unsolicited_telemetry_is_reported() -> None:
     async def main() -> None:
         async with can_device(good) as spec:
             with pytest.raises(BenchError, match="only 0 messages came"):
@@ -172,7 +172,7 @@ def test_a_device_that_sends_nothing_unasked_is_told() -> None:
     asyncio.run(main())
 
 
-def test_spreads_are_those_of_the_ordered_values() -> None:
+def test_spreads_are_quantiles_of_the_values() -> None:
     spread = Spread.of([value / 1000 for value in range(100, 0, -1)])
     assert (spread.p50_ms, spread.p99_ms, spread.max_ms) == (51.0, 100.0, 100.0)
     assert Spread.of([]).max_ms != Spread.of([]).max_ms

@@ -46,7 +46,7 @@ def test_telemetry_comes_in_physical_units(pair):
     assert 0.0 < reading.latency_s < PATIENCE_S
 
 
-def test_a_telecommand_reaches_the_device_as_it_was_given(pair):
+def test_a_telecommand_reaches_the_device_unchanged(pair):
     device, client = pair
     acknowledge = client.command("set_unix_time", seconds=0x1F1F1F1F, milliseconds=31)
     assert acknowledge.name == "set_unix_time"
@@ -116,7 +116,7 @@ def test_no_reply_is_an_error_after_the_time_out_and_is_tried_again_only_if_aske
     ]
 
 
-def test_a_late_reply_is_not_taken_for_that_of_the_next_request(pair):
+def test_a_late_reply_is_not_taken_as_the_next_request_s(pair):
     device, client = pair
     device.telemetry["rates"] = {"rate_x": 1.0}
     device.telemetry["quaternion"] = {"q_x": 0.5}
@@ -129,7 +129,7 @@ def test_a_late_reply_is_not_taken_for_that_of_the_next_request(pair):
     assert client.telemetry("quaternion")["q_x"] == 0.5
 
 
-def test_a_request_by_number_may_be_one_that_nobody_defined(pair):
+def test_a_request_by_number_may_be_undefined(pair):
     _device, client = pair
     for identifier in (200, 60):
         with pytest.raises(NackError) as caught:
@@ -186,7 +186,7 @@ def test_an_image_is_downloaded_by_bursts_and_lost_packets_are_asked_for_again(p
     assert image.pixels == device.pixels
 
 
-def test_unsolicited_telemetry_is_a_stream_of_its_own(hub):
+def test_unsolicited_telemetry_is_a_separate_stream(hub):
     with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
         client.read("rates")
         for count in range(3):
@@ -223,7 +223,7 @@ def test_ports_that_are_not_available_are_rejected_in_one_line():
         ObcClient.open()
 
 
-def test_a_vanished_port_is_told_from_a_silent_device():
+def test_a_vanished_port_is_distinguished_from_a_silent_device():
     device = FakeDevice()
     with device, ObcClient.open(serial=device.open_serial(), timeout_s=PATIENCE_S) as client:
         client.read("rates")
@@ -232,7 +232,7 @@ def test_a_vanished_port_is_told_from_a_silent_device():
             client.read("rates", timeout_s=TIMEOUT_S)
 
 
-def test_unsolicited_telemetry_that_nobody_takes_is_bounded_and_stamped_on_receipt(hub, monkeypatch):
+def test_unread_unsolicited_telemetry_is_bounded_and_stamped_on_receipt(hub, monkeypatch):
     monkeypatch.setattr("starhil.hil_tests.async_client.UNSOLICITED_KEPT", 5)
     with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
         began = time.monotonic()

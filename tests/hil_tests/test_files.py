@@ -46,7 +46,7 @@ def test_a_bmp_file_is_read_as_opencv_wrote_it(width):
 
 
 @pytest.mark.parametrize("data", [b"", b"BM", b"PNG" * 50, b"BM" + bytes(100)])
-def test_what_is_no_bmp_is_rejected(data):
+def test_a_file_that_is_no_bmp_is_rejected(data):
     with pytest.raises(BenchError):
         decode_bmp(data)
 
@@ -83,7 +83,7 @@ def test_the_can_log_is_read_back_as_candump_lines(tmp_path):
     assert {frame.timestamp for _, frame in lines} == {12.25}
 
 
-def test_the_junit_file_counts_and_carries_what_went_wrong(tmp_path):
+def test_the_junit_file_has_counts_and_failure_messages(tmp_path):
     cases = [
         TestCase("s", "one", PASSED, "fine", 0.5, "x = 1"),
         TestCase("s", "two\x00", FAILED, "bytes \x01 <wrong>", 0.25),
@@ -127,7 +127,7 @@ def test_frames_are_written_as_they_are_read(text):
 @pytest.mark.parametrize(
     "text", ["", "07360104", "#00", "12#00", "123#0", "123#000102030405060708", "GGG#00", "FFFFFFFF#"]
 )
-def test_what_is_no_frame_is_rejected(text):
+def test_an_invalid_frame_is_rejected(text):
     with pytest.raises(BenchError):
         parse_frame(text)
 

@@ -47,7 +47,7 @@ def test_an_emulator_that_ended_unexpectedly_is_reported_with_its_last_errors():
 
 
 @pytest.mark.process
-def test_it_is_the_reason_for_what_came_of_its_end():
+def test_the_end_of_an_emulator_is_the_reason_of_later_errors():
     with pytest.raises(EmulatorProcessError, match=LAST_ERRORS), bench(DIES) as own:
         wait_for_its_end(own.emulator, BenchError("no reply"))
 
@@ -62,7 +62,7 @@ def test_another_error_is_not_hidden_by_it(text):
 
 
 @pytest.mark.process
-def test_an_end_that_a_restart_has_told_of_is_not_told_of_again():
+def test_an_end_that_a_restart_has_reported_is_not_reported_again():
     with bench(DIES) as own:
         wait_for_its_end(own.emulator)
         with pytest.raises(EmulatorProcessError, match=LAST_ERRORS):
@@ -70,7 +70,7 @@ def test_an_end_that_a_restart_has_told_of_is_not_told_of_again():
 
 
 @pytest.mark.process
-def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_says_so(monkeypatch):
+def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_reports_the_end(monkeypatch):
     def start(_request, stack):
         process = stack.enter_context(emulator(DIES))
         wait_for_its_end(process)
@@ -115,7 +115,7 @@ def test_a_folder_is_no_report(write, tmp_path, monkeypatch):
 
 
 @WRITERS
-def test_a_folder_that_cannot_be_made_is_told_in_one_line(write, tmp_path):
+def test_a_folder_that_cannot_be_made_is_reported_in_one_line(write, tmp_path):
     (tmp_path / "file").write_text("", encoding="ascii")
     for path in (tmp_path / "file" / "report", tmp_path / "file" / "deeper" / "report"):
         with pytest.raises(BenchError, match=r"report: its folder cannot be created: [A-Z].*"):

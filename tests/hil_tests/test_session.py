@@ -50,7 +50,7 @@ def play(device, tmp_path):
     return _play
 
 
-def test_listen_judges_what_comes_after_it_began(device, hub, tmp_path):
+def test_listen_checks_only_messages_after_its_start(device, hub, tmp_path):
     path = tmp_path / "trial.toml"
     path.write_text(
         "[[step]]\nlisten = 'precise_attitude'\ncount = 4\ntimeout_s = 20\nexpect = { frame_counter = { min = 100 } }\n",
@@ -150,7 +150,7 @@ def test_steps_that_hold_pass_and_those_that_do_not_say_why(play, device):
     assert not result.passed
 
 
-def test_after_a_failed_step_the_rest_is_skipped_unless_told_otherwise(device, tmp_path):
+def test_after_a_failed_step_the_rest_is_skipped_without_keep_going(device, tmp_path):
     path = tmp_path / "s.toml"
     path.write_text("[[step]]\nread = 'rates'\nexpect = { rate_x = 9 }\n[[step]]\nread = 'rates'\n")
     with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
@@ -159,7 +159,7 @@ def test_after_a_failed_step_the_rest_is_skipped_unless_told_otherwise(device, t
 
 
 @pytest.mark.parametrize("moment", [0, 1])
-def test_what_has_run_keeps_its_result_when_a_signal_comes_as_it_is_shown(device, tmp_path, moment):
+def test_finished_steps_keep_their_result_when_a_signal_comes_as_one_is_shown(device, tmp_path, moment):
     path = tmp_path / "s.toml"
     path.write_text("[[step]]\nread = 'rates'\n" * 3)
     shown = []
@@ -358,7 +358,7 @@ def test_links_are_chosen_by_step_and_a_missing_one_is_skipped(play, device, hub
     assert [(item.link, item.status) for item in result.results] == [("can", "skipped"), ("serial", "passed")]
 
 
-def test_only_an_emulator_of_its_own_can_be_restarted(play):
+def test_only_an_emulator_that_the_session_started_can_be_restarted(play):
     result = play("[[step]]\nrestart = 'kill'")
     assert "use --start" in result.results[0].detail
 

@@ -87,7 +87,7 @@ def ask(tmp_path):
 STATUS = Reply(ReplyKind.TELEMETRY, 1, struct.pack("<H", 7), klass="get")
 
 
-def test_a_row_is_told_from_one_of_another_class_with_its_id(ask):
+def test_a_row_is_distinguished_from_one_of_another_class_with_the_same_id(ask):
     client, values = ask(lambda obc: obc.telemetry("status"), Reply(ReplyKind.ACK, 1, klass="do"), STATUS)
     assert values == {"count": 7}
     assert [reply.klass for reply in client.stray_replies] == ["do"]

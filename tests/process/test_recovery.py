@@ -142,7 +142,7 @@ def test_a_serial_peer_that_never_reads_does_not_stop_the_device(emulator, can_o
         wait_until(lambda: answers(obc, "star_tracker"))  # late replies to the flood come first
 
 
-def test_half_a_message_is_given_up_and_the_next_one_is_answered(serial_obc, can_obc):
+def test_an_incomplete_message_is_abandoned_and_the_next_one_is_answered(serial_obc, can_obc):
     serial_obc.command("clear_counters")
     serial_obc.run(_send(serial_obc, frame_request(2, bytes(6))[:5]))
     can_obc.run(_send(can_obc, CanFrame(0x07250104, bytes(7) + b"\x07")))

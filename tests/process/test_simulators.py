@@ -77,7 +77,7 @@ def test_basilisk_in_lock_step(motion, seconds, tmp_path):
 
 
 @needs_basilisk
-def test_a_basilisk_feed_that_nobody_listens_to_is_named():
+def test_a_basilisk_feed_without_a_listener_is_reported():
     from starhil.basilisk import StarTrackerFeed, StarTrackerFeedError
 
     with pytest.raises(StarTrackerFeedError, match="no emulator"):

@@ -108,7 +108,7 @@ def test_segments_of_any_size_are_full_but_the_last(size: int) -> None:
         assert len(parts[-1]) == (size - 1) % 7 + 2
 
 
-def test_what_the_counter_cannot_express_is_rejected() -> None:
+def test_a_message_too_long_for_the_counter_is_rejected() -> None:
     with pytest.raises(ProtocolError, match="does not fit"):
         segment(bytes(MAX_MESSAGE + 1))
 
@@ -195,14 +195,14 @@ def test_a_broken_message_is_one_fault_and_no_request(change: object, expected: 
     assert take(receiver, _segments()) == [WHOLE]
 
 
-def test_a_message_that_begins_anew_is_taken() -> None:
+def test_a_restarted_message_is_accepted() -> None:
     receiver = CanDeviceReceiver(DEVICE)
     events = take(receiver, _segments()[:2] + _segments())
     assert isinstance(events[0], LinkFault)
     assert events[1:] == [WHOLE]
 
 
-def test_a_half_message_is_given_up_after_the_time_out() -> None:
+def test_an_incomplete_message_is_abandoned_after_the_timeout() -> None:
     receiver = CanDeviceReceiver(DEVICE, timeout_s=0.5)
     take(receiver, _segments()[:2], 0.0)
     assert receiver.busy
@@ -316,12 +316,12 @@ def test_parts_that_do_not_fit_an_identifier_are_rejected(parts: tuple[int, int,
         ({"id": 1, "data": b"x", "remote": True}, "remote frame with data"),
     ],
 )
-def test_what_cannot_be_a_frame_is_rejected(arguments: dict[str, object], message: str) -> None:
+def test_an_impossible_frame_is_rejected(arguments: dict[str, object], message: str) -> None:
     with pytest.raises(ProtocolError, match=message):
         CanFrame(**arguments)  # type: ignore[arg-type]
 
 
-def test_candump_lines_are_those_of_candump() -> None:
+def test_candump_lines_have_the_format_of_candump() -> None:
     assert format_candump(
         CanFrame(0x123, b"\xde\xad", extended=False, timestamp=1436509052.249713), "vcan0"
     ) == ("(1436509052.249713) vcan0 123#DEAD")

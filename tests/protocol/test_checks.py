@@ -75,7 +75,7 @@ def test_sum_and_xor_of_the_digits(model: dict[str, object], expected: int) -> N
     assert compute(DIGITS, **model) == expected
 
 
-def test_byte_order_of_the_check_overrides_that_of_the_unit() -> None:
+def test_the_byte_order_of_the_check_overrides_the_unit_s() -> None:
     model = {"kind": "crc", "type": "u16", "poly": 0x1021, "order": "big"}
     assert build_check(ADAPTER.validate_python(model), "little").compute(DIGITS) == bytes.fromhex("31C3")
 

@@ -31,7 +31,7 @@ def test_export_writes_stdout_or_a_whole_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_list_tells_every_row_and_parameter() -> None:
+def test_list_prints_every_row_and_parameter() -> None:
     done = json.loads(starhil("icd", "list", "--json").stdout)
     icd = load_unit()
     assert [(row["id"], row["name"], row["size"]) for row in done["rows"]] == [

@@ -28,7 +28,7 @@ from tests.protocol.composed_links import (
 )
 
 
-def test_slip_substitutes_as_rfc_1055_says() -> None:
+def test_slip_escapes_as_in_rfc_1055() -> None:
     link = {"framing": {"kind": "slip"}, "request_header": [{"role": "id", "type": "u8"}]}
     sent = stack_of(link).encode_request(Request(TC, 1, b"\xc0\x02\xdb"))
     assert sent.hex(" ").upper() == "C0 01 DB DC 02 DB DD C0"
@@ -88,7 +88,7 @@ def test_nsp_reply_swaps_the_addresses_and_sets_ack_and_final() -> None:
 
 
 @pytest.mark.parametrize(("name", "request_"), ALL_REQUESTS)
-def test_device_reads_what_the_host_sends_in_pieces_of_any_size(name: str, request_: Request) -> None:
+def test_the_device_reads_requests_in_pieces_of_any_size(name: str, request_: Request) -> None:
     sent = STACKS[name].encode_request(request_)
     for size in (1, 2, 5, len(sent)):
         receiver = STACKS[name].device()
@@ -100,7 +100,7 @@ def test_device_reads_what_the_host_sends_in_pieces_of_any_size(name: str, reque
 
 
 @pytest.mark.parametrize(("name", "reply"), ALL_REPLIES)
-def test_host_reads_what_the_device_sends(name: str, reply: Reply) -> None:
+def test_the_host_reads_replies(name: str, reply: Reply) -> None:
     receiver = STACKS[name].host()
     sent = STACKS[name].encode_reply(reply)
     (found,) = [event for byte in sent for event in receiver.feed(bytes((byte,)), 0.0)]

@@ -80,7 +80,7 @@ def test_the_formulas_of_the_matrix_give_its_rows():
             assert values == pytest.approx(tuple(numbers(row[2])), abs=4 * DIGITS), row[0]
 
 
-def test_the_bytes_are_those_of_the_rows():
+def test_the_bytes_of_the_example_match_the_rows():
     x, y, z, _ = Q
     row = ICD.telemetry["quaternion"].encode({"q_x": x, "q_y": y, "q_z": z})
     assert row.hex(" ").upper() == EXAMPLE["`quaternion` (230), its 6 bytes"]

@@ -117,7 +117,7 @@ def _joined(frames: list[Any]) -> bytes:
 
 
 @pytest.mark.parametrize("row", [*TELECOMMANDS, *TELEMETRY], ids=by_name)
-def test_cantools_reads_what_our_frames_carry(row: Row) -> None:
+def test_cantools_decodes_our_frames(row: Row) -> None:
     database = _cantools()
     for values, data in packets(row):
         if row.kind == "telemetry":
@@ -362,7 +362,7 @@ def test_texts_for_people_tell_parameters_and_enumerations(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in FORMATS if name != "eds"])
-def test_every_export_says_what_a_number_beyond_its_range_becomes(name: str) -> None:
+def test_every_export_states_how_out_of_range_numbers_are_sent(name: str) -> None:
     """Rates are clipped, counters wrap; a telecommand's field is refused, which needs no word a field."""
     said = text(name)
     assert re.search(
@@ -388,7 +388,7 @@ def test_the_same_definition_gives_the_same_text(name: str) -> None:
     assert export(ICD, name) == text(name)
 
 
-def test_an_unknown_format_is_told() -> None:
+def test_an_unknown_format_is_rejected() -> None:
     with pytest.raises(ProtocolError, match="no export format 'pdf'; choose one of markdown"):
         export(ICD, "pdf")
 

@@ -84,7 +84,7 @@ def test_unsolicited_telemetry_and_bursts_are_packets_of_their_own(tmp_path: Pat
     assert found == [b"\xe5" + bytes(6), b"\x77" + bytes(22), b"\xe6" + bytes(6)]
 
 
-def test_a_command_waits_for_the_reply_to_the_one_before_but_not_for_ever(tmp_path: Path) -> None:
+def test_a_command_waits_for_the_previous_reply_up_to_a_limit(tmp_path: Path) -> None:
     link = Plugin(ICD, tmp_path, dialect="b", reply_timeout=0.05).protocol()
     link.write_data(b"\xe6")
     assert not link.answered.is_set()

@@ -44,7 +44,7 @@ def test_the_sender_that_has_most_waiting_loses_its_oldest() -> None:
         )
     )
 )
-def test_what_is_put_is_taken_or_counted_as_dropped(steps: list[tuple[int, list[bytes], int]]) -> None:
+def test_every_item_is_delivered_or_counted_as_dropped(steps: list[tuple[int, list[bytes], int]]) -> None:
     queue, put, taken, dropped = FairQueue(30), 0, 0, 0
     for sender, lines, size in steps:
         put += len(lines)
@@ -137,7 +137,7 @@ def test_a_request_is_answered_before_most_of_a_flood_that_came_first() -> None:
     asyncio.run(main())
 
 
-def test_a_client_reads_nothing_more_while_the_hub_does_not_take_what_it_sends() -> None:
+def test_a_client_stops_reading_while_the_hub_does_not_accept_its_frames() -> None:
     async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writer.write(b"< hi >")
         for _ in range(3):

@@ -112,7 +112,7 @@ def test_buses_are_apart() -> None:
     run(scenario)
 
 
-def test_remote_frames_go_only_to_those_who_asked() -> None:
+def test_remote_frames_go_only_to_clients_that_asked() -> None:
     async def scenario(hub: CanHub) -> None:
         one, two = await Peer.join(hub), await Peer.join(hub)
         plain = await Peer.join(hub, None)
@@ -217,7 +217,7 @@ def test_the_log_is_a_candump_log(tmp_path: Path) -> None:
     ]
 
 
-def test_a_taken_port_and_an_impossible_log_are_told(tmp_path: Path) -> None:
+def test_a_taken_port_and_an_impossible_log_are_reported(tmp_path: Path) -> None:
     async def scenario(hub: CanHub) -> None:
         with pytest.raises(ProtocolError, match=f"cannot listen at 127.0.0.1:{hub.port}"):
             await CanHub(port=hub.port).start()
@@ -359,6 +359,6 @@ def test_a_full_disk_ends_the_log_and_nothing_else(
 
 
 @pytest.mark.parametrize("host", ["a..b", "x" * 64])
-def test_a_host_that_cannot_be_a_name_is_told(host: str) -> None:
+def test_an_invalid_host_name_is_reported(host: str) -> None:
     with pytest.raises(ProtocolError, match=rf"cannot listen at {host}:0: .*; choose another --host"):
         asyncio.run(CanHub(host, 0).start())

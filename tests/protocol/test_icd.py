@@ -173,7 +173,7 @@ def _row_values() -> st.SearchStrategy[tuple[Row, dict[str, Value]]]:
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(_row_values())
-def test_every_row_gives_back_what_it_was_given(case: tuple[Row, dict[str, Value]]) -> None:
+def test_every_row_decodes_the_values_it_encoded(case: tuple[Row, dict[str, Value]]) -> None:
     row, values = case
     data = row.encode(values)
     assert len(data) == row.size
@@ -208,7 +208,7 @@ def test_every_row_has_an_example_that_it_accepts(row: Row) -> None:
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.id}-{row.name}")
 @pytest.mark.parametrize("extra", [-1, 1])
-def test_a_wrong_length_is_told_with_the_published_code(row: Row, extra: int) -> None:
+def test_a_wrong_length_is_refused_with_the_published_code(row: Row, extra: int) -> None:
     size = row.size + extra
     if size < 0:
         return
@@ -387,7 +387,7 @@ def test_parameters_take_numbers_as_the_wire_carries_them(
         ("update_rate", 100.001), ("can_address", 255),
     ],
 )  # fmt: skip
-def test_parameters_reject_what_is_outside_and_say_why(name: str, value: Value) -> None:
+def test_parameters_reject_values_outside_their_limits_with_a_reason(name: str, value: Value) -> None:
     with pytest.raises(MessageError, match=f"^{name}: ") as caught:
         ICD.parameters[name].check(value)
     assert caught.value.code is ErrorCode.INVALID_PARAMETER
@@ -460,8 +460,8 @@ def test_a_bad_definition_is_rejected_by_file_and_row(tmp_path: Path, text: str,
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_or_empty_definition_is_told(tmp_path: Path) -> None:
-    with pytest.raises(IcdError, match="neither a folder nor a unit"):
+def test_a_missing_or_empty_definition_is_reported(tmp_path: Path) -> None:
+    with pytest.raises(IcdError, match="neither a folder nor a bundled unit"):
         load_unit(tmp_path / "none.toml")
     with pytest.raises(IcdError, match=r"no \.toml file"):
         load_unit(tmp_path)

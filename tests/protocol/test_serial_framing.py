@@ -90,7 +90,7 @@ def test_bytes_against_the_framing_make_one_fault_each(text: str, expected: list
     assert receiver.feed(encode_request(GOOD), 1.0)[-1] == GOOD
 
 
-def test_a_half_message_is_given_up_after_the_time_out() -> None:
+def test_an_incomplete_message_is_abandoned_after_the_timeout() -> None:
     receiver = DeviceReceiver(timeout_s=0.5)
     assert receiver.feed(b"\x1f\x7f\x02\x05", 10.0) == []
     assert receiver.busy
@@ -115,7 +115,7 @@ def test_an_endless_message_keeps_within_bounds_and_counts_once() -> None:
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.lists(requests, max_size=6), st.lists(st.integers(1, 40), min_size=1), st.booleans())
-def test_requests_come_out_whatever_way_the_stream_is_cut(
+def test_requests_are_decoded_from_a_stream_cut_anywhere(
     asked: list[Request], cuts: list[int], doubled: bool
 ) -> None:
     def unambiguous(request: Request) -> bool:

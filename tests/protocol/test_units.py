@@ -66,7 +66,7 @@ CODED = [
 @pytest.mark.parametrize(
     ("head", "fields", "values", "wire"), [case[1:] for case in CODED], ids=[case[0] for case in CODED]
 )
-def test_fields_have_the_bytes_that_their_definition_says(unit, head, fields, values, wire):
+def test_fields_have_the_bytes_of_their_definition(unit, head, fields, values, wire):
     row = unit(head + telemetry(fields)).telemetry["row"]
     assert row.encode(values) == bytes.fromhex(wire)
     assert row.decode(bytes.fromhex(wire)) == pytest.approx(values)
@@ -110,7 +110,7 @@ def test_rows_of_two_classes_may_have_one_id(unit):
     assert icd.request(icd.telemetry["two"]).klass == "watch"
 
 
-def test_a_parameter_is_that_of_the_device_unless_the_unit_says_otherwise(unit):
+def test_a_parameter_defaults_to_the_device_s(unit):
     icd = unit(HEAD + '[[parameter]]\nid = 7\nname = "exposure"\nmax = 1000\ndefault = 200\n')
     exposure = icd.parameters["exposure"]
     assert (exposure.id, exposure.unit, exposure.minimum, exposure.maximum, exposure.default) == (

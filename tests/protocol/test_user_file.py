@@ -42,7 +42,7 @@ def test_a_file_comes_whole_and_one_beyond_the_limit_not_at_all(tmp_path):
     assert refusal.value.strerror == "larger than 3e-06 MB"
 
 
-def test_what_is_no_regular_file_is_rejected_without_waiting(tmp_path):
+def test_a_file_that_is_not_regular_is_rejected_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "fifo")
     with socket.socket(socket.AF_UNIX) as there:
         there.bind(str(tmp_path / "socket"))

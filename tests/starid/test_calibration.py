@@ -137,7 +137,7 @@ def test_the_minimum_is_scipys(sky: StarCatalog) -> None:
     assert result.camera.distortion[0] == pytest.approx(theirs.x[1], abs=0.3 * noise["k1"])
 
 
-def test_what_is_not_estimated_is_held(sky: StarCatalog) -> None:
+def test_parameters_that_are_not_estimated_keep_their_values(sky: StarCatalog) -> None:
     frames, _ = simulated(sky, WIDE, 3, 6)
     result = calibrate(frames, WIDE, ("focal",))
     assert result.camera.centre_px == WIDE.centre_px
@@ -146,7 +146,7 @@ def test_what_is_not_estimated_is_held(sky: StarCatalog) -> None:
     assert [name for name, sigma in result.sigmas.items() if sigma > 0.0] == ["fx", "fy"]
 
 
-def test_given_sigmas_weigh_the_stars(sky: StarCatalog) -> None:
+def test_given_sigmas_weight_the_stars(sky: StarCatalog) -> None:
     frames, _ = simulated(sky, WIDE, 4, 7)
     rng = np.random.default_rng(7)
     noisy = []

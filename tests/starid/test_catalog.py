@@ -144,7 +144,7 @@ def test_cuts_go_both_ways(sky: StarCatalog) -> None:
 
 @given(st.floats(0, 360), st.sampled_from([-90.0, -89.9, -30.0, 0.0, 60.0, 90.0]), st.floats(0, 200))
 @settings(deadline=None, derandomize=True, max_examples=60)
-def test_cones_are_those_of_the_angle(ra: float, dec: float, radius: float) -> None:
+def test_cones_match_the_angle(ra: float, dec: float, radius: float) -> None:
     stars = sky_of_2000().brighter_than(4.0)
     a, d, r = np.radians([ra, dec, radius])
     axis = np.array([np.cos(d) * np.cos(a), np.cos(d) * np.sin(a), np.sin(d)])
@@ -168,7 +168,7 @@ def test_stars_are_found_by_number(sky: StarCatalog) -> None:
         sky.index_of([32349, 999999])
 
 
-def test_identity_tells_catalogues_apart(sky: StarCatalog) -> None:
+def test_different_catalogues_have_different_identities(sky: StarCatalog) -> None:
     assert sky.identity == load_catalog(epoch=2000.0).identity
     assert len({sky.identity, load_catalog(epoch=2001.0).identity, sky.brighter_than(6).identity}) == 3
     assert pickle.loads(pickle.dumps(sky.brighter_than(2))).identity == sky.brighter_than(2).identity
@@ -235,7 +235,7 @@ def test_blend_leaves_no_close_pair_of_leaders_and_no_light_behind(sky: StarCata
     assert merge_close_stars(sky.subset([]), 1.0).hip.size == 0
 
 
-def test_close_pairs_are_those_of_a_tree(sky: StarCatalog) -> None:
+def test_close_pairs_match_a_tree(sky: StarCatalog) -> None:
     vectors = sky.brighter_than(6.0).vectors
     for angle in (1e-5, 1e-3, 0.05, math.pi):
         some = vectors if angle < 1.0 else vectors[:60]

@@ -30,7 +30,7 @@ READERS = [
 ]
 
 
-def test_a_pipe_gets_what_is_written_and_stays_a_pipe(tmp_path: Path) -> None:
+def test_a_pipe_receives_the_file_and_stays_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     seen: list[bytes] = []
@@ -151,7 +151,7 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["1_0", "nan", "inf", "-inf", "1e999", "", "x", "١", "0x10", "1,5"])
-def test_what_only_python_reads_is_no_number(text: str) -> None:
+def test_python_s_own_notation_is_not_a_number(text: str) -> None:
     with pytest.raises(ValueError, match="not a number"):
         read_number(text)
 

@@ -114,7 +114,7 @@ def test_weights_pull() -> None:
     assert heavy > 2000.0
 
 
-def test_covariance_is_that_of_many_solutions() -> None:
+def test_the_covariance_matches_the_scatter_of_many_solutions() -> None:
     rng = np.random.default_rng(13)
     truth, body, reference, _ = scene(rng, random_attitude, 12, 18.0, 0.0)
     sigma = rng.uniform(1e-4, 4e-4, 12)

@@ -44,7 +44,7 @@ def test_a_flat_series_passes():
         ),
     ],
 )
-def test_a_growing_series_fails_for_what_grows(name, change):
+def test_a_growing_series_fails_by_name(name, change):
     assert grown(series(change)) == [name]
 
 

@@ -138,7 +138,7 @@ _README: Final = """\
 
 Made by starhil from the interface definition of the unit. `rake build VERSION=1.0.0` makes the gem to install in COSMOS; it asks for
 the serial port, its bit rate and, of some units, the dialect of their replies. A container sees no serial port of its host: hand it in as a device,
-or bring it to a TCP port and put `tcpip_client_interface.py` in place of `serial_interface.py` in `plugin.txt`.
+or bring it to a TCP port and replace `serial_interface.py` by `tcpip_client_interface.py` in `plugin.txt`.
 
 Each telecommand is a command; `REQUEST_…` asks for telemetry. `ANSWER` is what comes back for a command: its name and the code.
 The protocol sends one request at a time, since a reply may not name its row.

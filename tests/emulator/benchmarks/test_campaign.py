@@ -48,7 +48,7 @@ def test_a_frame_depends_on_plan_and_number_only():
         np.testing.assert_array_equal(alone[name], other[name])
 
 
-def test_an_interrupted_campaign_goes_on_where_it_stopped(tmp_path):
+def test_an_interrupted_campaign_resumes_where_it_stopped(tmp_path):
     chunks = run_campaign(PLAN, folder=tmp_path)
     first = next(chunks)
     chunks.close()
@@ -61,7 +61,7 @@ def test_an_interrupted_campaign_goes_on_where_it_stopped(tmp_path):
 
 
 @pytest.mark.process
-def test_a_killed_campaign_goes_on_and_gives_the_same_figures(tmp_path):
+def test_a_killed_campaign_resumes_with_the_same_figures(tmp_path):
     command = [
         sys.executable,
         "-c",

@@ -63,7 +63,7 @@ def test_an_error_alone_is_recovered_and_appears_in_no_other_line(kind):
         assert np.all(found[other].arcsec <= allowed), NAMES[other]
 
 
-def test_all_kinds_together_are_told_apart():
+def test_all_kinds_of_error_are_separated():
     rng = np.random.default_rng(7)
     sizes = {
         "bias": np.array([9.0, -8.0, 5.0]),
@@ -92,7 +92,7 @@ def test_frames_without_an_attitude_may_be_missing():
     np.testing.assert_allclose(noise.arcsec, factor * SIZE / 3.0, rtol=0.1)
 
 
-def test_what_is_below_the_resolution_is_given_as_zero_with_it():
+def test_an_error_below_the_resolution_is_zero():
     rng = np.random.default_rng(5)
     _, field, pixel, _ = static_errors(series(30, 2, 2, rng, noise=SIZE, field=0.05 * SIZE), CONFIDENCE)
     assert np.all(field.arcsec == 0.0)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 import typer
+from typer.testing import CliRunner
 
 from starhil.emulator.cli import app
 
@@ -23,7 +24,7 @@ from starhil.emulator.cli import app
         (MemoryError(), "not enough memory"),
     ],
 )
-def test_what_the_system_refuses_is_one_line_and_status_2(
+def test_an_operating_system_error_is_one_line_and_status_2(
     error: Exception, said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     built = typer.Typer()
@@ -42,7 +43,7 @@ def test_what_the_system_refuses_is_one_line_and_status_2(
 
 
 @pytest.mark.parametrize("name", ["", ".", ".."])
-def test_a_folder_where_a_file_goes_is_named(
+def test_a_folder_given_as_a_file_is_named(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = name or str(tmp_path)
@@ -88,7 +89,7 @@ def test_a_rejected_option_is_one_line_and_status_2(
 @pytest.mark.parametrize(
     ("raised", "status"), [(typer.Exit(1), 1), (KeyboardInterrupt(), 130), (None, 0), (typer.Abort(), 130)]
 )
-def test_the_exit_status_of_a_command_is_that_of_the_process(
+def test_the_process_exits_with_the_status_of_the_command(
     raised: BaseException | None, status: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built = typer.Typer()
@@ -105,7 +106,7 @@ def test_the_exit_status_of_a_command_is_that_of_the_process(
     assert caught.value.code == status
 
 
-def test_no_command_at_all_is_answered_with_the_help(
+def test_without_a_command_the_help_is_printed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr("sys.argv", ["starhil"])
@@ -115,7 +116,7 @@ def test_no_command_at_all_is_answered_with_the_help(
     assert "Usage: starhil" in capsys.readouterr().out
 
 
-def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_printed(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr("sys.argv", ["starhil", "--version"])
     with pytest.raises(SystemExit) as caught:
         app.main()
@@ -132,8 +133,20 @@ def test_the_version_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         (["--view", "127.0.0.1:8080", "demo"], "127.0.0.1:8080"),
     ],
 )
-def test_the_address_of_the_console_may_be_left_out(words: list[str], view: str) -> None:
+def test_the_address_of_the_console_is_optional(words: list[str], view: str) -> None:
     command = typer.main.get_command(app.build_app())
     context = command.make_context("starhil", ["run", *words])
     run = command.get_command(context, "run")
     assert run.make_context("run", words, parent=context).params["view"] == view
+
+
+def test_help_shows_flags_without_a_type_and_positional_arguments_in_capitals() -> None:
+    for command, shown in (
+        ("run", "[PROFILE]"),
+        ("session", "SCRIPT"),
+        ("reproduce", "[NAME]..."),
+        ("replay", "FOLDER"),
+    ):
+        text = CliRunner().invoke(app.build_app(), [command, "--help"]).stdout
+        assert "<bool>" not in text
+        assert shown in text.split("Usage:")[1].splitlines()[0]

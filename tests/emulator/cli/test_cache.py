@@ -51,7 +51,7 @@ def test_the_least_recently_used_goes_when_the_limit_is_passed(folder: Path) -> 
     assert kept(folder) == {1, 3, 4}
 
 
-def test_what_was_just_computed_is_kept_even_beyond_the_limit(
+def test_a_newly_computed_file_is_kept_even_beyond_the_limit(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", "0.5")

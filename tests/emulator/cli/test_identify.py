@@ -28,7 +28,7 @@ def answer(path, *options: str) -> dict:
 @pytest.mark.parametrize(
     ("ra", "dec", "roll"), [(83.8, -1.2, 30), (0, 0, 180), (359.99, 89.9, -75), (120, -90, 10)]
 )
-def test_what_render_draws_identify_finds(tmp_path, ra, dec, roll):
+def test_identify_finds_the_attitude_of_a_rendered_image(tmp_path, ra, dec, roll):
     image = tmp_path / "sky.png"
     options = ["--ra", str(ra), "--dec", str(dec), "--roll", str(roll), "--seed", "1"]
     assert starhil("render", *options, "-o", str(image)).exit_code == 0

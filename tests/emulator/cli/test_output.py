@@ -100,7 +100,7 @@ def test_an_output_of_any_encoding_shows_every_character(encoding: str) -> None:
     assert "37.97" in done.stdout.decode(encoding)
 
 
-def test_what_an_encoding_lacks_is_spelled_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_characters_that_an_encoding_lacks_are_spelled_out(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr("sys.stdout", stream)
     output.show_every_character()
@@ -108,7 +108,7 @@ def test_what_an_encoding_lacks_is_spelled_out(monkeypatch: pytest.MonkeyPatch) 
     assert stream.buffer.getvalue() == b'1sigma 0.12" <= 3 deg \\u6f22 \\udcff\n'  # type: ignore[attr-defined]
 
 
-def test_every_command_rejects_what_is_not_finite() -> None:
+def test_every_command_rejects_numbers_that_are_not_finite() -> None:
     assert [path for path, command in commands() if not isinstance(command, app.FiniteCommand)] == []
 
 
@@ -152,5 +152,5 @@ def test_a_name_that_no_image_can_have_is_rejected_before_the_work(arguments: st
         ("calibrate gone.png --fov 1 -o /proc/x/y", "its folder cannot be created"),
     ],
 )
-def test_what_makes_no_sense_is_rejected_in_one_line(arguments: str, said: str) -> None:
+def test_nonsensical_arguments_are_rejected_in_one_line(arguments: str, said: str) -> None:
     assert said in refusal(*arguments.split())

@@ -103,7 +103,7 @@ def test_a_profile_names_its_unit_by_name_or_by_a_folder_beside_it(tmp_path):
         assert load_profile(str(profile)).unit_source == source
 
 
-def test_a_bench_that_speaks_another_unit_than_the_profile_says_so():
+def test_a_bench_of_another_unit_than_the_profile_is_rejected():
     process = EmulatorProcess(["none"])
     process.ready = {"unit": "/my%20units/one"}
     process.check_unit("/my units/one")

@@ -48,7 +48,7 @@ def test_every_fault_of_the_device_has_a_control_with_the_values_that_it_takes()
     assert all(control["kind"] == "choice" and control["values"] for control in controls.values())
 
 
-def test_a_scenario_from_the_page_begins_now(run, tmp_path):
+def test_a_scenario_from_the_page_starts_now(run, tmp_path):
     path = tmp_path / "later.toml"
     path.write_text('name = "later"\n[[at]]\nrun_time_s = 2.0\nfault = { optical = { blank = true } }\n')
 

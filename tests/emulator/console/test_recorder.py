@@ -118,7 +118,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
     assert said[0].endswith("stopped: No space left on device; the run continues")
 
 
-def test_each_head_has_a_file_of_its_own(run, tmp_path):
+def test_each_head_has_its_own_file(run, tmp_path):
     async def scenario(emulation, _line):
         await emulation.stepper.step(4.0)
 

@@ -55,7 +55,7 @@ def test_reports_of_runs_need_the_token_and_the_files_of_the_page_do_not(run):
     run(scenario, options=OPTIONS)
 
 
-def test_previews_are_made_only_while_somebody_looks_at_the_images(run):
+def test_previews_are_made_only_while_a_page_shows_images(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
@@ -163,7 +163,7 @@ def test_a_page_that_joins_late_receives_the_newest_image_at_once(run):
     run(scenario, options=OPTIONS)
 
 
-def test_each_head_has_a_page_of_its_own_on_a_clock_of_all(run):
+def test_each_head_has_its_own_page_on_a_shared_clock(run):
     async def scenario(emulation, _line):
         async with Page(emulation) as first, Page(emulation, head=2) as second:
             for number, page in enumerate((first, second), start=1):
@@ -226,7 +226,7 @@ def test_a_page_that_does_not_read_keeps_a_bounded_queue_and_the_newest_image():
     asyncio.run(scenario())
 
 
-def test_a_session_reports_its_results_to_the_console_while_it_goes_on(run):
+def test_a_session_reports_its_results_to_the_console_as_they_arrive(run):
     async def scenario(emulation, _line):
         address = emulation.ready_fields["view"]
         async with Page(emulation) as page:

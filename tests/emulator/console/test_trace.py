@@ -59,7 +59,7 @@ def test_segments_on_can_are_joined_for_each_pair_of_nodes():
     assert found[-1][1].startswith("4→253 device_status mode=boot")
 
 
-def test_requests_on_can_and_junk_are_told_apart():
+def test_requests_on_can_and_junk_are_distinguished():
     (frame,) = encode_request_frames(Request.of(STATUS.id), 1, 4)
     found = lines(
         [(False, frame), (False, CanFrame(0x1FFFFFFF, b"\x01")), (True, CanFrame(0x05EE0401, bytes(3)))]

@@ -111,7 +111,7 @@ def test_a_truth_file_that_is_a_pipe_is_rejected_at_once(run, tmp_path):
     run(scenario)
 
 
-def test_frames_are_told_with_truth_and_error(run):
+def test_frames_are_reported_with_truth_and_error(run):
     run.pipeline.turn_rad = 1e-5
 
     async def scenario(emulation, _line):

@@ -56,7 +56,7 @@ def test_without_a_folder_of_the_session_it_is_one_of_the_user(run, tmp_path, mo
     assert mode(tmp_path / f"starhil-{os.geteuid()}") == 0o700
 
 
-def test_a_folder_of_somebody_else_is_not_used(run, tmp_path, monkeypatch):
+def test_a_folder_of_another_user_is_not_used(run, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     (tmp_path / "theirs").mkdir()
@@ -145,7 +145,7 @@ def test_a_token_that_is_not_asked_for_does_no_harm(run):
 
 
 @pytest.mark.parametrize("size", [MAX_LINE + 1, 10_000_000])
-def test_a_line_that_is_too_long_is_answered_and_the_channel_goes_on(run, size):
+def test_a_line_that_is_too_long_is_answered_and_the_channel_continues(run, size):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             answer = await asyncio.wait_for(control.raw(b"x" * size), 60.0)

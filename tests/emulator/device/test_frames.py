@@ -116,7 +116,7 @@ def test_delay_time_moves_the_exposure(make_bench):
     assert mid_s == pytest.approx(begin + 0.35)
 
 
-def test_exposures_that_the_machine_has_no_time_for_are_left_out_and_tracking_goes_on(bench):
+def test_exposures_that_the_machine_has_no_time_for_are_skipped_and_tracking_continues(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(3.5)
     before = bench.read("precise_attitude")

@@ -116,7 +116,7 @@ def test_a_smaller_size_is_the_mean_over_squares():
     assert np.abs(got - expected).max() <= 0.5
 
 
-def test_a_whole_frame_is_taken_beside_what_is_stored(bench):
+def test_a_new_frame_is_taken_beside_the_stored_image(bench):
     save(bench, "size_64")
     taken = []
     bench.device.images.capture_full(taken.append)

@@ -56,7 +56,7 @@ def test_results_change_the_mode(here, valid, tracked, enabled, there):
     assert modes.mode is there
 
 
-def test_changes_are_told_with_their_cause():
+def test_mode_changes_are_reported_with_their_cause():
     seen = []
     modes = Modes(seen.append)
     modes.booted()
@@ -72,7 +72,7 @@ def test_changes_are_told_with_their_cause():
     ]
 
 
-def test_who_is_told_of_an_error_sees_why():
+def test_a_listener_sees_the_reason_of_an_error():
     seen = []
     modes = Modes(lambda _transition: seen.append(modes.error))
     modes.fail("sensor")

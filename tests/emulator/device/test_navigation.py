@@ -87,7 +87,7 @@ def test_an_uploaded_orbit_adds_its_velocity(make_bench):
     assert frame.observer_velocity == pytest.approx(expected, abs=0.5)
 
 
-def test_elements_in_parameters_are_those_of_an_orbit():
+def test_elements_in_parameters_give_an_orbit():
     assert known_orbit(KNOWN) == KeplerOrbit(
         EQUINOX, 6.9e6, 0.0, *(np.radians(value) for value in (97.5, 40.0, 0.0, 10.0))
     )
@@ -102,7 +102,7 @@ def test_an_orbit_that_meets_the_earth_is_refused(bench):
     bench.device.parameters.set({"orbit_semi_major_axis": 26600.0, "orbit_eccentricity": 0.7})
 
 
-def test_a_run_goes_on_without_an_orbit_that_ends(make_bench, caplog):
+def test_a_run_continues_after_its_orbit_has_decayed(make_bench, caplog):
     bench = make_bench(Profile()).start()
 
     class Decays:
@@ -114,7 +114,7 @@ def test_a_run_goes_on_without_an_orbit_that_ends(make_bench, caplog):
     bench.step(3.5)
     assert [frame.position_m for frame in bench.pipeline.frames] == [None] * len(bench.pipeline.frames)
     assert len(bench.pipeline.frames) >= 2
-    assert caplog.text.count("has decayed; the run goes on without an orbit") == 1
+    assert caplog.text.count("has decayed; the run continues without an orbit") == 1
 
 
 def test_an_orbit_of_a_profile_that_is_none_names_the_profile(make_bench):

@@ -46,7 +46,7 @@ def test_bad_requests_get_the_published_code_and_change_nothing(bench, identifie
     assert bench.mode == "standby"
 
 
-def test_acknowledge_tells_what_became_of_the_last_telecommand(bench):
+def test_the_acknowledge_reports_the_result_of_the_last_telecommand(bench):
     bench.command("set_mode", mode="lost_in_space")
     assert bench.read("acknowledge") == {
         "last_telecommand": 96, "processed": True, "error": "ok", "parameter_index": 0,

@@ -123,7 +123,7 @@ def changes_of(bench):
 
 
 @pytest.mark.parametrize("restart", ["reset", "restore_parameters"])
-def test_what_stays_as_it_is_saved_is_no_change(bench, restart):
+def test_a_restart_reports_only_parameters_that_change(bench, restart):
     bench.device.parameters.set({"canopen_node": 45, "exposure": 55})
     bench.command("save_parameters")
     bench.device.parameters.set({"exposure": 77, "analog_gain": 2.0})
@@ -156,7 +156,7 @@ def test_a_stored_value_that_is_not_allowed_takes_no_other_one_along(bench):
     assert bench.device.parameters["analog_gain"] == 2.0
 
 
-def test_a_reset_forgets_what_was_chosen_and_counted(bench):
+def test_a_reset_clears_selections_and_counters(bench):
     fresh = bench.read("device_status")["mode_changes"], bench.read("parameter")
     bench.command("set_parameter", parameter=29, value=2.0)
     bench.command("set_mode", mode="lost_in_space")
@@ -222,7 +222,7 @@ def test_a_store_that_cannot_write_refuses_and_is_logged(make_bench, tmp_path, m
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_a_save_is_answered_when_the_disk_has_it_or_has_not(make_bench, monkeypatch, fails):
+def test_a_save_is_answered_when_writing_has_succeeded_or_failed(make_bench, monkeypatch, fails):
     bench = make_bench().start()
     bench.device._background = disk = LaterBackground()
 

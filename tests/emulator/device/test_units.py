@@ -117,7 +117,7 @@ def test_times_count_from_the_epoch_of_the_unit(unit, epoch, seconds):
     assert 1000.0 < values["f"] < 1002.0
 
 
-def test_a_day_begins_at_midnight(unit):
+def test_a_day_starts_at_midnight(unit):
     fields = '{ name = "t", type = "u32", unit = "ms", value = "clock.unix" }'
     bench = unit(f'{HEAD}[conventions]\nepoch = "midnight"\n' + row("telemetry", 1, "times", fields))
     bench.device.time.set_unix_ns((20_000 * 86_400 + 3_600) * 10**9)

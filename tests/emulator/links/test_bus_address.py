@@ -23,7 +23,7 @@ def clashes(caplog) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_an_address_is_reported_while_another_has_it_and_free_after(caplog):
+def test_an_address_is_reported_while_another_uses_it_and_free_afterwards(caplog):
     first, second = (BusAddress("address", "links.can.address") for _ in range(2))
     first.take(BUS, 4)
     second.take(BUS, 5)

@@ -137,7 +137,7 @@ def test_mode_command_reaches_the_device_and_its_refusal_the_client(linked):
     linked(test)
 
 
-def test_rows_are_those_of_the_other_links(linked):
+def test_rows_are_the_same_as_on_other_links(linked):
     def test(link):
         for name in ("identification", "precise_attitude", "star_config"):
             row = link.bench.icd.telemetry[name]
@@ -312,7 +312,7 @@ def test_error_mode_is_an_emergency(linked):
     linked(test)
 
 
-def test_deaf_device_hears_and_says_nothing(linked):
+def test_an_unresponsive_device_neither_reads_nor_sends(linked):
     def test(link):
         link.device.unresponsive = True
         assert link.sdo("40 00 10 00") == ""
@@ -349,7 +349,7 @@ def test_a_deadline_is_never_taken_for_a_time_before_it(deadline):
 
 
 @pytest.mark.parametrize("period_ms", [100, 1000])
-def test_heartbeats_go_on_whatever_their_deadlines_add_up_to(linked, period_ms):
+def test_heartbeats_continue_with_any_sum_of_deadlines(linked, period_ms):
     def test(link):
         link.bench.step(0.234)
         link.sdo(f"2b 17 10 00 {period_ms.to_bytes(2, 'little').hex(' ')}")

@@ -226,7 +226,7 @@ def test_a_gap_between_frames_is_kept(bench):
     in_loop(scenario())
 
 
-def test_the_acknowledge_of_a_reset_waits_for_its_turn_and_leaves(bench):
+def test_the_acknowledge_of_a_reset_is_sent_in_its_turn(bench):
     async def scenario():
         bus = Wire()
         link = CanLink(bench.requests, bus, frame_gap_s=0.001)
@@ -316,7 +316,7 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
     in_loop(scenario())
 
 
-def test_a_half_message_is_given_up_and_counted(bench, monkeypatch):
+def test_an_incomplete_message_is_abandoned_and_counted(bench, monkeypatch):
     async def scenario():
         linked = await Linked(bench).start()
         linked.uart.arrive(b"\x1f\x7f\x80")
@@ -344,7 +344,7 @@ def test_a_half_message_is_given_up_and_counted(bench, monkeypatch):
         (WireFaultSettings(delay_s=0.01), 0),
     ],
 )
-def test_wire_faults_damage_what_goes_out(bench, settings, expected):
+def test_wire_faults_damage_outgoing_bytes(bench, settings, expected):
     async def scenario():
         linked = await Linked(bench).start()
         linked.uart.arrive(encode_request(Request.of(128)))

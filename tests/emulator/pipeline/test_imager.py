@@ -80,7 +80,7 @@ def test_a_callback_that_fails_is_logged_and_the_next_requests_are_answered(make
     assert "\n" not in said
 
 
-def test_a_pipeline_that_ends_fails_what_is_pending_and_can_be_started_again(make_imager, caplog):
+def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_imager, caplog):
     answers, losses = [], []
 
     async def scenario(imager):
@@ -171,7 +171,7 @@ def test_a_request_that_cannot_be_sent_is_not_left_pending(worker):
     run(lambda: ProcessImager(SETUP, worker(ANSWERING)), scenario)
 
 
-def test_a_thread_whose_pipeline_cannot_be_made_says_so(monkeypatch):
+def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
     def fail(_setup):
         raise ValueError("odd\ncamera")
 

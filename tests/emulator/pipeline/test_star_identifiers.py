@@ -90,13 +90,13 @@ def test_only_the_last_wish_is_made_after_the_one_under_way(factory, beside):
     assert beside.get(WIDE) == (Made(WIDE), True)
 
 
-def test_the_way_back_to_what_is_in_force_takes_no_time(factory, beside):
+def test_returning_to_the_current_solver_takes_no_time(factory, beside):
     assert beside.get(SHALLOW) == (Made(DEEP), False)
     assert beside.get(DEEP) == (Made(DEEP), True)
     factory.go.set()
 
 
-def test_what_cannot_be_made_is_rejected_until_something_else_is_asked_for(factory, beside):
+def test_a_solver_that_cannot_be_made_is_rejected_until_another_is_requested(factory, beside):
     impossible = replace(DEEP, options=(("limiting_magnitude", -1.0),))
     assert beside.get(impossible) == (Made(DEEP), False)
     factory.go.set()

@@ -79,7 +79,7 @@ def test_an_image_that_is_saturated_all_over_cannot_be_searched(pipeline):
     assert (result.valid, result.reason, result.detected) == (False, "detection_failed", 0)
 
 
-def test_particles_of_the_place_are_added_to_those_of_the_sky(pipeline):
+def test_particles_of_the_orbit_are_added_to_the_sky(pipeline):
     quiet = pipeline.handle(replace(REQUEST, index=3))
     anomaly = pipeline.handle(replace(REQUEST, index=3, particles_s=3000.0))
     assert anomaly.refused + anomaly.detected > quiet.refused + quiet.detected + 50

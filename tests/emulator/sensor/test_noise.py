@@ -58,7 +58,7 @@ def test_the_variance_follows_the_photon_transfer_curve(digitizer: Digitizer, me
 
 
 @pytest.mark.parametrize("mean_e", [17.0, 300.0])
-def test_skewness_is_that_of_poisson(mean_e: float) -> None:
+def test_the_skewness_follows_poisson_statistics(mean_e: float) -> None:
     expected = mean_e / (mean_e + FINE.read_noise_e**2) ** 1.5
     sample = np.concatenate([electrons(mean_e, FINE, frame).ravel() for frame in range(8)])
     assert stats.skew(sample) == pytest.approx(expected, abs=5.0 * np.sqrt(6.0 / sample.size))

@@ -150,7 +150,7 @@ def test_trail_has_the_length_of_the_rate(renderer: Renderer) -> None:
     assert np.hypot(*trails[centre].T) == pytest.approx(np.full(centre.sum(), expected), rel=0.01)
 
 
-def test_same_seed_same_bytes_whatever_came_before(catalog: StarCatalog) -> None:
+def test_the_same_seed_gives_the_same_bytes_after_any_history(catalog: StarCatalog) -> None:
     first = Renderer(DEFAULT_CAMERA, catalog, SensorModel(), seed=4)
     second = Renderer(DEFAULT_CAMERA, catalog, SensorModel(), seed=4)
     first.render(random_attitude(np.random.default_rng(0)), (0.01, 0.0, 0.0), 8, exposure_s=0.05)

@@ -80,7 +80,7 @@ def test_focal_length_and_distortion_drift(catalog):
     np.testing.assert_allclose(stars.xy_px, expected, atol=1e-9)
 
 
-def test_the_own_dark_frame_removes_what_a_hot_detector_takes_for_stars(catalog):
+def test_the_dark_frame_removes_false_stars_of_a_hot_detector(catalog):
     sensor = dataclasses.replace(SENSOR, hot_pixels=300, hot_e_s=20_000.0, psf_sigma_px=1.2)
     renderer = Renderer(CAMERA, catalog, sensor, seed=2)
     dark = measure_dark_map(sensor, CAMERA.height, CAMERA.width, frames=16, seed=3)

@@ -56,7 +56,7 @@ def test_bodies_are_where_jpl_has_them(date, values):
 @pytest.mark.parametrize(
     "date", ["2016-12-31T23:59:59.5", "2017-01-01", "2026-03-01T00:05", "2031-07-09T12:07:31.7"]
 )
-def test_interpolated_places_are_those_of_the_series(date):
+def test_interpolated_positions_match_the_series(date):
     """Within 1 m and 20 µm/s for the Earth and the Sun, and 0.001″ for the Moon, in the middle of a slot and at a leap second."""
     unix_s = unix_time(date)
     observer = Observer(unix_s)
@@ -268,7 +268,7 @@ def switches(blinded, step_s: int = 20) -> list[int]:
 
 
 @pytest.mark.parametrize(("off_sun_deg", "earth_deg"), [(25.0, 20.0), (70.0, 25.0), (150.0, 10.0)])
-def test_a_sensor_is_blinded_along_its_orbit_when_geometry_says_so(off_sun_deg, earth_deg):
+def test_a_sensor_is_blinded_along_its_orbit_where_geometry_predicts(off_sun_deg, earth_deg):
     sky = Sky({"bodies": "ephemeris", "sun": {"exclusion_deg": 35.0}, "earth": {"exclusion_deg": earth_deg}})
     radius_km, inclination, node = 6896.0, 1.0, 0.4
     orbit = KeplerOrbit(NEW_YEAR, 1e3 * radius_km, 0.0, inclination, node, j2=False)
@@ -308,7 +308,7 @@ def test_light_that_passes_the_baffle_saturates_the_image():
 # --- the table [sky] ---
 
 
-def test_without_a_date_the_sky_is_what_is_typed_in():
+def test_without_a_date_the_sky_has_only_given_bodies():
     typed = {"moon": {"ra_deg": 1.0, "dec_deg": 2.0}, "false_stars": 3}
     view = Sky(typed).view(NEW_YEAR, np.array([7e6, 0.0, 0.0]), np.zeros(3))
     assert view.objects == SkyObjects.from_dict(typed)
@@ -322,7 +322,7 @@ def test_a_date_alone_moves_the_stars_and_shows_no_bodies():
     assert Sky({"date": NEW_YEAR, "aberration": False}).view(NEW_YEAR).observer is None
 
 
-def test_typed_bodies_replace_or_change_those_of_the_date():
+def test_given_bodies_replace_or_change_those_of_the_date():
     sky = Sky(
         {
             "bodies": "ephemeris",

@@ -50,7 +50,7 @@ def test_the_moon_saturates_hides_and_glares(renderer: Renderer) -> None:
     assert np.pi * (radius_px + 1.0) ** 2 < full < np.pi * (radius_px + 5.0) ** 2
 
 
-def test_the_lit_limb_points_where_it_is_told(renderer: Renderer) -> None:
+def test_the_lit_limb_points_in_the_given_direction(renderer: Renderer) -> None:
     """North is up and east is left: a limb at position angle 90° (east) lights the left half."""
     objects = SkyObjects(
         moon=Moon(83.8, -1.2, diameter_deg=4.0, magnitude=-6.5, illuminated=0.5, glare_share=0.0)
@@ -69,7 +69,7 @@ def test_the_sun_brightens_the_side_where_it_is(renderer: Renderer) -> None:
 
 
 @pytest.mark.parametrize("electrons_s", [0.0, 2e6])
-def test_the_earth_covers_what_is_behind_it(renderer: Renderer, electrons_s: float) -> None:
+def test_the_earth_covers_stars_behind_it(renderer: Renderer, electrons_s: float) -> None:
     earth = EarthLimb(83.8, -70.0, radius_deg=64.0, electrons_s=electrons_s)
     frame = renderer.render(ORION, objects=SkyObjects(earth=earth))
     vectors = DEFAULT_CAMERA.back_project(frame.stars.xy_px)
@@ -84,7 +84,7 @@ def test_the_earth_covers_what_is_behind_it(renderer: Renderer, electrons_s: flo
 
 @pytest.mark.parametrize("sun", [None, (60.0, 20.0), (150.0, -40.0)])
 @pytest.mark.parametrize("radius_deg", [64.0, 20.0])
-def test_a_wide_earth_is_that_of_every_pixel(
+def test_a_wide_earth_matches_a_computation_per_pixel(
     radius_deg: float, sun: tuple[float, float] | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Within 1.2 % of full daylight and 0.8 % of the stars' light of the computation pixel by pixel, up to the limb."""
@@ -111,7 +111,7 @@ def test_a_wide_earth_is_that_of_every_pixel(
     assert 0.3 < share < 0.7
 
 
-def test_glare_around_a_source_in_the_field_is_that_of_every_pixel(renderer: Renderer) -> None:
+def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(renderer: Renderer) -> None:
     """Within 0.2 electrons, 2 % of the read noise, of strength/(chord² + softness²) in every pixel."""
     camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
     light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
@@ -176,7 +176,7 @@ def test_planets_are_points_at_their_directions(renderer: Renderer) -> None:
     assert np.linalg.norm(found.xy_px - place(83.0, 3.0), axis=1).min() < 0.1
 
 
-def test_particles_leave_streaks_where_the_truth_says(renderer: Renderer) -> None:
+def test_particles_leave_streaks_at_their_true_positions(renderer: Renderer) -> None:
     frame = renderer.render(ORION, objects=SkyObjects(cosmic_rays_s=200.0))
     plain = renderer.render(ORION)
     assert frame.objects is not None

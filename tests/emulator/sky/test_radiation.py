@@ -32,7 +32,7 @@ def place(latitude_deg: float, longitude_deg: float, hours: float = 0.0) -> np.n
     ("latitude", "longitude"), [(0.0, 0.0), (-26.0, -49.0), (51.5, 179.0), (80.0, -120.0)]
 )
 @pytest.mark.parametrize("hours", [0.0, 7.5])
-def test_the_place_below_is_that_of_sidereal_time(latitude, longitude, hours):
+def test_the_sub_satellite_point_follows_sidereal_time(latitude, longitude, hours):
     below = sub_satellite_point(place(latitude, longitude, hours), NOON_2026_UNIX_S + 3600.0 * hours)
     precession_deg = 0.4
     assert below[0] == pytest.approx(latitude, abs=1e-6)
@@ -47,7 +47,7 @@ def test_the_anomaly_lies_over_brazil_and_rises_with_altitude():
         assert anomaly_share(latitude, longitude, 500.0) < 1e-6
 
 
-def test_the_rate_has_a_quiet_part_and_that_of_the_anomaly():
+def test_the_particle_rate_is_the_quiet_rate_plus_the_anomaly():
     inside, outside = place(-26.0, -49.0), place(40.0, 100.0)
     assert particle_rate(2.0, 100.0, inside, NOON_2026_UNIX_S) == pytest.approx(102.0, rel=1e-3)
     assert particle_rate(2.0, 100.0, outside, NOON_2026_UNIX_S) == pytest.approx(2.0, abs=1e-3)

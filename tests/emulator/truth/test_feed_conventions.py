@@ -61,7 +61,7 @@ def test_a_convention_that_is_not_the_senders_is_rejected_at_the_second_message(
     assert sent == read or "truth.convention" in live.last_fault
 
 
-def test_position_velocity_and_date_of_a_feed_are_those_of_its_truth():
+def test_position_velocity_and_date_of_a_feed_reach_the_truth():
     live = LiveTruth(Attitude.identity(), timeline="run")
     velocity = [0.0, 7500.0, 0.0]
     for t in (0.0, 1.0):
@@ -109,7 +109,7 @@ def test_a_mounted_sensor_sees_along_its_axes_in_the_body_and_turns_with_the_bod
     assert apart_arcsec(sensor.state(10.0).attitude, later) < MILLIARCSECOND
 
 
-def test_without_a_mount_the_truth_is_that_of_the_sensor():
+def test_without_a_mount_the_truth_is_the_sensor_s():
     truth = FixedTruth(ORION)
     assert mounted(truth, None) is truth
 
@@ -140,7 +140,7 @@ def test_every_kind_of_truth_takes_a_mount(kind):
     assert config.mount.build().matrix[0] == pytest.approx([0.0, 0.0, -1.0], abs=1e-12)
 
 
-def test_a_mount_stays_when_the_truth_changes_unless_another_is_given(run):
+def test_a_mount_stays_when_the_truth_changes_without_one(run):
     mount = {"matrix": [[0, 0, -1], [0, 1, 0], [1, 0, 0]]}
 
     async def scenario(emulation, _line):

@@ -218,6 +218,6 @@ def test_dates_are_utc_unless_they_say_otherwise(date):
 
 
 @pytest.mark.parametrize("date", ["tomorrow", "1066-10-14", True, None, [2026, 1, 1], float("nan")])
-def test_what_is_no_date_is_rejected(date):
+def test_an_invalid_date_is_rejected(date):
     with pytest.raises(ValueError, match="date from 1970 to 2100"):
         unix_time(date)

@@ -154,7 +154,7 @@ def test_a_bad_block_is_acknowledged_and_a_repeated_one_changes_nothing(run):
     run(scenario, **truth_of(0, role="server"))
 
 
-def test_a_42_that_starts_again_begins_where_the_clock_is(run):
+def test_a_restarted_42_continues_at_the_clock(run):
     async def scenario(emulation, _line):
         port = int(emulation.ready_fields["truth"].rpartition(":")[2])
         for _ in range(2):

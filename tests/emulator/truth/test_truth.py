@@ -247,7 +247,7 @@ def test_live_feed_takes_the_rate_from_its_messages_and_the_time_from_their_rece
     assert live.state(1.7).rate_rad_s == pytest.approx(rate, abs=1e-9)
 
 
-def test_live_feed_that_starts_again_begins_a_new_time_line():
+def test_a_restarted_live_feed_starts_a_new_time_line():
     live = LiveTruth(EAST)
     live.receive(line(500.0, ORION), 1.0)
     assert live.receive(line(0.0, EAST), 2.0)
@@ -354,7 +354,7 @@ def test_a_sender_whose_clock_slips_is_followed(speed, with_rate):
     assert worst_arcsec < 0.8 * 3600 * (0.05 + 8.0 * abs(1.0 / speed - 1.0))
 
 
-def test_the_rate_of_a_slow_sender_is_that_of_run_time():
+def test_the_rate_of_a_slow_sender_is_in_simulation_time():
     rate = np.radians([0.3, 0.0, 0.1])
     live = LiveTruth(EAST)
     for n in range(600):

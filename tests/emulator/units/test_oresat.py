@@ -162,7 +162,7 @@ def test_unit_whose_only_link_is_canopen_opens_it_by_itself(run):
     assert f"canopen={NODE}" in line.split()
 
 
-def test_the_bench_commands_and_reads_a_card_with_error_numbers_of_its_own_by_name(run, tmp_path):
+def test_the_bench_commands_and_reads_a_card_with_custom_error_numbers_by_name(run, tmp_path):
     channel, unit = "virtual:oresat-bench", str(tmp_path)
     definition = (UNITS_FOLDER / "oresat" / "oresat.toml").read_text(encoding="utf-8")
     (tmp_path / "unit.toml").write_text(f"{definition}\n[errors]\ninvalid_parameter = 99\n", encoding="utf-8")

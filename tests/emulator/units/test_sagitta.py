@@ -73,7 +73,7 @@ def test_attitude_is_the_truth_and_flagged_valid():
     with_unit("sagitta", "serial", scenario)
 
 
-def test_validity_clears_when_the_lens_is_covered_and_the_count_of_stable_solutions_begins_again():
+def test_validity_clears_when_the_lens_is_covered_and_the_count_of_stable_solutions_restarts():
     def scenario(unit: Emulated) -> None:
         unit.cover()
         unit.step(3.0)

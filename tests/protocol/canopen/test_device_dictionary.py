@@ -35,7 +35,7 @@ def test_every_parameter_stands_at_its_identifier(bench):
 @pytest.mark.parametrize(
     "row", [row for row in ICD.rows if row.kind == "telemetry"], ids=lambda row: row.name
 )
-def test_telemetry_rows_are_those_of_the_other_links(bench, row):
+def test_telemetry_rows_are_the_same_as_on_other_links(bench, row):
     values = row.example()
     bench.application.rows[row.name] = values
     assert bench.read(0x2000, row.id) == row.encode(values)
@@ -81,7 +81,7 @@ def test_mode_is_read_and_commanded_at_one_place(bench):
     assert bench.application.commands == [("set_mode", {"mode": "lost_in_space"})]
 
 
-def test_float_limits_do_not_refuse_what_they_name(bench):
+def test_float_limits_accept_the_limits_themselves(bench):
     import struct
 
     for parameter in (item for item in ICD.parameters.values() if item.type == "f32"):

@@ -27,7 +27,7 @@ def test_nothing_that_the_slave_sends_is_malformed(recorded):
     assert [frame for frame in ours if frame.malformed or frame.protocols[-1] != "canopen"] == []
 
 
-def test_the_dissector_sees_what_the_tester_malforms_on_purpose(recorded):
+def test_the_dissector_reports_frames_that_the_tester_malforms_on_purpose(recorded):
     malformed = [frame.identifier for way, frame in recorded if way == "->" and frame.malformed]
     assert {0x000, 0x100, 0x62C} <= set(malformed)
 

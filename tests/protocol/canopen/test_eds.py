@@ -69,7 +69,7 @@ def test_data_sheet_and_dictionary_have_the_same_objects(od):
     assert listed == set(build_dictionary(load_unit()).entries)
 
 
-def test_data_sheet_describes_what_is_served(bench, od):
+def test_the_eds_describes_the_served_dictionary(bench, od):
     """Each object's type, access, default and length, as an SDO client sees them after power-on."""
     for item in variables(od):
         if item.index < 0x1000 or item.index in {0x2000, 0x6040, 0x6043} or item.access_type == "wo":
@@ -88,7 +88,7 @@ def test_data_sheet_describes_what_is_served(bench, od):
             assert data[::-1].hex().upper() == item.default_raw[2:], item
 
 
-def test_limits_are_those_of_the_interface_definition(od):
+def test_limits_come_from_the_interface_definition(od):
     exposure = od["Parameters"]["exposure"]
     assert (exposure.min, exposure.max, exposure.default, exposure.data_type) == (
         1,

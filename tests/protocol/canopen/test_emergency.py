@@ -29,7 +29,7 @@ def test_error_comes_and_goes(bench):
     assert clear_error(bench) == []
 
 
-def test_register_holds_what_the_remaining_errors_set(bench):
+def test_the_error_register_holds_the_bits_of_the_remaining_errors(bench):
     raise_error(bench, 0x4210, ErrorRegister.TEMPERATURE)
     raise_error(bench, 0x3110, ErrorRegister.VOLTAGE)
     assert bench.number(0x1001) == 0x0D
@@ -87,7 +87,7 @@ def test_nothing_in_stopped_and_all_of_it_after(bench):
     assert [(identifier, data[:2].hex()) for identifier, data in bench.nmt(128)] == [(0xAC, "01ff")]
 
 
-def test_reset_of_the_node_forgets_errors_reset_of_communication_only_its_own(bench):
+def test_a_node_reset_clears_all_errors_and_a_communication_reset_its_own(bench):
     raise_error(bench)
     bench.frame(0x80, "01")
     assert bench.number(0x1001) == 0x91

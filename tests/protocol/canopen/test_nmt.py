@@ -47,7 +47,7 @@ def test_resets_boot_up_again(bench, before, node, command, event):
 
 
 @pytest.mark.parametrize("data", ["01", "012c00", "", "012d", "032c", "002c", "ff2c", "0180"])
-def test_what_is_no_command_for_this_node_is_ignored(bench, data):
+def test_an_invalid_or_foreign_nmt_command_is_ignored(bench, data):
     bench.frame(0, data)
     assert bench.slave.state is NmtState.PRE_OPERATIONAL
     assert bench.sent == bench.sent[:1]
@@ -78,7 +78,7 @@ def test_node_id_that_is_none(node_id):
 # Heartbeat producer
 
 
-def test_heartbeat_tells_the_state(bench):
+def test_the_heartbeat_reports_the_state(bench):
     bench.write(0x1017, 0, 100, 2)
     start = bench.now
     assert heartbeats(bench.advance(0.25)) == [
@@ -112,7 +112,7 @@ def guard(bench):
     return bench.frame(0x72C, remote=True)
 
 
-def test_guarding_toggles_and_tells_the_state(bench):
+def test_guarding_toggles_and_reports_the_state(bench):
     bench.write(0x1017, 0, 0, 2)
     assert [guard(bench) for _ in range(3)] == [[(0x72C, b"\x7f")], [(0x72C, b"\xff")], [(0x72C, b"\x7f")]]
     bench.operational()
@@ -128,7 +128,7 @@ def test_no_guarding_while_the_heartbeat_is_on(bench):
     assert guard(bench) == []
 
 
-def test_life_guarding_begins_with_the_first_request(bench):
+def test_life_guarding_starts_with_the_first_request(bench):
     bench.write(0x1017, 0, 0, 2)
     bench.write(0x100C, 0, 100, 2)
     bench.write(0x100D, 0, 3, 1)
@@ -156,7 +156,7 @@ def watch(bench, node=5, period_ms=100, entry=1):
     return bench.write(0x1016, entry, node << 16 | period_ms)
 
 
-def test_consumer_begins_with_the_first_heartbeat(bench):
+def test_the_consumer_starts_with_the_first_heartbeat(bench):
     watch(bench)
     assert [sent for sent in bench.advance(0.5) if sent[1] == 0xAC] == []
 

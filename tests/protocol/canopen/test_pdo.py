@@ -209,7 +209,9 @@ def test_object_that_cannot_be_read_is_not_sent(quiet):
         (0x1600, 0, 0, 1, AbortCode.UNSUPPORTED_ACCESS),
     ],
 )
-def test_what_a_living_pdo_refuses(bench, index, subindex, value, size, code):
+def test_writes_to_an_enabled_pdo_are_answered_with_their_abort_code(
+    bench, index, subindex, value, size, code
+):
     assert bench.write(index, subindex, value, size) == code
 
 
@@ -321,7 +323,7 @@ def test_synchronous_rpdo_acts_at_the_next_sync_on_the_latest(quiet):
     assert quiet.application.commands == [("set_mode", {"mode": "lost_in_space"})]
 
 
-def test_what_waits_for_sync_does_not_survive_leaving_operational(quiet):
+def test_pdos_waiting_for_sync_are_dropped_on_leaving_operational(quiet):
     configure_rpdo(quiet, kind=1)
     quiet.operational()
     quiet.frame(RPDO1, "03")

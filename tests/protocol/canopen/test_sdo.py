@@ -263,7 +263,7 @@ def test_block_upload(bench, length, size):
     assert bench.sdo("a1") == abort("000000", AbortCode.COMMAND)
 
 
-def test_block_upload_repeats_what_was_not_confirmed(bench):
+def test_block_upload_repeats_unconfirmed_segments(bench):
     data = bench.show(bytes(range(70)))
     bench.sdo("a4 40 60 01 05 00")
     first = bench.frame(0x62C, b"\xa3" + bytes(7))
@@ -307,7 +307,7 @@ def test_faults_of_block_uploads(bench, requests, code):
     assert bench.sdo(requests[-1]) == abort("406001", code)
 
 
-def test_block_upload_of_what_cannot_be_read(bench):
+def test_block_upload_of_an_unreadable_object_is_aborted(bench):
     assert bench.sdo("a4 40 60 01 7f 00") == abort("406001", AbortCode.NO_DATA)
     assert bench.sdo("a4 42 60 00 7f 00") == abort("426000", AbortCode.WRITE_ONLY)
     assert bench.sdo("a4 99 50 00 7f 00") == abort("995000", AbortCode.NO_OBJECT)
@@ -418,7 +418,7 @@ def test_block_download_end_before_its_time(bench):
     assert bench.sdo("60") == abort("002062", AbortCode.COMMAND)
 
 
-def test_block_download_to_what_cannot_be_written(bench):
+def test_block_download_is_aborted_for_a_read_only_object_or_a_wrong_size(bench):
     assert bench.sdo("c2 00 10 00 04") == abort("001000", AbortCode.READ_ONLY)
     assert bench.sdo("c2 17 10 00 04") == abort("171000", AbortCode.LENGTH_HIGH)
 

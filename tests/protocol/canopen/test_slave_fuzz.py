@@ -68,7 +68,7 @@ def frames(source: random.Random, entries: list[tuple[int, int]]):
         yield CanFrame(identifier, b"" if remote else bytes(data), extended=extended, remote=remote)
 
 
-def test_the_slave_answers_in_order_and_goes_on_whatever_comes():
+def test_the_slave_answers_in_order_and_survives_any_input():
     source = random.Random(SEED)
     bench = Bench().power_on()
     bench.show(bytes(3000))

@@ -27,7 +27,7 @@ def test_producer_sends_at_its_period_and_acts_on_its_own_sync(bench):
     assert [identifier for _, identifier, _ in bench.advance(0.02)] == [0x80, 0x1AC]
 
 
-def test_counter_wraps_at_its_overflow_and_begins_anew_after_stopped(bench):
+def test_the_counter_wraps_at_its_overflow_and_restarts_after_stopped(bench):
     bench.write(0x1017, 0, 0, 2)
     assert bench.write(0x1019, 0, 3, 1) == 0
     bench.write(0x1006, 0, 10_000)
@@ -91,7 +91,7 @@ def test_time_of_day_both_ways():
 @pytest.mark.parametrize(
     "data", [b"", NOON_DATA[:5], NOON_DATA + b"\0", (86_400_000).to_bytes(4, "little") + b"\0\0"]
 )
-def test_what_is_no_time_of_day(bench, data):
+def test_an_invalid_time_of_day_is_ignored(bench, data):
     bench.events()
     assert decode_time_of_day(data) is None
     bench.frame(0x100, data)

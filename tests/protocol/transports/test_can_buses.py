@@ -85,7 +85,7 @@ def _set_link(state: str) -> None:
 
 @pytest.mark.socketcan
 @pytest.mark.skipif(not HAS_VCAN, reason="no vcan0 here")
-def test_an_interface_that_goes_down_is_told_and_found_again() -> None:
+def test_an_interface_that_goes_down_is_reported_and_reopened() -> None:
     async def main() -> None:
         async with can_pair("socketcan") as pair:
             _set_link("down")
@@ -121,7 +121,7 @@ class _BusInTrouble(can.BusABC):
         raise can.CanOperationError("bus-off")
 
 
-def test_bus_off_is_told_and_no_frame() -> None:
+def test_bus_off_is_reported_and_is_no_frame() -> None:
     async def main() -> None:
         transport = PythonCanTransport("trouble:0", _BusInTrouble)
         errors: list[ProtocolError] = []
@@ -158,7 +158,7 @@ def test_bus_off_is_told_and_no_frame() -> None:
         ),
     ],
 )
-def test_buses_that_cannot_be_had_are_told_in_one_line(spec: str, message: str) -> None:
+def test_unavailable_buses_are_reported_in_one_line(spec: str, message: str) -> None:
     async def main() -> None:
         with pytest.raises(TransportError, match=message) as caught:
             await open_can(spec).start(lambda _: None)

@@ -101,7 +101,7 @@ asyncio.run(main())
 
 
 @pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
-def test_the_bus_goes_on_when_the_process_that_founded_it_is_killed(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_bus_survives_the_process_that_started_it(caplog: pytest.LogCaptureFixture) -> None:
     async def main() -> None:
         with socket.create_server(("127.0.0.1", 0)) as probe:
             port = probe.getsockname()[1]
@@ -134,7 +134,7 @@ def test_the_bus_goes_on_when_the_process_that_founded_it_is_killed(caplog: pyte
 
 
 @pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
-def test_auto_with_port_0_is_a_bus_of_its_own() -> None:
+def test_auto_with_port_0_is_a_private_bus() -> None:
     async def main() -> None:
         one, two = open_can("auto", hub_port=0), open_can("auto", hub_port=0)
         await one.start(lambda _: None)
@@ -177,7 +177,7 @@ async def _wrong_server(greeting: bytes) -> asyncio.Server:
 
 
 @pytest.mark.parametrize("greeting", [b"SSH-2.0-OpenSSH", b"< error busy >", b"", b"< hi >"])
-def test_a_server_that_is_no_socketcand_is_told(greeting: bytes) -> None:
+def test_a_server_that_is_no_socketcand_is_reported(greeting: bytes) -> None:
     async def main() -> None:
         async with await _wrong_server(greeting) as server:
             port = server.sockets[0].getsockname()[1]

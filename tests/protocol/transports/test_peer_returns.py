@@ -139,9 +139,7 @@ BUSES = {"hub": "", "virtual": "virtual:returns", "udp_multicast": "udp_multicas
 
 
 @pytest.mark.parametrize("kind", LINES)
-def test_a_line_carries_what_is_sent_after_the_return_at_once_and_nothing_from_before(
-    kind: str, tmp_path: Path
-) -> None:
+def test_a_line_carries_only_bytes_sent_after_the_peer_returned(kind: str, tmp_path: Path) -> None:
     async def main() -> None:
         peer = LINES[kind](tmp_path)
         line = open_serial(peer.spec, SLOW_BAUD, paced=True)
@@ -180,7 +178,7 @@ async def _hears(peer: Peer, line: SerialTransport) -> None:
 
 
 @pytest.mark.parametrize("kind", BUSES)
-def test_a_bus_carries_to_a_peer_that_came_back_what_is_sent_from_then_on(kind: str) -> None:
+def test_a_bus_carries_to_a_returned_peer_only_later_frames(kind: str) -> None:
     async def main() -> None:
         async with contextlib.AsyncExitStack() as stack:
             spec = BUSES[kind]

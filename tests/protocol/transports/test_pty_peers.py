@@ -59,7 +59,7 @@ async def next_bytes(fd: int, count: int) -> bytes:
     return bytes(data)
 
 
-def test_what_is_sent_while_nobody_has_the_line_open_is_lost() -> None:
+def test_bytes_sent_while_the_line_is_closed_are_lost() -> None:
     async def main() -> None:
         async with opened() as (line, _):
             for _ in range(1000):
@@ -79,9 +79,7 @@ def fill(line: SerialTransport) -> None:
 
 
 @pytest.mark.parametrize("watched", [True, False], ids=["inotify", "no inotify"])
-def test_what_a_peer_has_left_unread_is_gone_for_the_next(
-    watched: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_unread_bytes_are_gone_for_the_next_peer(watched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not watched:
         monkeypatch.setattr(pty, "_watch", lambda _: -1)
 

@@ -77,7 +77,7 @@ def test_a_peer_that_does_not_read_neither_blocks_nor_fills_memory(kind: str, tm
     asyncio.run(main())
 
 
-def test_a_vanished_port_is_told_once_and_comes_back_by_itself(tmp_path: Path) -> None:
+def test_a_vanished_port_is_reported_once_and_reopened(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "tty"
         async with serial_pair("pty and tty", tmp_path) as pair:
@@ -200,7 +200,7 @@ def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
         ("rfc2217://host:1", "must be auto, a tty's path"),
     ],
 )
-def test_ports_that_cannot_be_had_are_told_in_one_line(spec: str, message: str) -> None:
+def test_unavailable_ports_are_reported_in_one_line(spec: str, message: str) -> None:
     async def main() -> None:
         with pytest.raises(TransportError, match=message) as caught:
             await open_serial(spec).start(lambda _: None)
@@ -210,7 +210,7 @@ def test_ports_that_cannot_be_had_are_told_in_one_line(spec: str, message: str) 
     asyncio.run(main())
 
 
-def test_a_busy_port_is_told() -> None:
+def test_a_busy_port_is_reported() -> None:
     async def main() -> None:
         master, slave = os.openpty()
         tty.setraw(slave)
@@ -250,7 +250,7 @@ def test_closing_twice_or_unopened_is_harmless(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", SERIAL_KINDS)
-def test_a_new_bit_rate_begins_when_all_before_it_has_left(kind: str, tmp_path: Path) -> None:
+def test_a_new_bit_rate_takes_effect_after_all_earlier_bytes(kind: str, tmp_path: Path) -> None:
     async def main() -> None:
         async with serial_pair(kind, tmp_path, baud=19200) as pair:
             loop = asyncio.get_running_loop()
@@ -283,7 +283,7 @@ def test_a_tty_takes_another_bit_rate_and_keeps_it_when_it_comes_back(tmp_path: 
     asyncio.run(main())
 
 
-def test_a_bit_rate_that_a_tty_cannot_have_is_told_and_the_old_one_kept(tmp_path: Path) -> None:
+def test_an_impossible_bit_rate_is_reported_and_the_old_one_kept(tmp_path: Path) -> None:
     async def main() -> None:
         async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
             pair.two.set_baud(-1)
@@ -315,7 +315,7 @@ def test_a_tty_whose_settings_are_rejected_is_reported_in_one_line(monkeypatch: 
 
 
 @pytest.mark.parametrize("error", [termios.error(errno.EIO, "Input/output error"), RuntimeError("odd")])
-def test_a_port_comes_back_whatever_its_opening_raised_before(
+def test_a_port_is_reopened_after_any_error(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, error: Exception
 ) -> None:
     real, raised = serial.Serial, []

@@ -11,7 +11,7 @@ from starhil.protocol.transports.serial import open_serial
 
 @pytest.mark.parametrize("host", ["127.0.0..1", "x" * 300])
 @pytest.mark.parametrize("kind", ["socket", "listen", "socketcand"])
-def test_a_host_that_cannot_be_is_told_in_one_line(kind, host):
+def test_an_invalid_host_is_reported_in_one_line(kind, host):
     transport = (
         open_can(f"socketcand:{host}:29536/x") if kind == "socketcand" else open_serial(f"{kind}://{host}:1")
     )

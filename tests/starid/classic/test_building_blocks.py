@@ -22,7 +22,7 @@ def sky(count: int, seed: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
-def test_pair_ranges_are_those_of_a_scan_of_all_pairs() -> None:
+def test_pair_ranges_match_a_scan_of_all_pairs() -> None:
     vectors, longest = sky(120, 1), 0.7
     table = pair_table(vectors, longest)
     i, j = np.triu_indices(len(vectors), 1)

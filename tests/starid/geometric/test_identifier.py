@@ -105,7 +105,7 @@ def test_the_covariance_matches_the_errors(given: bool) -> None:
     assert chi2.ppf(UNLIKELY, 3 * solved) < total < chi2.ppf(1.0 - UNLIKELY, 3 * solved)
 
 
-def test_given_errors_weigh() -> None:
+def test_known_errors_weight_the_stars() -> None:
     rng = np.random.default_rng(25)
     with_errors, without = [], []
     for scene in scenes(SceneSettings(5.5, 0.0), 60, 26):
@@ -117,7 +117,7 @@ def test_given_errors_weigh() -> None:
     assert np.median(with_errors) < 0.5 * np.median(without)
 
 
-def test_the_solution_states_what_it_rests_on() -> None:
+def test_the_solution_states_stars_residuals_and_covariance() -> None:
     scene = scenes(ROWS["1"], 1, 27)[0]
     solution = identifier().identify(scene.xy_px, scene.flux)
     stars = identifier().catalog

@@ -19,7 +19,7 @@ def hot_detector(dtype=np.uint16):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_what_the_dark_frame_shows_is_gone_and_the_star_stays(dtype):
+def test_the_dark_frame_s_signal_is_removed_and_the_star_stays(dtype):
     dark = hot_detector(dtype)
     image = dark.copy()
     image[20:23, 20:23] += 50

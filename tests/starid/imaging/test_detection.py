@@ -220,7 +220,7 @@ def test_a_faint_companion_draws_a_star_as_a_blended_catalogue_expects(
         assert places.mean(axis=0) == pytest.approx((30.2 + shift, 30.0), abs=0.015 + 0.15 * shift)
 
 
-def test_a_pair_that_is_hardly_told_apart_has_wider_errors() -> None:
+def test_a_barely_resolved_pair_has_wider_errors() -> None:
     shape = (60, 120)
     known = DetectionSettings(gain_e_per_dn=GAIN, psf_sigma_px=SIGMA)
     light = spot(shape, 30.0, 30.0, 6000.0) + spot(shape, 90.0, 30.0, 6000.0)
@@ -231,7 +231,7 @@ def test_a_pair_that_is_hardly_told_apart_has_wider_errors() -> None:
     assert pair.xy_sigma_px[doubtful, 1] < 2.0 * pair.xy_sigma_px[alone, 1]
 
 
-def test_a_close_pair_can_be_told_apart() -> None:
+def test_a_close_pair_is_resolved() -> None:
     shape = (100, 100)
     light = spot(shape, 50.0, 50.0, 6000.0) + spot(shape, 51.3, 50.0, 4000.0)
     found = detect(photograph(light), DetectionSettings(psf_sigma_px=SIGMA, blend_px=0.0))
@@ -400,7 +400,7 @@ def test_black_and_white_and_flat_have_a_reason(dtype: type, shape: tuple[int, i
         (None, "not a NoneType"),
     ],
 )
-def test_what_is_no_image_is_rejected_in_one_line(image: object, text: str) -> None:
+def test_an_invalid_image_is_rejected_in_one_line(image: object, text: str) -> None:
     with pytest.raises(StaridError) as caught:
         detect(image)  # type: ignore[arg-type]
     assert text in str(caught.value)

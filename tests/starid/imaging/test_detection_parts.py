@@ -77,7 +77,7 @@ def smooth_image(image: np.ndarray, taps: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sigma", [0.4, 0.8, 1.3, 2.0, 4.0])
-def test_smoothing_keeps_the_level_and_lowers_the_noise_as_told(sigma: float) -> None:
+def test_smoothing_keeps_the_level_and_lowers_the_noise_as_stated(sigma: float) -> None:
     taps = spot_taps(sigma)
     assert taps[0] + 2.0 * taps[1:].sum() == pytest.approx(1.0, abs=1e-6)
     white = np.random.default_rng(3).normal(0.0, 1000.0, (400, 400)) + 30000.0
@@ -205,7 +205,7 @@ def flow_trails(flow: np.ndarray, places: np.ndarray, noise: float, seed: int = 
         (-1.5, 0.4, 0.5, 0.0, 0.0),
     ],
 )
-def test_a_flow_is_found_whatever_the_senses(flow: tuple[float, ...]) -> None:
+def test_a_flow_is_found_in_every_direction(flow: tuple[float, ...]) -> None:
     truth = np.array(flow)
     places = flow_places(30)
     trails = flow_trails(truth, places, 0.05)

@@ -113,7 +113,7 @@ def test_missing_files_and_folders_are_rejected(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["a.png", "a.tiff", "sub/folder/a.PNG"])
 @pytest.mark.parametrize("pixels", [GREY8, GREY16])
-def test_what_is_written_is_read_back(tmp_path: Path, name: str, pixels: np.ndarray) -> None:
+def test_a_written_image_is_read_back(tmp_path: Path, name: str, pixels: np.ndarray) -> None:
     write_image(tmp_path / name, pixels)
     np.testing.assert_array_equal(read_image(tmp_path / name), pixels)
     assert [p.name for p in (tmp_path / name).parent.iterdir()] == [Path(name).name]

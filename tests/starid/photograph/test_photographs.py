@@ -46,7 +46,7 @@ def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
     ],
     ids=["plain", "barrel", "pincushion", "hill", "out of focus"],
 )
-def test_a_photograph_tells_attitude_field_and_distortion(sky, seed, defects) -> None:
+def test_a_photograph_gives_attitude_field_and_distortion(sky, seed, defects) -> None:
     image, truth, camera = photograph(sky, seed, **defects)
     found = solve_image(image, NOMINAL, sky, fov_tolerance=0.1)
     assert found.solution.valid
@@ -55,7 +55,7 @@ def test_a_photograph_tells_attitude_field_and_distortion(sky, seed, defects) ->
     assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
 
 
-def test_a_negative_and_a_mirrored_photograph_are_seen_for_what_they_are(sky) -> None:
+def test_negative_and_mirrored_photographs_are_recognised(sky) -> None:
     image, truth, camera = photograph(sky, 6)
     negative = solve_image(np.invert(image), NOMINAL, sky, fov_tolerance=0.1)
     assert centre_error_arcsec(negative, truth, camera) < CENTRE_ARCSEC
@@ -163,7 +163,7 @@ def test_a_negative_is_known_by_its_dark_tail(sky) -> None:
 
 
 @pytest.mark.parametrize("bits", [8, 16])
-def test_a_coarser_look_tells_what_the_plain_one_tells(sky, bits) -> None:
+def test_a_coarser_view_gives_the_same_detections(sky, bits) -> None:
     image, _, _ = photograph(sky, 12, trail_px=12.0)
     if bits == 16:
         image = image.astype(np.uint16) * 100
@@ -180,7 +180,7 @@ def test_a_coarser_look_tells_what_the_plain_one_tells(sky, bits) -> None:
     assert coarse.trail_px == pytest.approx(plain.trail_px, rel=0.1)
 
 
-def test_pattern_stars_are_those_of_the_plain_rule() -> None:
+def test_pattern_stars_match_the_plain_rule() -> None:
     rng = np.random.default_rng(11)
     vectors = rng.normal(size=(1500, 3))
     vectors /= np.linalg.norm(vectors, axis=1)[:, None]

@@ -96,7 +96,7 @@ def test_experiments_begin_in_their_turn_and_report_in_their_order(tmp_path):
     assert [result.experiment.name for result in ended] == ["late", "early"]
 
 
-def test_only_what_changed_is_computed_again(tmp_path):
+def test_only_changed_parts_are_computed_again(tmp_path):
     runner.run([_experiment()], tmp_path, jobs=1)
     longer = dataclasses.replace(_experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9})
     assert runner.run([longer], tmp_path, jobs=1)[0].parts == 1
@@ -105,7 +105,7 @@ def test_only_what_changed_is_computed_again(tmp_path):
     assert runner.run([revised], tmp_path, seed=2, jobs=1)[0].parts == 4
 
 
-def test_a_run_goes_on_where_it_was_interrupted(tmp_path):
+def test_a_run_resumes_where_it_was_interrupted(tmp_path):
     whole = runner.run([_experiment()], tmp_path / "whole", jobs=1)[0].outcome
 
     def interrupted(context: Context, part: Part) -> Results:
@@ -169,7 +169,7 @@ def test_an_interrupted_finish_leaves_no_outcome_of_other_parameters(tmp_path):
     assert (tmp_path / "toy" / "values.csv").read_text() == values
 
 
-def test_parts_on_the_sphere_do_not_depend_on_what_the_process_did_before(tmp_path):
+def test_parts_on_the_sphere_do_not_depend_on_the_process_s_history(tmp_path):
     spherical = registry.experiments()["spherical"]
     parameters = {**spherical.full, "frames": 2}
     context = Context(tmp_path, tmp_path, "spherical", 1, parameters, quick=False)
@@ -261,7 +261,7 @@ def test_an_agreement_needs_a_number():
         (False, 91.0, False, ""),
     ],
 )
-def test_an_improvement_is_one_sided_and_says_by_how_much(larger, ours, passed, words):
+def test_an_improvement_is_one_sided_and_quantified(larger, ours, passed, words):
     made = improvement("q", published=90.0, ours=ours, larger=larger)
     assert (made.passed, made.kind) == (passed, "better")
     assert words in made.remark
@@ -273,7 +273,7 @@ def test_a_row_of_several_numbers_counts_each():
     assert "2 of 3 agree" in made.remark
 
 
-def test_the_sampling_error_is_that_of_two_counts():
+def test_the_sampling_error_combines_two_counts():
     greatest, words = sampling(50.0, 1000)
     assert greatest == pytest.approx(3.0 * np.sqrt(2.0 * 0.25 / 1000.0) * 100.0, rel=1e-2)
     assert "two shares of 1000" in words
@@ -290,7 +290,7 @@ def test_columns_of_unequal_length_are_rejected(tmp_path):
         write_csv(tmp_path / "t.csv", {"a": [1], "b": [1, 2]})
 
 
-def test_the_report_names_what_was_missed_and_links_the_files(tmp_path):
+def test_the_report_names_missed_checks_and_links_the_files(tmp_path):
     results = runner.run([_experiment(least=1e9)], tmp_path, jobs=1)
     text = report.report_text(results, quick=False, seed=1)
     assert "| bounds of this project hold | 0 | 1 |" in text
@@ -332,7 +332,7 @@ def _invoke(*arguments: str):
 
 
 @pytest.mark.parametrize(("least", "known", "status"), [(-1e9, False, 0), (1e9, False, 1), (1e9, True, 0)])
-def test_the_exit_status_says_whether_there_is_a_regression(tmp_path, monkeypatch, least, known, status):
+def test_the_exit_status_reports_a_regression(tmp_path, monkeypatch, least, known, status):
     monkeypatch.setattr(registry, "experiments", lambda: {"toy": _experiment(least=least)})
     entries = {"toy": {"total | of all": KnownMiss("Known.")}} if known else {}
     monkeypatch.setattr(known_misses, "KNOWN", entries)

@@ -26,7 +26,7 @@ def seven_stars():
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_clusters_are_those_of_scikit_learn(seed):
+def test_clusters_match_scikit_learn(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(3, 9))
     brightness, positions = rng.uniform(0.0, 3.0, n), rng.uniform(-20.0, 20.0, (n, 2))
@@ -42,7 +42,7 @@ def test_clusters_are_those_of_scikit_learn(seed):
 
 
 @pytest.mark.parametrize("spread", [0.01, 0.3, 5.0, 500.0])
-def test_clusters_of_any_extent_are_those_of_scikit_learn(spread):
+def test_clusters_of_any_extent_match_scikit_learn(spread):
     points = np.random.default_rng(8).normal(0.0, spread, (400, 3))
     points[::3] = np.round(points[::3] / 0.4) * 0.4
     expected = DBSCAN(eps=0.4, min_samples=3).fit(points).labels_

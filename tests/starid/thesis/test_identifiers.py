@@ -115,7 +115,7 @@ def test_a_change_of_exposure_is_no_reason_to_be_lost():
     assert lsi().zero_point == pytest.approx(before + 2.5, abs=1e-6)
 
 
-def test_after_a_reset_an_answer_is_what_it_is_first():
+def test_after_a_reset_the_answer_is_the_first_one():
     rng = np.random.default_rng(8)
     before, frame = (points(rng, random_attitude(rng)) for _ in range(2))
     recursion = RsiIdentifier()

@@ -34,7 +34,7 @@ def observations(percent, every, shift=0.0):
 
 
 @pytest.mark.parametrize("k", [1, 20])
-def test_stored_neighbours_are_those_of_a_tree(k):
+def test_stored_neighbours_match_a_tree(k):
     made, lsi = database(99.0), lost_in_space(99.0)
     tree = cKDTree(made.features.astype(np.float64))
     for observation in observations(99.0, 40, 0.13):
@@ -45,7 +45,7 @@ def test_stored_neighbours_are_those_of_a_tree(k):
         np.testing.assert_allclose(np.sort(np.sqrt(distances)), expected, atol=1e-9)
 
 
-def test_exact_neighbour_is_that_of_full_precision():
+def test_the_exact_neighbour_matches_full_precision():
     made, lsi = database(96.0), lost_in_space(96.0)
     full = np.empty((made.cells, 5))
     sums = np.empty(8)
@@ -138,7 +138,7 @@ def test_accuracy_off_the_grid_and_between_the_cells():
     assert (fine <= 0.001).mean() > 0.8
 
 
-def test_comparing_the_stars_tells_places_of_equal_features_apart():
+def test_comparing_the_stars_separates_cells_of_equal_features():
     lsi = lost_in_space(99.5)
     search = SubcellSearch(lsi, neighbours=256)
     errors = {False: [], True: []}

@@ -49,7 +49,7 @@ def test_lost_in_space_is_the_nearest_neighbour_and_the_lasso_of_scikit_learn(ra
 
 
 @pytest.mark.parametrize("penalty", [0.5, 2.0, 5.0])
-def test_the_path_has_the_least_value_of_what_is_minimised(penalty):
+def test_the_path_reaches_scikit_learn_s_minimum(penalty):
     made = database(96.0)
     observation = made.normalise(made.sky.features(115.0, -65.0))
     cells = made.grid.dictionary(734)

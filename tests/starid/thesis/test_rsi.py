@@ -127,11 +127,11 @@ def test_answers_that_agree_outvote_the_others():
     memory = AnswerMemory(9, 0.5)
     for ra, dec in [(359.9, 1.0), (40.0, 9.0), (0.1, 1.1), (200.0, -50.0), (0.0, 1.2), (1.5, 2.5)]:
         memory.add(ra, dec, 179.9)
-    place = memory.place()
-    assert place.votes == 3
-    assert place.right_ascension_deg % 360.0 == pytest.approx(0.0, abs=1e-9)
-    assert place.declination_deg == pytest.approx(1.1)
-    assert place.roll_deg == pytest.approx(179.9)
+    predicted = memory.prediction()
+    assert predicted.votes == 3
+    assert predicted.right_ascension_deg % 360.0 == pytest.approx(0.0, abs=1e-9)
+    assert predicted.declination_deg == pytest.approx(1.1)
+    assert predicted.roll_deg == pytest.approx(179.9)
 
 
 def test_the_memory_follows_the_camera():
@@ -146,23 +146,23 @@ def test_the_memory_follows_the_camera():
         _, first, second = np.intersect1d(before.identity, now.identity, return_indices=True)
         memory.add(before.right_ascension_deg, before.declination_deg, before.roll_deg)
         memory.carry(estimate_motion(before.observed.positions[first], now.observed.positions[second]))
-    place = memory.place()
-    assert place.votes == 19
+    predicted = memory.prediction()
+    assert predicted.votes == 19
     error = boresight_error(
-        place.right_ascension_deg, place.declination_deg, now.right_ascension_deg, now.declination_deg
+        predicted.right_ascension_deg, predicted.declination_deg, now.right_ascension_deg, now.declination_deg
     )
     assert float(error) < 1e-9
-    assert place.roll_deg == pytest.approx(now.roll_deg)
+    assert predicted.roll_deg == pytest.approx(now.roll_deg)
 
 
-def test_the_memory_forgets_what_is_too_old_and_all_when_cleared():
+def test_the_memory_drops_old_answers_and_all_when_cleared():
     memory = AnswerMemory(2, 0.5)
     for ra in (10.0, 10.1, 50.0, 50.1):
         memory.add(ra, 0.0, 0.0)
     memory.carry(motion(shift=(1.0, 0.0)))
-    assert memory.place().right_ascension_deg == pytest.approx(49.05)
+    assert memory.prediction().right_ascension_deg == pytest.approx(49.05)
     memory.clear()
-    assert memory.place() is None
+    assert memory.prediction() is None
 
 
 def test_a_wrong_start_is_recovered_from_and_gross_answers_are_outvoted():
