@@ -210,9 +210,8 @@ class Identifier(SingleCameraIdentifier):
     def _identify(self, measured: Measured) -> Solution:
         if self._fov_tolerance > 0.0:
             return self._identify_any_scale(measured)
-        return self._solution(
-            self._search(self._camera, measured, self._numbers_for(measured)), "lost_in_space"
-        )
+        answer = self._search(self._camera, measured, self._numbers_for(measured))
+        return self._solution(answer, "lost_in_space")
 
     def _search(self, camera: Camera, measured: Measured, numbers: Array) -> Answer:
         """Search the whole sky with a camera and settings of the kernels."""

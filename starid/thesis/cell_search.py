@@ -191,22 +191,6 @@ def _push_children(
 
 
 @compiled
-def _next_vectors(
-    index: CellIndex, query: Array, slack: float, limit: float, stack: Array, top: int
-) -> tuple[int, int, int]:
-    """Take the nearest branch from the stack: the vectors to look at, none where it is cut or halved, and the new top."""
-    top -= 1
-    if stack[top, 2] > limit:
-        return 0, 0, top
-    level, prefix = int(stack[top, 0]), int(stack[top, 1])
-    rest = index.depth - level
-    first, last = index.start[prefix << rest], index.start[(prefix + 1) << rest]
-    if rest > 0 and last - first > _SCAN:
-        return 0, 0, _push_children(index, level, prefix, query, slack, limit, stack, top)
-    return first, last, top
-
-
-@compiled
 def _sift_down(distances: Array, cells: Indices, size: int) -> None:
     """Restore the heap (greatest distance, then greatest cell, on top) after its top was replaced."""
     at = 0
@@ -246,7 +230,17 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
     stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
-        first, last, top = _next_vectors(index, query, 0.0, distances[0], stack, top)
+        top -= 1
+        if stack[top, 2] > distances[0]:
+            continue
+        level = int(stack[top, 0])
+        prefix = int(stack[top, 1])
+        rest = index.depth - level
+        first = index.start[prefix << rest]
+        last = index.start[(prefix + 1) << rest]
+        if rest > 0 and last - first > _SCAN:
+            top = _push_children(index, level, prefix, query, 0.0, distances[0], stack, top)
+            continue
         for i in range(first, last):
             d = 0.0
             for f in range(5):
@@ -297,7 +291,17 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
     stack = np.zeros((_STACK, 3))
     top = 1
     while top > 0:
-        first, last, top = _next_vectors(index, query, _HALF_STEP, best, stack, top)
+        top -= 1
+        if stack[top, 2] > best:
+            continue
+        level = int(stack[top, 0])
+        prefix = int(stack[top, 1])
+        rest = index.depth - level
+        first = index.start[prefix << rest]
+        last = index.start[(prefix + 1) << rest]
+        if rest > 0 and last - first > _SCAN:
+            top = _push_children(index, level, prefix, query, _HALF_STEP, best, stack, top)
+            continue
         for i in range(first, last):
             d = 0.0
             for f in range(5):
