@@ -435,7 +435,7 @@ class AreaPainter:
         margin = 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
         if not disc_in_field(direction, radius_rad + margin, self._camera):
             return None
-        cosines = np.tensordot(direction.astype(np.float32), self._grid_directions, axes=1)
+        cosines = np.einsum("k,kij", direction.astype(np.float32), self._grid_directions)
         near = cosines >= math.cos(min(radius_rad + margin, math.pi))
         spans = []
         for axis, size in enumerate(self._size[::-1]):
