@@ -129,11 +129,11 @@ class AreaLight:
 
     @property
     def covered_share(self) -> float:
-        """Fraction of the image that receives less than half of the sky's light, by every `GLARE_STEP`-th pixel."""
-        if self.earth is not None and len(self._layers) == 1:
-            return self.earth.covered_share
-        if not self._layers:
-            return float(self.flooded)
+        """Fraction of the image that receives less than half of the sky's light; behind obstructions, by a grid of pixels."""
+        if not self.in_front:
+            hidden = sum(np.count_nonzero(patch.passed < 0.5) for patch in self.behind)
+            share = float(self.flooded) if self.earth is None else self.earth.covered_share
+            return min(share + hidden / math.prod(self.size), 1.0)
         x, y = np.meshgrid(*(np.arange(GLARE_STEP // 2, size, GLARE_STEP) for size in self.size))
         return float(np.mean(self.seen_at(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64)) < 0.5))
 
@@ -433,10 +433,10 @@ class AreaPainter:
 
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
         """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
-        margin = 2.0 * GLARE_STEP * self._camera.pixel_scale_rad
+        margin = 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
         if not disc_in_field(direction, radius_rad + margin, self._camera):
             return None
-        cosines = np.tensordot(direction.astype(np.float32), self._grid_directions, axes=1)
+        cosines = np.einsum("k,kij", direction.astype(np.float32), self._grid_directions)
         near = cosines >= math.cos(min(radius_rad + margin, math.pi))
         spans = []
         for axis, size in enumerate(self._size[::-1]):
