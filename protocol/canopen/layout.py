@@ -32,7 +32,7 @@ class PackedField(_Model):
 
 
 class PlacedMember(_Model):
-    """One entry of a record: a field to read, a telecommand to write, or both; or a parameter."""
+    """One entry of a record: a field to read, a telecommand to write, or both; a parameter; or a file that is never there."""
 
     subindex: Annotated[int, Field(ge=1, le=254)] | None = None
     """One more than that of the entry before unless given."""
@@ -40,11 +40,14 @@ class PlacedMember(_Model):
     value: str | None = None
     telecommand: str | None = None
     parameter: str | None = None
+    domain: Literal["ro", "wo"] | None = None
+    """A DOMAIN that never has data: reading and writing it are refused for that."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> PlacedMember:
-        if (self.parameter is not None) == (self.value is not None or self.telecommand is not None):
-            raise ValueError("needs value and/or telecommand, or parameter")
+        row = self.value is not None or self.telecommand is not None
+        if row + (self.parameter is not None) + (self.domain is not None) != 1:
+            raise ValueError("needs value and/or telecommand, or parameter, or domain")
         return self
 
 
