@@ -48,7 +48,7 @@ class Entry:
     name
         As PDOs refer to it: `INDEX.NAME`, or `INDEX`.
     size
-        Bytes; 0 where the definition fixes none.
+        Bytes; 0 where the definition fixes none, as of a text.
     row, slot
         Telemetry that it reads, and which part of it.
     command, part
@@ -105,13 +105,18 @@ def _entry(
         row_name, _, field = placed.value.partition(".")
         row = icd.telemetry[row_name]
         slot = row.named_fields[field].slot
-        size = slot.size
+        size = 0 if row.named_fields[field].kind == "text" else slot.size
     command = None if placed.telecommand is None else icd.telecommands[placed.telecommand]
-    if command is not None:
+    if command is not None and not _is_text(command):
         size = size or command.size
     if isinstance(placed, PlacedMember) and placed.parameter is not None:
         size = _bytes_of(icd.parameters[placed.parameter].type)
     return Entry(index, subindex, name, size, row, slot, command)
+
+
+def _is_text(command: Row) -> bool:
+    """Return whether a telecommand has a text, which is written as long as it is."""
+    return [field.kind for field in command.fields] == ["text"]
 
 
 def _bytes_of(type_: str) -> int:
@@ -143,6 +148,8 @@ def _turned(slot: Slot | None, data: bytes) -> bytes:
 def _read(probe: CanopenProbe, entry: Entry) -> bytes:
     """Read an entry, which must have its size; return it in the order of its row."""
     data = probe.read(entry.index, entry.subindex)
+    if entry.slot is not None and not entry.size:
+        return data.ljust(entry.slot.size, b"\0")
     check_equal(len(data), entry.size, f"bytes of {entry.name}h")
     return _turned(entry.slot, data)
 
@@ -171,6 +178,8 @@ def _written(entry: Entry, command: Row, data: bytes) -> bytes:
     part = command.slots[0] if entry.part is None and len(command.slots) == 1 else entry.part
     if not data:
         return b"\x01"
+    if _is_text(command):
+        return data.rstrip(b"\0") or b"\0"
     return data if part is None else _turned(part, data[part.offset : part.offset + part.size])
 
 
@@ -301,7 +310,11 @@ def _reports(entry: Entry, *quantities: str) -> bool:
 def _reported(entry: Entry, command: Row) -> Run:
     """Write all values of an enumeration, else both limits; the previous value is put back."""
     (name, field), *_ = command.named_fields.items()
-    values: list[Value] = list(field.physical_limits) if field.enum is None else list(field.enum.values)
+    values: list[Value]
+    if _is_text(command):
+        values = ["s", "star"]
+    else:
+        values = list(field.physical_limits) if field.enum is None else list(field.enum.values)
 
     def run(probe: CanopenProbe) -> None:
         before = probe.read(entry.index, entry.subindex)
@@ -311,7 +324,7 @@ def _reported(entry: Entry, command: Row) -> Run:
             check_equal(
                 probe.read(entry.index, entry.subindex), data, f"{entry.name}h after writing {value!s}:"
             )
-        probe.set(entry.index, entry.subindex, before)
+        probe.set(entry.index, entry.subindex, before or b"\0")
 
     return run
 

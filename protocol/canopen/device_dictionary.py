@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Final, NoReturn
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
@@ -212,13 +212,15 @@ class DeviceDictionary(Dictionary):
         if value is not None:
             row, slot, fields = self._slot_of(value)
             if telecommand is None:
-                member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
+                member = variable(name, *key, _data_type(slot, fields), "ro", mappable=slot.type != "bytes")
                 _describe(member, fields)
-            elif member.data_type != DATA_TYPES[slot.type]:
+            elif member.data_type != _data_type(slot, fields):
                 raise IcdError(f"canopen.toml: {key[0]:04X}h: {value} and {telecommand} differ in type")
             else:
                 member.access_type = "rw"
-            self._bind_reader(key, row, name, partial(self._read_slot, row, slot))
+            read = partial(self._read_slot, row, slot)
+            text = fields[0].kind == "text"
+            self._bind_reader(key, row, name, (lambda: read().rstrip(b"\0")) if text else read)
             self._placed[row.kind, row.name, slot.index] = key
         return member
 
@@ -232,6 +234,9 @@ class DeviceDictionary(Dictionary):
         add_record(objects, placed.name, members)
 
     def _member_variable(self, model: PlacedMember, key: Key) -> ODVariable:
+        if model.domain is not None:
+            self._readers[key] = self._writers[key] = _no_data
+            return variable(model.name, *key, datatypes.DOMAIN, model.domain)
         if model.parameter is None:
             return self._value_variable(model.name, key, model.value, model.telecommand)
         return self._parameter_variable(model.name, key, self.icd.parameters[model.parameter])
@@ -313,7 +318,8 @@ class DeviceDictionary(Dictionary):
 
         The client writes the only value, all bytes (as a number if a type is given), or 1 if the telecommand has no data.
         """
-        scalar = type_ is None and len(row.slots) == 1 and row.slots[0].type != "bytes"
+        text = type_ is None and [field.kind for field in row.fields] == ["text"]
+        scalar = text or (type_ is None and len(row.slots) == 1 and row.slots[0].type != "bytes")
         self._placed[row.kind, row.name, row.slots[0].index if scalar else None] = key
         if type_ is not None:
             if type_size(DATA_TYPES[type_]) != row.size:
@@ -325,6 +331,10 @@ class DeviceDictionary(Dictionary):
         elif row.size == 0:
             member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
             self._writers[key] = lambda _data: self._execute(row, b"")
+        elif text:
+            member = variable(name, *key, datatypes.VISIBLE_STRING, "wo")
+            self._sizes[key] = row.size
+            self._writers[key] = lambda payload: self._execute(row, payload.ljust(row.size, b"\0"))
         elif scalar:
             slot, fields = _slots(row)[0]
             member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
@@ -423,6 +433,14 @@ def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
         if fields:
             slots.append((slot, fields))
     return slots
+
+
+def _data_type(slot: Slot, fields: list[Field]) -> int:
+    return datatypes.VISIBLE_STRING if fields[0].kind == "text" else DATA_TYPES[slot.type]
+
+
+def _no_data(_data: bytes = b"") -> NoReturn:
+    raise SdoAbortError(AbortCode.NO_DATA, "no file")
 
 
 def span_of(slot: Slot) -> slice:

@@ -35,7 +35,7 @@ class PackedField(_Model):
 
 
 class PlacedMember(_Model):
-    """An entry of a record, with `value`, `telecommand` or both, or with `parameter`."""
+    """An entry of a record, with `value`, `telecommand` or both, with `parameter`, or with `domain`."""
 
     subindex: Annotated[int, Field(ge=1, le=254)] | None = None
     """Sub-index; default: the next one."""
@@ -47,11 +47,14 @@ class PlacedMember(_Model):
     """Telecommand that a write executes."""
     parameter: str | None = None
     """Parameter that is read and set."""
+    domain: Literal["ro", "wo"] | None = None
+    """A DOMAIN that never has data, such as a file that is absent: access is refused with 0800 0024h."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> PlacedMember:
-        if (self.parameter is not None) == (self.value is not None or self.telecommand is not None):
-            raise ValueError("needs value and/or telecommand, or parameter")
+        row = self.value is not None or self.telecommand is not None
+        if row + (self.parameter is not None) + (self.domain is not None) != 1:
+            raise ValueError("needs value and/or telecommand, or parameter, or domain")
         return self
 
 

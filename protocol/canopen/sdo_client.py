@@ -86,7 +86,7 @@ def _read(row: Row, entries: Sequence[tuple[Key, Slot | None]]) -> SdoTransfer:
         value = yield from upload(*key)
         if slot is None:
             return value
-        data[span_of(slot)] = in_order(slot, value)
+        data[span_of(slot)] = in_order(slot, value).ljust(slot.size, b"\0")  # a text ends before its NULs
     return bytes(data)
 
 

@@ -189,6 +189,8 @@ def _content(placed: PlacedObject) -> str:
         )
     if placed.telemetry is not None:
         return f"telemetry {placed.telemetry}: a sub-index a field"
+    if placed.members:
+        return ", ".join(member.name for member in placed.members)
     shown = [] if placed.value is None else [f"reads {placed.value}"]
     return ", ".join(
         [*shown, *([] if placed.telecommand is None else [f"writing executes {placed.telecommand}"])]

@@ -1,7 +1,7 @@
 """A program around the exported C: it encodes, decodes and talks over a serial line as lines on its stdin ask.
 
-`decode ROW HEX`, `encode ROW VALUE…`, `frame ID HEX`, `receive DIALECT PENDING HEX`, `open PATH DIALECT`, `ask ID HEX`;
-each is answered by one line.
+`decode ROW HEX`, `encode ROW VALUE…`, `frame ID HEX`, `receive DIALECT PENDING HEX`, `open PATH DIALECT`, `ask ID HEX`, and
+on CAN `can_frame ID HEX`, `can_receive`, `can CANID HEX`, `can_give_up`, from address 1 to 4; each is answered by one line.
 """
 
 from __future__ import annotations
@@ -164,6 +164,9 @@ int main(void)
             printf("%d", (int)unit_give_up(&receiver));
         } else if (strcmp(verb, "open") == 0) {
             open_port(first);
+        } else if (strncmp(verb, "can", 3u) == 0) {
+            size = hex(bytes);
+            on_can(verb, first == NULL ? 0ul : strtoul(first, NULL, 10), bytes, size);
         } else {
             ask((uint32_t)atol(first));
         }
@@ -186,6 +189,33 @@ static size_t needed_capacity(uint32_t id, const uint8_t *data, size_t size, uin
 {
     return unit_frame_request((uint8_t)id, data, size, frame, UNIT_REQUEST_CAPACITY(size));
 }
+
+static void on_can(const char *verb, unsigned long id, const uint8_t *data, size_t size)
+{
+    static unit_can_receiver_t can_receiver;
+    unit_can_frame_t frame;
+    unit_message_t message;
+    size_t number;
+    if (strcmp(verb, "can_frame") == 0) {
+        for (number = 0u; unit_can_request((uint8_t)id, data, size, 1u, 4u, number, &frame); ++number) {
+            printf("%lu", (unsigned long)frame.id);
+            print_hex(frame.data, frame.size);
+            printf(" ");
+        }
+    } else if (strcmp(verb, "can_receive") == 0) {
+        unit_can_receiver_init(&can_receiver, 1u, 4u);
+    } else if (strcmp(verb, "can_give_up") == 0) {
+        printf("%d", (int)unit_can_give_up(&can_receiver));
+    } else {
+        memset(&frame, 0, sizeof frame);
+        frame.id = (uint32_t)id;
+        frame.size = (uint8_t)size;
+        memcpy(frame.data, data, size);
+        if (unit_can_receive(&can_receiver, &frame, &message) != UNIT_NONE) {
+            print_message(&message);
+        }
+    }
+}
 """,
     True: """
 static void init_receiver(const char *dialect)
@@ -198,6 +228,11 @@ static size_t needed_capacity(uint32_t id, const uint8_t *data, size_t size, uin
 {
     (void)id, (void)data, (void)frame;
     return UNIT_REQUEST_CAPACITY(size);
+}
+
+static void on_can(const char *verb, unsigned long id, const uint8_t *data, size_t size)
+{
+    (void)verb, (void)id, (void)data, (void)size;
 }
 """,
 }

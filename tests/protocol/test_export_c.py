@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_reply, encode_request
 from starhil.protocol.values import FieldError
+from tests.emulator.units.clients import Emulated, with_unit
 from tests.protocol.c_driver import CDriver, c_words, hex_or_none
 from tests.protocol.test_export import by_name, packets
 
@@ -148,6 +151,112 @@ def test_the_receiver_of_the_c_reads_streams_as_ours(c: CDriver, dialect: Dialec
 def test_a_message_that_is_too_long_is_one_fault(c: CDriver) -> None:
     data = b"\x1f\x7f\x80" + bytes(600) + b"\x1f\xff"
     assert c_events(c, Dialect.A, 128, data) == events(Dialect.A, 128, data)
+
+
+# -- CAN ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("row", list(ICD.rows), ids=by_name)
+def test_requests_on_can_are_framed_as_ours(c: CDriver, row: Row) -> None:
+    samples = [bytes(range(row.size))] if row.kind == "telecommand" else [b""]
+    for data in samples:
+        frames = encode_request_frames(Request.of(row.id, data), 1, 4)
+        expected = [word for frame in frames for word in (str(frame.id), hex_or_none(frame.data))]
+        assert c("can_frame", row.id, hex_or_none(data)) == expected
+
+
+def test_a_request_on_can_has_as_many_frames_as_its_counter_allows(c: CDriver) -> None:
+    for size in (0, 7, 8, 9, 14, 15, 1792):
+        data = bytes(number % 251 for number in range(size))
+        frames = encode_request_frames(Request.of(9, data), 1, 4)
+        assert c("can_frame", 9, hex_or_none(data))[1::2] == [hex_or_none(frame.data) for frame in frames]
+    assert c("can_frame", 9, bytes(1793).hex()) == []
+
+
+def can_events(frames: list[CanFrame]) -> list[list[str]]:
+    """What our receiver of the OBC's side makes of each frame, as the program prints it, and of the silence after them."""
+    receiver = CanHostReceiver(1, 4)
+    found = []
+    for frame in frames:
+        events = receiver.feed(frame, 0.0)
+        messages = [event for event in events if not isinstance(event, LinkFault)]
+        words = [FAULT, "0", "0", "-"] if events else []
+        for event in messages:
+            words = [KINDS.index(event.kind.value), event.id, int(event.code), hex_or_none(event.data)]
+        found.append([str(word) for word in words])
+    return [*found, [FAULT] if receiver.flush(1.0) else ["0"]]
+
+
+def test_the_receiver_of_the_c_reads_can_as_ours(c: CDriver) -> None:
+    rng = random.Random(11)
+    for _ in range(300):
+        frames: list[CanFrame] = []
+        for _ in range(rng.randrange(1, 5)):
+            kind = rng.choice([kind for kind in ReplyKind if kind is not ReplyKind.ECHO])
+            short = kind in (ReplyKind.ACK, ReplyKind.NACK)
+            data = rng.randbytes(
+                0 if short else rng.choice([1, 8] if kind is ReplyKind.EVENT else [1, 8, 9, 22, 70])
+            )
+            id_ = 119 if kind is ReplyKind.BURST else 128 if kind is ReplyKind.TELEMETRY else 130
+            code = rng.randrange(1, 11) if kind is ReplyKind.NACK else 0
+            frames += encode_reply_frames(Reply(kind, id_, data, code=code, destination=1), 4)
+        damaged = list(frames)
+        for _ in range(rng.randrange(4)):
+            at = rng.randrange(len(damaged))
+            odd = rng.choice([damaged[at].data[:-1], b"", rng.randbytes(8)])
+            damaged[at : at + 1] = rng.choice(
+                [
+                    [],
+                    [damaged[at]] * 2,
+                    [replace(damaged[at], data=odd)],
+                    [replace(damaged[at], id=damaged[at].id ^ 0x100)],
+                ]
+            ) or [CanFrame(0x1F010401)]
+        for sent in (frames, damaged):
+            c("can_receive", 0)
+            got = [c("can", frame.id, hex_or_none(frame.data)) for frame in sent]
+            assert [*got, c("can_give_up", 0)] == can_events(sent), sent
+
+
+def test_another_row_ends_a_message_on_can_that_is_incomplete(c: CDriver) -> None:
+    cut, whole = (
+        encode_reply_frames(Reply(ReplyKind.TELEMETRY, id_, bytes(size), destination=1), 4)
+        for id_, size in ((130, 20), (131, 13))
+    )
+    c("can_receive", 0)
+    got = [c("can", frame.id, hex_or_none(frame.data)) for frame in (cut[0], *whole)]
+    assert got == [[], [FAULT, "0", "0", "-"], ["1", "131", "0", bytes(13).hex()]]
+    assert c("can_give_up", 0) == ["0"]
+
+
+def test_a_message_on_can_that_is_too_long_is_one_fault(c: CDriver) -> None:
+    frames = encode_reply_frames(Reply(ReplyKind.TELEMETRY, 130, bytes(600), destination=1), 4)
+    c("can_receive", 0)
+    got = [c("can", frame.id, hex_or_none(frame.data)) for frame in frames]
+    assert [*got, c("can_give_up", 0)] == can_events(frames)
+    assert sum(FAULT in words for words in got) == 1
+
+
+def test_every_row_is_answered_by_the_emulated_unit_on_can(c: CDriver) -> None:
+    def ask(unit: Emulated, row: Row, data: bytes) -> list[str]:
+        c("can_receive", 0)
+        words = c("can_frame", row.id, hex_or_none(data))
+        answer: list[CanFrame] = []
+        for can_id, hexed in zip(words[::2], words[1::2], strict=True):
+            answer += unit.ask_can(int(can_id), bytes.fromhex(hexed.strip("-")))
+        *none, last = [c("can", frame.id, hex_or_none(frame.data)) for frame in answer]
+        assert none == [[]] * len(none)
+        return last
+
+    def scenario(unit: Emulated) -> None:
+        for row in ICD.telemetry.values():
+            kind, id_, _, data = ask(unit, row, b"")
+            assert (KINDS[int(kind)], int(id_), len(data) // 2) == ("telemetry", row.id, row.size), row.name
+        for row in ICD.telecommands.values():
+            kind, id_, *_ = ask(unit, row, row.encode(row.example()))
+            assert (KINDS[int(kind)] in ("ack", "nack"), int(id_)) == (True, row.id), row.name
+
+    with_unit("cubestar", "can", scenario)
 
 
 # -- other units -------------------------------------------------------------------------------------------------------

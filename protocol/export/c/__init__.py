@@ -1,4 +1,4 @@
-"""The interface definition as C99: a header and a source with a codec for each row and the serial link of the OBC's side.
+"""The interface definition as C99: a header and a source with a codec for each row and the OBC's side of serial link and CAN.
 
 The text needs nothing but the standard library's headers and allocates nothing. `rows` writes the codecs, the files
 `*.h` and `*.c` of this folder hold the links; their `unit_` and `UNIT_` become the prefix of the unit.
@@ -37,7 +37,9 @@ def files(icd: InterfaceDefinition, stack: SerialStack) -> Mapping[str, str]:
         link_header, helpers, link_source = link_parts(stack)
         key_type = "uint32_t"
     else:
-        link_header, helpers, link_source = _part("cubespace.h"), "", "\0" + _part("cubespace.c")
+        parts = ["cubespace", "cubespace_can"] if icd.link.can is not None else ["cubespace"]
+        link_header, helpers = "\n".join(_part(f"{part}.h") for part in parts), ""
+        link_source = "\0" + "\n".join(_part(f"{part}.c") for part in parts)
         key_type = "uint8_t"
     header = "\n".join(_header(icd, prefix, link_header))
     source = "\n".join(_source(icd, prefix, helpers, link_source, key_type))

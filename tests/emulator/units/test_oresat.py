@@ -182,3 +182,30 @@ def test_the_bench_commands_and_reads_a_card_with_custom_error_numbers_by_name(r
 
     links = {"serial": {"port": "off"}, "can": {"channel": channel}}
     assert run(scenario, unit=unit, links=links) == ({"status": "lost_in_space"}, False)
+
+
+def test_the_rest_of_the_card_reads_its_defaults_keeps_settings_and_has_no_files():
+    def exchange(unit: Emulated, command: int, index: int, subindex: int, data: bytes = b"") -> bytes:
+        request = struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")
+        (reply,) = [f for f in unit.ask_can(0x600 + NODE, request, extended=False) if f.id == 0x580 + NODE]
+        return reply.data
+
+    def scenario(unit: Emulated) -> None:
+        assert upload(unit, 0x3000) == upload(unit, 0x3009) == b"\0"
+        assert upload(unit, 0x3001) == b"\x01"  # flight mode
+        assert upload(unit, 0x3002, 1) == b"0.0"  # version of the hardware
+        assert upload(unit, 0x3004, 2) == b"[]"  # files to read
+        assert [upload(unit, 0x4001, n) for n in (1, 2, 3, 7, 8)] == [
+            b"\x01",
+            (1000).to_bytes(4, "little"),
+            (1).to_bytes(4, "little"),
+            bytes(4),
+            b"\x01",
+        ]
+        assert exchange(unit, 0x27, 0x3004, 3, b"a.t")[0] == 0x60
+        assert upload(unit, 0x3004, 3) == b"a.t"
+        no_data = (0x0800_0024).to_bytes(4, "little")
+        assert exchange(unit, 0x40, 0x3004, 4)[4:] == exchange(unit, 0x40, 0x4001, 4)[4:] == no_data
+        assert exchange(unit, 0x2F, 0x3005, 4, b"x")[4:] == no_data
+
+    with_unit("oresat", "canopen", scenario)
