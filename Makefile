@@ -3,7 +3,7 @@
 # make lint        ruff, mypy --strict and the contracts of imports
 # make docs        pages and API reference in out/docs; a warning or a broken link fails
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
-# make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 220 MB)
+# make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 110 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
@@ -60,10 +60,12 @@ fuzz: $(VENV)/.developer
 soak: $(VENV)/.product
 	$(BIN)/python tools/soak.py --minutes $(MINUTES)
 
+SITE := import site; print(site.getsitepackages()[0])
 cosmos: $(VENV)/.developer
-	$(PYTHON) -m venv out/cosmos
-	out/cosmos/bin/pip install --quiet openc3
-	PYTHONPATH=$$(out/cosmos/bin/python -c 'import site; print(site.getsitepackages()[0])') \
+	$(PYTHON) -m venv --without-pip out/cosmos
+	$(BIN)/python -c '$(SITE)' >"$$(out/cosmos/bin/python -c '$(SITE)')/product.pth"  # what the product has is not installed again
+	$(BIN)/python -m pip --python out/cosmos/bin/python install --quiet openc3
+	PYTHONPATH=$$(out/cosmos/bin/python -c '$(SITE)') \
 		$(BIN)/python -m pytest -k cosmos tests/protocol/test_export.py tests/process/test_cosmos_plugin.py
 
 clean:

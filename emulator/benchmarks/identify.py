@@ -45,26 +45,30 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "0.5, half covered": SceneSettings(5.5, 0.5, covered=0.5),
     "0.5, 100 false, V ≤ 4.75": SceneSettings(4.75, 0.5, false_stars=100),
     "0.5, 200 false in half the field": SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5),
-    "8°, V ≤ 7.5, 0.5": SceneSettings(7.5, 0.5),
-    "20°, V ≤ 6.5, 0.5": SceneSettings(6.5, 0.5),
-    "62°, V ≤ 5, 0.5": SceneSettings(5.0, 0.5),
+    "8°, V ≤ 7.5, 0.5": SceneSettings(7.5, 0.5, field_deg=8.0),
+    "20°, V ≤ 6.5, 0.5": SceneSettings(6.5, 0.5, field_deg=20.0),
+    "62°, V ≤ 5, 0.5": SceneSettings(5.0, 0.5, field_deg=62.0),
     "dense, V ≤ 7.8, 0.5": SceneSettings(7.8, 0.5),
-    "tracking, 3 stars": SceneSettings(5.5, 0.5, kept=3),
-    "tracking, 2 stars": SceneSettings(5.5, 0.5, kept=2),
-    "tracking, 2 stars, 0.05": SceneSettings(5.5, 0.05, kept=2),
-    "tracking, 1 star, 2 false": SceneSettings(5.5, 0.5, kept=1, false_stars=2),
-    "tracking, 1 star, 1 false, 0.05": SceneSettings(5.5, 0.05, kept=1, false_stars=1),
+    "tracking, 3 stars": SceneSettings(5.5, 0.5, kept=3, predicted_px=3.0),
+    "tracking, 2 stars": SceneSettings(5.5, 0.5, kept=2, predicted_px=3.0),
+    "tracking, 2 stars, 0.05": SceneSettings(5.5, 0.05, kept=2, predicted_px=0.3),
+    "tracking, 1 star, 2 false": SceneSettings(5.5, 0.5, kept=1, false_stars=2, predicted_px=3.0),
+    "tracking, 1 star, 1 false, 0.05": SceneSettings(5.5, 0.05, kept=1, false_stars=1, predicted_px=0.3),
     "dense, mirrored sky": SceneSettings(8.0, 0.5, mirrored=True),
     "1000–1500 random points": SceneSettings(5.5, random_points=(1000, 1500)),
-    "12°, V ≤ 6, exact": SceneSettings(6.0, 0.0, magnitude_noise=0.0),
-    "12°, V ≤ 6, 1": SceneSettings(6.0, 1.0, magnitude_noise=0.0),
-    "12°, V ≤ 6, 2": SceneSettings(6.0, 2.0, magnitude_noise=0.0),
-    "12°, V ≤ 6, 2, 12 stars": SceneSettings(6.0, 2.0, magnitude_noise=0.0, least_stars=12),
-    "12°, V ≤ 6, 3": SceneSettings(6.0, 3.0, magnitude_noise=0.0),
-    "12°, V ≤ 6, 3, 12 stars": SceneSettings(6.0, 3.0, magnitude_noise=0.0, least_stars=12),
-    "12°, V ≤ 6, 2, 0.3 mag": SceneSettings(6.0, 2.0, magnitude_noise=0.3),
-    "8°, V ≤ 7.5, 1, 0.4 mag": SceneSettings(7.5, 1.0, magnitude_noise=0.4),
-    "12°, V ≤ 6, 3 of 2048 px": SceneSettings(6.0, 3.0, magnitude_noise=0.0),
+    "12°, V ≤ 6, exact": SceneSettings(6.0, 0.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
+    "12°, V ≤ 6, 1": SceneSettings(6.0, 1.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
+    "12°, V ≤ 6, 2": SceneSettings(6.0, 2.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
+    "12°, V ≤ 6, 2, 12 stars": SceneSettings(
+        6.0, 2.0, magnitude_noise=0.0, least_stars=12, field_deg=12.0, side_px=1024
+    ),
+    "12°, V ≤ 6, 3": SceneSettings(6.0, 3.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
+    "12°, V ≤ 6, 3, 12 stars": SceneSettings(
+        6.0, 3.0, magnitude_noise=0.0, least_stars=12, field_deg=12.0, side_px=1024
+    ),
+    "12°, V ≤ 6, 2, 0.3 mag": SceneSettings(6.0, 2.0, magnitude_noise=0.3, field_deg=12.0, side_px=1024),
+    "8°, V ≤ 7.5, 1, 0.4 mag": SceneSettings(7.5, 1.0, magnitude_noise=0.4, field_deg=8.0, side_px=512),
+    "12°, V ≤ 6, 3 of 2048 px": SceneSettings(6.0, 3.0, magnitude_noise=0.0, field_deg=12.0, side_px=2048),
 }
 """Row of the table → scene: "σ px, false, missing" of stars to V 5.5 in 42° where nothing else is said."""
 
@@ -72,28 +76,8 @@ PAPERS: Final = tuple(ROWS)[-9:]
 """Scenes of the sensors that the papers of the published algorithms simulate; with 12 stars at least, for the
 sparse fields' share."""
 
-FIELDS: Final[dict[str, tuple[float, int | None]]] = {
-    "8°, V ≤ 7.5, 0.5": (8.0, None),
-    "20°, V ≤ 6.5, 0.5": (20.0, None),
-    "62°, V ≤ 5, 0.5": (62.0, None),
-    **dict.fromkeys(PAPERS[:7], (12.0, 1024)),
-    PAPERS[7]: (8.0, 512),
-    PAPERS[8]: (12.0, 2048),
-}
-"""Row → width in degrees, and side in pixels if it differs, for fields other than the given camera's."""
-
-TRACKED: Final = {
-    "tracking, 3 stars": 3.0,
-    "tracking, 2 stars": 3.0,
-    "tracking, 2 stars, 0.05": 0.3,
-    "tracking, 1 star, 2 false": 3.0,
-    "tracking, 1 star, 1 false, 0.05": 0.3,
-}
-"""Rows in which a solver that tracks is given a predicted attitude → its error, one sigma about each axis, in
-pixels at the centre of the field."""
-
 WINDOW_SIGMAS: Final = 20.0 / 3.0
-"""Largest distance of a star from its predicted position that such a solver is given, in those errors."""
+"""Largest distance of a star from its predicted position that a solver that tracks is given, in errors of the prediction."""
 
 STANDARD: Final = tuple(ROWS)[:9]
 """Rows of the published comparison."""
@@ -254,7 +238,9 @@ def _by_field(rows: Sequence[str], camera: Camera) -> dict[tuple[Camera, float],
     """Rows by their camera and the limit of the databases for it."""
     fields: dict[tuple[Camera, float], list[str]] = {}
     for row in rows:
-        (width, side), limit = FIELDS.get(row, (camera.fov_deg, None)), ROWS[row].limiting_magnitude
+        settings = ROWS[row]
+        side, limit = settings.side_px, settings.limiting_magnitude
+        width = settings.field_deg or camera.fov_deg
         seen = Camera.from_fov(width, side or camera.width, side or camera.height)
         if side is None and math.isclose(width, camera.fov_deg):
             seen, limit = camera, max(limit, PEER_LIMIT_V)
@@ -326,14 +312,14 @@ def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float
         scene = maker.scene(settings, rng)
         floor = best_attitude(maker.camera, maker.stars, scene) if settings.sky else None
         predicted = None
-        if row in TRACKED:
-            turn = TRACKED[row] * maker.camera.pixel_scale_rad * rng.standard_normal(3)
+        if settings.predicted_px:
+            turn = settings.predicted_px * maker.camera.pixel_scale_rad * rng.standard_normal(3)
             predicted = scene.attitude.rotated(turn)
         for name, solver in solvers.items():
             if spent[name] > budget_s:
                 continue
             if predicted is not None and solver.track is not None:
-                reply = solver.track(scene, predicted, WINDOW_SIGMAS * TRACKED[row])
+                reply = solver.track(scene, predicted, WINDOW_SIGMAS * settings.predicted_px)
             else:
                 reply = solver.solve(scene)
             spent[name] += reply.seconds

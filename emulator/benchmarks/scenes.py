@@ -51,6 +51,11 @@ class SceneSettings:
         Stars that the field has at least; another one is drawn until it has (at most `MAX_DRAWS`).
     mirrored : bool
         The image is mirrored: as dense and clustered as the sky, and nowhere like it.
+    field_deg, side_px
+        Width of the field, and side of the image where that differs too, where they are not those of the camera given.
+    predicted_px : float
+        Error of the predicted attitude that a solver that tracks is given, one sigma about each axis, in pixels at the
+        centre of the field; 0: none is given.
     """
 
     limiting_magnitude: float = 5.5
@@ -65,6 +70,9 @@ class SceneSettings:
     kept: int | None = None
     least_stars: int = 0
     mirrored: bool = False
+    field_deg: float | None = None
+    side_px: int | None = None
+    predicted_px: float = 0.0
 
     @property
     def sky(self) -> bool:

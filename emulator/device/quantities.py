@@ -56,13 +56,10 @@ def getter_of(name: str) -> Getter:
 # --- attitude and rate ---
 
 
-QUANTITIES["attitude.x"] = lambda shot: shot.reported.quaternion_xyzw[0]
-QUANTITIES["attitude.y"] = lambda shot: shot.reported.quaternion_xyzw[1]
-QUANTITIES["attitude.z"] = lambda shot: shot.reported.quaternion_xyzw[2]
-QUANTITIES["attitude.w"] = lambda shot: shot.reported.quaternion_xyzw[3]
-QUANTITIES["rate.x"] = lambda shot: shot.reported.rate_rad_s[0]
-QUANTITIES["rate.y"] = lambda shot: shot.reported.rate_rad_s[1]
-QUANTITIES["rate.z"] = lambda shot: shot.reported.rate_rad_s[2]
+for _axis, _letter in enumerate("xyzw"):
+    QUANTITIES[f"attitude.{_letter}"] = lambda shot, axis=_axis: shot.reported.quaternion_xyzw[axis]
+for _axis, _letter in enumerate("xyz"):
+    QUANTITIES[f"rate.{_letter}"] = lambda shot, axis=_axis: shot.reported.rate_rad_s[axis]
 
 QUANTITIES["attitude.valid"] = lambda shot: bool(shot.frame is not None and shot.frame.valid)
 QUANTITIES["attitude.stable"] = lambda shot: shot.device.valid_in_a_row
@@ -95,15 +92,13 @@ def _rate_clipped(shot: Snapshot) -> bool:
 # --- the last frame ---
 
 
-def _of_frame(name: str, function: Callable[[Any], Value]) -> None:
+def _of_frame(name: str, function: Callable[..., Value]) -> None:
     QUANTITIES[name] = lambda shot: None if shot.frame is None else function(shot.frame)
 
 
 _of_frame("frame.counter", lambda frame: int(frame.counter))
-_of_frame("frame.latency", lambda frame: float(frame.latency_s))
-_of_frame("frame.capture", lambda frame: float(frame.capture_s))
-_of_frame("frame.detect", lambda frame: float(frame.detect_s))
-_of_frame("frame.identify", lambda frame: float(frame.identify_s))
+for _name in ("latency", "capture", "detect", "identify"):
+    _of_frame(f"frame.{_name}", lambda frame, name=_name: float(getattr(frame, f"{name}_s")))
 _of_frame("frame.method", lambda frame: "tracking" if frame.result.tracked else "lost_in_space")
 _of_frame("frame.tracking", lambda frame: bool(frame.result.tracked))
 _of_frame("frame.capture_ok", lambda frame: frame.reason not in {"no_frame", "processing_error"})
@@ -113,9 +108,8 @@ _of_frame("frame.late", lambda frame: bool(frame.late or frame.reason == "timeou
 _of_frame("frame.index_pending", lambda frame: bool(frame.result.index_pending))
 _of_frame("frame.background", lambda frame: float(frame.result.background_dn))
 _of_frame("frame.noise", lambda frame: float(frame.result.noise_dn))
-_of_frame("stars.detected", lambda frame: int(frame.result.detected))
-_of_frame("stars.matched", lambda frame: int(frame.result.matched))
-_of_frame("stars.refused", lambda frame: int(frame.result.refused))
+for _name in ("detected", "matched", "refused"):
+    _of_frame(f"stars.{_name}", lambda frame, name=_name: int(getattr(frame.result, name)))
 
 QUANTITIES["frame.available"] = lambda shot: shot.frame is not None
 QUANTITIES["frame.time"] = lambda shot: None if shot.exposure_ns is None else shot.exposure_ns / NANOSECONDS
@@ -246,9 +240,8 @@ QUANTITIES["temperature.mounting"] = lambda shot: shot.device.thermal.mounting_c
 QUANTITIES["temperature.detector"] = lambda shot: shot.device.thermal.temperature_c(
     shot.device.clock.now_ns()
 )
-_of_frame("sky.sun_in_field", lambda frame: "sun" in frame.result.in_field)
-_of_frame("sky.moon_in_field", lambda frame: "moon" in frame.result.in_field)
-_of_frame("sky.earth_in_field", lambda frame: "earth" in frame.result.in_field)
+for _name in ("sun", "moon", "earth"):
+    _of_frame(f"sky.{_name}_in_field", lambda frame, name=_name: name in frame.result.in_field)
 _of_frame("rate.too_high", lambda frame: frame.reason == "rate_too_high")
 
 # --- parameters ---

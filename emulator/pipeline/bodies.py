@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Final
 
 from starhil.emulator.pipeline.messages import FrameResult
-from starhil.emulator.sky.directions import disc_in_field, icrs_vector
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -184,7 +185,13 @@ class Renderer:
         self._still_conditions = (math.nan, math.nan)
         self._optics = camera
         """The camera at the temperature of the frame."""
-        self._work = np.empty_like(self._still)
+        self._work = np.zeros_like(self._still)
+
+    @cached_property
+    def _sensitivity(self) -> tuple[npt.NDArray[np.uint16], float]:
+        """Sensitivity (h, w) in 65535 steps, and one of them."""
+        step = max(float(self._pattern.sensitivity.max()), 1.0) / np.iinfo(np.uint16).max
+        return np.rint(self._pattern.sensitivity / np.float32(step)).astype(np.uint16), step
 
     def sensor_magnitudes(self) -> npt.NDArray[np.float64]:
         """Magnitudes (n,) of all catalogue stars in the sensor's band."""
@@ -364,8 +371,7 @@ class Renderer:
                 _GLARE_SHARE * self.sensor.read_noise_e,
                 _BRIGHTER * self.sensor.saturation_dn * self.sensor.gain_e_per_dn,
             )
-            sky_e_s = float(self._sky_e_s)
-            area.draw(self._work, self._still, self._pattern.sensitivity, sky_e_s, exposure_s, *limits)
+            area.draw(self._work, self._still, *self._sensitivity, float(self._sky_e_s), exposure_s, *limits)
         return self._work
 
     def _paths(

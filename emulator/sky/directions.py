@@ -1,36 +1,14 @@
-"""Directions in the sky as vectors, and discs in the field of view."""
+"""Directions in the sky as vectors."""
 
 from __future__ import annotations
 
 import math
-from functools import lru_cache
-from typing import Final
 
 import numpy as np
 import numpy.typing as npt
-
-from starid.camera import Camera
-
-_BORDER_SAMPLES: Final = 33
 
 
 def icrs_vector(ra_deg: float, dec_deg: float) -> npt.NDArray[np.float64]:
     """Unit vector (3,) of a direction."""
     ra, dec = math.radians(ra_deg), math.radians(dec_deg)
     return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
-
-
-def disc_in_field(centre: npt.NDArray[np.float64], radius_rad: float, camera: Camera) -> bool:
-    """Return whether any part of a disc around a direction (3,) of the sensor frame is in the field."""
-    if math.acos(max(min(float(centre[2]), 1.0), -1.0)) > camera.field_radius_rad + radius_rad:
-        return False
-    if camera.project(centre[None, :])[1][0]:
-        return True
-    nearest = float(np.nanmax(_border_of(camera) @ centre, initial=-1.0))
-    return nearest >= math.cos(min(radius_rad, math.pi))
-
-
-@lru_cache(maxsize=4)
-def _border_of(camera: Camera) -> npt.NDArray[np.float64]:
-    """Directions (n, 3) of the outer edge of the pixel array."""
-    return camera.back_project(camera.border(_BORDER_SAMPLES))

@@ -10,8 +10,9 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.directions import disc_in_field, icrs_vector
-from starhil.emulator.sky.light_grid import GLARE_STEP, Image, fill, interpolated
+from starhil.emulator.sky.directions import icrs_vector
+from starhil.emulator.sky.field import disc_in_field
+from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Sensitivity, fill, interpolated
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
 from starid.attitude import Attitude
@@ -72,9 +73,17 @@ class Patch:
         seen[inside] = self.passed[row[inside], column[inside]]
         return seen
 
-    def cover(self, mean: Image, still: Image, sensitivity: Image, sky_e_s: float, exposure_s: float) -> None:
+    def cover(
+        self,
+        mean: Image,
+        still: Image,
+        sensitivity: Sensitivity,
+        unit: float,
+        sky_e_s: float,
+        exposure_s: float,
+    ) -> None:
         """Put it in front of the mean electrons (h, w), in place; `still` is of sky and dark current alone."""
-        sensed = sensitivity[self.box] * np.float32(exposure_s)
+        sensed = sensitivity[self.box] * np.float32(unit * exposure_s)
         behind, sky = mean[self.box], sensed * np.float32(sky_e_s)
         if self.hides_glare:
             dark = still[self.box] - sky
@@ -136,7 +145,8 @@ class AreaLight:
         self,
         mean: Image,
         still: Image,
-        sensitivity: Image,
+        sensitivity: Sensitivity,
+        unit: float,
         sky_e_s: float,
         exposure_s: float,
         least_e: float,
@@ -144,7 +154,8 @@ class AreaLight:
     ) -> None:
         """Fill the mean electrons (h, w) with `still`, which is of sky and dark current, and all light and shadow.
 
-        Glare of less than `least_e` electrons everywhere is left out, and where the light is more than `saturated_e` it
+        What `mean` holds before must be finite: it stays behind a wide Earth until that is drawn.
+        `sensitivity` is in units of `unit`. Glare of less than `least_e` electrons everywhere is left out, and where the light is more than `saturated_e` it
         need not be exact.
         """
         glare = self.glare if self.glare is not None and exposure_s * np.max(self.glare) > least_e else None
@@ -153,13 +164,13 @@ class AreaLight:
         else:
             none = np.empty((0, 0), dtype=np.float32)
             hidden = none if self.earth is None else self.earth.grid[2]
-            fill(mean, still, sensitivity, none if glare is None else glare, hidden, exposure_s)
+            fill(mean, still, sensitivity, none if glare is None else glare, hidden, unit * exposure_s)
         for patch in self.behind:
-            patch.cover(mean, still, sensitivity, sky_e_s, exposure_s)
+            patch.cover(mean, still, sensitivity, unit, sky_e_s, exposure_s)
         if self.earth is not None:
-            self.earth.cover(mean, still, sensitivity, sky_e_s, exposure_s, saturated_e)
+            self.earth.cover(mean, still, sensitivity, unit, sky_e_s, exposure_s, saturated_e)
         for patch in self.in_front:
-            patch.cover(mean, still, sensitivity, sky_e_s, exposure_s)
+            patch.cover(mean, still, sensitivity, unit, sky_e_s, exposure_s)
 
 
 def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
@@ -423,6 +434,8 @@ class AreaPainter:
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
         """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
         margin = 2.0 * GLARE_STEP * self._camera.pixel_scale_rad
+        if not disc_in_field(direction, radius_rad + margin, self._camera):
+            return None
         cosines = np.tensordot(direction.astype(np.float32), self._grid_directions, axes=1)
         near = cosines >= math.cos(min(radius_rad + margin, math.pi))
         spans = []

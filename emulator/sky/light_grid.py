@@ -11,6 +11,9 @@ from starid.jit import compiled_ieee, inner
 
 Image = npt.NDArray[np.float32]
 
+Sensitivity = npt.NDArray[np.uint16]
+"""Relative signal of each pixel (h, w) in a unit of its own: two bytes are read faster than four."""
+
 GLARE_STEP: Final = 8
 """Pixels between the points at which smooth light is computed."""
 
@@ -26,10 +29,11 @@ def expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32], first: i
 
 @compiled_ieee
 def fill(
-    out: Image, still: Image, sensitivity: Image, glare: Image, height: Image, exposure_s: float
+    out: Image, still: Image, sensitivity: Sensitivity, glare: Image, height: Image, exposure_s: float
 ) -> None:
     """Fill (h, w) with `still` plus smooth light, interpolated linearly between the points of its grid.
 
+    `exposure_s` is that of a pixel with a sensitivity of 1.
     Without `glare` (of size 0) there is no light. Where all corners of a cell have a `height` of at most 0 the image is
     left as it is, unless that has size 0.
     """
@@ -37,7 +41,12 @@ def fill(
     cells = (width + GLARE_STEP - 1) // GLARE_STEP
     upper = np.empty(cells * GLARE_STEP, dtype=np.float32)
     lower = np.empty(cells * GLARE_STEP, dtype=np.float32)
+    if glare.size:
+        expand(glare[0], lower, 0, cells)
     for band in range((rows + GLARE_STEP - 1) // GLARE_STEP):
+        upper, lower = lower, upper
+        if glare.size:
+            expand(glare[band + 1], lower, 0, cells)
         end = 0
         while end < cells:
             start = end
@@ -46,9 +55,6 @@ def fill(
             if start == end:
                 end += 1
                 continue
-            if glare.size:
-                expand(glare[band], upper, start, end)
-                expand(glare[band + 1], lower, start, end)
             run = slice(start * GLARE_STEP, min(end * GLARE_STEP, width))
             above, below = upper[run], lower[run]
             for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, rows)):
@@ -59,7 +65,7 @@ def fill(
                 share = np.float32(y % GLARE_STEP) * np.float32(exposure_s / GLARE_STEP)
                 rest = np.float32(exposure_s) - share
                 for x in range(to.size):
-                    to[x] = base[x] + gain[x] * (rest * above[x] + share * below[x])
+                    to[x] = base[x] + np.float32(gain[x]) * (rest * above[x] + share * below[x])
 
 
 @inner

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.light_grid import GLARE_STEP, Image, expand
+from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Sensitivity, expand
 from starid.jit import compiled_ieee, inner
 
 GLOW_HEIGHTS: Final = 20.0
@@ -32,6 +32,7 @@ _SMOOTH: Final = 2
 _DETAILED: Final = 3
 
 Line = npt.NDArray[np.float32]
+Gain = npt.NDArray[np.uint16]
 
 
 @dataclass(frozen=True)
@@ -80,18 +81,26 @@ class WideEarth:
         self,
         mean: Image,
         still: Image,
-        sensitivity: Image,
+        sensitivity: Sensitivity,
+        unit: float,
         sky_e_s: float,
         exposure_s: float,
         saturated_e: float,
     ) -> None:
         """Put the Earth in front of the mean electrons (h, w), in place.
 
-        `still` is `mean` without the light of bodies: sky and dark current. Cells with more than `saturated_e` electrons in
+        `still` is `mean` without the light of bodies, sky and dark current, and `unit` that of `sensitivity`. Cells with more than `saturated_e` electrons in
         every pixel need no more than that.
         """
         body = (self.distance, self.behind, self.brightness, self.step_rad)
-        _cover(mean, still, sensitivity, self.grid, body, (sky_e_s, exposure_s, saturated_e))
+        _cover(
+            mean,
+            still,
+            sensitivity,
+            self.grid,
+            body,
+            (unit * sky_e_s * exposure_s, exposure_s, unit, saturated_e),
+        )
 
 
 @inner
@@ -153,18 +162,20 @@ def _sort_cells(
 
 
 @inner
-def _draw_bright(to: Line, gain: Line, shades: tuple[Line, Line], share: np.float32, full_e: float) -> None:
+def _draw_bright(
+    to: Line, gain: Gain, shades: tuple[Line, Line], share: np.float32, full: np.float32
+) -> None:
     """Draw a row of disc that saturates."""
-    full, (above, below) = np.float32(full_e), shades
+    above, below = shades
     for x in range(to.size):
-        to[x] = gain[x] * full * (above[x] + share * (below[x] - above[x]))
+        to[x] = np.float32(gain[x]) * full * (above[x] + share * (below[x] - above[x]))
 
 
 @inner
 def _draw_smooth(
     to: Line,
     base: Line,
-    gain: Line,
+    gain: Gain,
     shades: tuple[Line, Line],
     share: np.float32,
     light: tuple[np.float32, np.float32],
@@ -175,14 +186,14 @@ def _draw_smooth(
     zero = np.float32(0.0)
     for x in range(to.size):
         shade = max(above[x] + share * (below[x] - above[x]), zero)
-        to[x] = max(base[x] + gain[x] * (full * shade - sky), zero)
+        to[x] = max(base[x] + np.float32(gain[x]) * (full * shade - sky), zero)
 
 
 @inner
 def _draw_detailed(
     to: Line,
     base: Line,
-    gain: Line,
+    gain: Gain,
     planes: tuple[Line, Line, Line, Line, Line, Line, Line],
     share: np.float32,
     body: tuple[np.float32, np.float32, np.float32],
@@ -199,27 +210,28 @@ def _draw_detailed(
         shade = behind + along * (lit[x] + share * (next_lit[x] - lit[x]))
         clear = min(max(high[x] + share * (next_high[x] - high[x]), zero), one)
         light = full * glow[x] * min(max(shade, zero), one)
-        dark = base[x] - gain[x] * sky
-        to[x] = max(dark + (to[x] - dark) * clear + gain[x] * light, zero)
+        sensed = np.float32(gain[x])
+        dark = base[x] - sensed * sky
+        to[x] = max(dark + (to[x] - dark) * clear + sensed * light, zero)
 
 
 @compiled_ieee
 def _cover(
     mean: Image,
     still: Image,
-    sensitivity: Image,
+    sensitivity: Sensitivity,
     grid: Image,
     body: tuple[float, float, float, float],
-    light: tuple[float, float, float],
+    light: tuple[float, float, float, float],
 ) -> None:
     """As `WideEarth.cover`, with the Earth's numbers, and those of the light."""
     distance, behind, brightness, step_rad = body
-    full_e, saturated_e = brightness * light[1], light[2]
+    full_e, saturated_e = brightness * light[1], light[3]
     rows, width = mean.shape
     points = grid.shape[2]
     reach = min(max(math.log(max(full_e, 1e-9) / _LEAST_E), 1.0), GLOW_HEIGHTS)
     limits = (full_e, saturated_e, reach, full_e * (distance**2 - 1.0) * step_rad**2 / 4.0)
-    full, sky = np.float32(full_e), np.float32(light[0] * light[1])
+    full, sky = np.float32(full_e * light[2]), np.float32(light[0])
     shades, emergents = np.empty((2, points), dtype=np.float32), np.empty((2, points), dtype=np.float32)
     lines = np.empty((7, points * GLARE_STEP), dtype=np.float32)
     height, sorts = np.empty(points, dtype=np.float32), np.empty(points, dtype=np.int32)
@@ -248,7 +260,7 @@ def _cover(
                 share = np.float32(y % GLARE_STEP) / np.float32(GLARE_STEP)
                 to, base, gain = mean[y, run], still[y, run], sensitivity[y, run]
                 if sort == _BRIGHT:
-                    _draw_bright(to, gain, (a, b), share, full_e)
+                    _draw_bright(to, gain, (a, b), share, full)
                 elif sort == _SMOOTH:
                     _draw_smooth(to, base, gain, (a, b), share, (full, sky))
                 else:

@@ -7,6 +7,7 @@ It combines the lost-in-space search (`starid.geometric.search`), tracking (`sta
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,6 +128,9 @@ class Effort:
 
 class Identifier(SingleCameraIdentifier):
     """Star identification for one camera and one catalogue.
+
+    In `track` three stars can be enough, and two if their errors are given. Whether they are depends on the window, by
+    default `TRACKING_WINDOW_PX`: the narrower, the less can agree by chance.
 
     Parameters
     ----------
@@ -276,16 +280,13 @@ class Identifier(SingleCameraIdentifier):
         StaridError
             As in `track`.
         """
-        return near(xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, self._verify)
+        search = functools.partial(self._track, anywhere=True)
+        return near(xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, search)
 
     def _track(
         self, measured: Measured, predicted: Attitude, window_px: float | None, *, anywhere: bool = False
     ) -> Solution:
-        """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`).
-
-        Three stars can be enough, and two if their errors are given. Whether they are depends on the window, by default
-        `TRACKING_WINDOW_PX`: the narrower, the less can agree by chance.
-        """
+        """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`)."""
         numbers = self._numbers_for(measured)
         window = (TRACKING_WINDOW_PX if window_px is None else window_px) / self._px_per_rad
         prior, least = self._prior(window), LEAST_TRACKED_KNOWN if measured.sigmas_known else LEAST_TRACKED
@@ -297,9 +298,6 @@ class Identifier(SingleCameraIdentifier):
             predicted.matrix, window, least, prior,
         )  # fmt: skip
         return self._solution(answer, "tracking")
-
-    def _verify(self, measured: Measured, candidate: Attitude, window_px: float | None) -> Solution:
-        return self._track(measured, candidate, window_px, anywhere=True)
 
     def _prior(self, window_rad: float) -> tuple[float, float]:
         """Volume of the rotations that keep every star of the field within a window, rad³, and the window's solid angle."""

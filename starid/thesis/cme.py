@@ -277,8 +277,6 @@ def estimate_motion(
     now: Array,
     *,
     threshold_deg: float = 1.0,
-    trials: int = MAX_TRIALS,
-    seed: int = _SEED,
     model: MotionModel = "rigid",
 ) -> CameraMotion:
     """Estimate the camera motion from matched stars (line 5 of algorithm 2).
@@ -289,8 +287,6 @@ def estimate_motion(
         Positions of the same stars in the earlier and the later frame, (m, 2), degrees.
     threshold_deg
         Distance η beyond which a match is an outlier.
-    trials, seed
-        Most hypotheses drawn, and the seed of the draws.
     model
         "rigid": rotation and translation. "affine": any 2×2 matrix and translation, as the thesis has it.
 
@@ -308,7 +304,7 @@ def estimate_motion(
     if (
         first.shape != second.shape
         or first.ndim != 2
-        or not mlesac(first, second, threshold_deg, trials, seed, model == "affine", matrix, inliers)
+        or not mlesac(first, second, threshold_deg, MAX_TRIALS, _SEED, model == "affine", matrix, inliers)
     ):
         needed = "three in a triangle" if model == "affine" else "two in different places"
         raise FilterError(f"motion: {first.shape[0]} matched stars; at least {needed} are needed")
@@ -326,10 +322,16 @@ def estimate_motion(
 
 
 def matched_motion(
-    before: ObservedFrame, now: ObservedFrame, matches: Indices, *, model: MotionModel = "rigid"
+    before: ObservedFrame,
+    now: ObservedFrame,
+    matches: Indices,
+    *,
+    threshold_deg: float = 1.0,
+    model: MotionModel = "rigid",
 ) -> CameraMotion | None:
     """Estimate the camera motion from the matches (m, 2) of two frames; None where there are too few for it."""
+    first, second = before.positions[matches[:, 0]], now.positions[matches[:, 1]]
     try:
-        return estimate_motion(before.positions[matches[:, 0]], now.positions[matches[:, 1]], model=model)
+        return estimate_motion(first, second, threshold_deg=threshold_deg, model=model)
     except FilterError:
         return None

@@ -11,15 +11,14 @@ import numpy as np
 
 from starid.arrays import Array, Mask
 from starid.errors import StaridError
-from starid.thesis.cme import CameraMotion, MotionModel, estimate_motion
-from starid.thesis.false_stars import FalseStarFilter, FilterError, ObservedFrame
+from starid.thesis.cme import CameraMotion, MotionModel, matched_motion
+from starid.thesis.false_stars import FalseStarFilter, ObservedFrame
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.lsi import LostInSpace, LsiEstimate, LsiSolution
 from starid.thesis.rsi_memory import AnswerMemory, Prediction
 
 Mode = Literal["lsi", "rsi"]
 
-_FEWEST_MATCHES: Final = 2
 _FEWEST_VOTES: Final = 2
 
 
@@ -82,6 +81,10 @@ class RsiStep:
 
     Attributes
     ----------
+    true_stars
+        Which objects the features were computed from.
+    motion
+        Camera motion since the previous image, if it is known.
     estimate
         Boresight and polar angle; None if no star remained.
     roll_deg
@@ -96,26 +99,22 @@ class RsiStep:
         ε_ψ of the answer kept exceeds τ.
     region_deg, region_cells
         Side Γ of the region and number of its cells; NaN and 0 in mode "lsi".
-    motion
-        Camera motion since the previous image, if it is known.
-    true_stars
-        Which objects the features were computed from.
     search_s, lasso_s
         Time of the nearest-neighbour searches and of the regularisation, seconds.
     """
 
-    estimate: LsiEstimate | None
-    roll_deg: float
-    valid: bool
-    mode: Mode
-    triggered: bool
-    exceeded: bool
-    region_deg: float
-    region_cells: int
-    motion: CameraMotion | None
     true_stars: Mask
-    search_s: float
-    lasso_s: float
+    motion: CameraMotion | None
+    estimate: LsiEstimate | None = None
+    roll_deg: float = math.nan
+    valid: bool = False
+    mode: Mode = "lsi"
+    triggered: bool = False
+    exceeded: bool = True
+    region_deg: float = math.nan
+    region_cells: int = 0
+    search_s: float = 0.0
+    lasso_s: float = 0.0
 
 
 def region_side(mean_distance_deg: float, sigma_distance_deg: float, settings: RsiSettings) -> float:
@@ -200,7 +199,7 @@ class RecursiveIdentification:
         if features is None:
             self._memory.clear()
             self._searches_all = True
-            return _empty_step(true_stars, motion)
+            return RsiStep(true_stars, motion)
         observation = self._lsi.database.normalise(features)
         angle = features.theta_rad if self.settings.angle_in_search else math.nan
         predicted = self._memory.prediction()
@@ -225,6 +224,8 @@ class RecursiveIdentification:
         exceeded = estimate.error_psi > self.settings.tau
         self._searches_all = exceeded
         return RsiStep(
+            true_stars,
+            motion,
             estimate,
             roll,
             estimate.error_psi <= self.settings.invalid_factor * self.settings.tau,
@@ -233,8 +234,6 @@ class RecursiveIdentification:
             exceeded,
             side if use_region else math.nan,
             cells,
-            motion,
-            true_stars,
             search_s,
             lasso_s,
         )
@@ -279,38 +278,12 @@ class RecursiveIdentification:
         if self._before is None or self._filter is None:
             return everything, None
         result = self._filter(self._before, frame)
-        if result.matches.shape[0] < _FEWEST_MATCHES:
-            return everything, None
-        try:
-            motion = estimate_motion(
-                self._before.positions[result.matches[:, 0]],
-                frame.positions[result.matches[:, 1]],
-                threshold_deg=self.settings.motion_threshold_deg,
-                model=self.settings.motion_model,
-            )
-        except FilterError:
-            return everything, None
-        return result.true_now, motion
+        limit, model = self.settings.motion_threshold_deg, self.settings.motion_model
+        motion = matched_motion(self._before, frame, result.matches, threshold_deg=limit, model=model)
+        return (everything, None) if motion is None else (result.true_now, motion)
 
     def _features(self, frame: ObservedFrame, chosen: Mask) -> FeatureVector | None:
         inside = chosen & (np.sum(frame.positions**2, axis=1) <= self._radius**2)
         if not inside.any():
             return None
         return extract_features(frame.brightness[inside], frame.positions[inside])
-
-
-def _empty_step(true_stars: Mask, motion: CameraMotion | None) -> RsiStep:
-    return RsiStep(
-        estimate=None,
-        roll_deg=math.nan,
-        valid=False,
-        mode="lsi",
-        triggered=False,
-        exceeded=True,
-        region_deg=math.nan,
-        region_cells=0,
-        motion=motion,
-        true_stars=true_stars,
-        search_s=0.0,
-        lasso_s=0.0,
-    )

@@ -9,6 +9,7 @@ grows with their fourth power.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Final
@@ -116,26 +117,13 @@ class _Tracks:
         return int(self.number.size)
 
     def kept(self, mask: Mask) -> _Tracks:
-        return _Tracks(
-            self.number[mask],
-            self.position[mask],
-            self.variance[mask],
-            self.brightness[mask],
-            self.seen[mask],
-            self.missed[mask],
-            self.sums[mask],
-        )
+        return _Tracks(*(getattr(self, name)[mask] for name in _COLUMNS))
 
     def joined(self, other: _Tracks) -> _Tracks:
-        return _Tracks(
-            np.concatenate([self.number, other.number]),
-            np.concatenate([self.position, other.position]),
-            np.concatenate([self.variance, other.variance]),
-            np.concatenate([self.brightness, other.brightness]),
-            np.concatenate([self.seen, other.seen]),
-            np.concatenate([self.missed, other.missed]),
-            np.concatenate([self.sums, other.sums]),
-        )
+        return _Tracks(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in _COLUMNS))
+
+
+_COLUMNS: Final = tuple(field.name for field in dataclasses.fields(_Tracks))
 
 
 class TrackFilter:

@@ -23,6 +23,15 @@ FAINTEST_MAGNITUDE: Final = 15.0
 INTENSITY_UNITS: Final = 255.0
 """Steps of an 8-bit intensity."""
 
+SHIFT_PX: Final = 25.0
+"""Greatest shift of a moved frame per axis, pixels; it is drawn from U(−25, 25)."""
+
+ROTATION_DEG: Final = 2.5
+"""Greatest turn of a moved frame, degrees; it is drawn from U(−2.5, 2.5)."""
+
+WANDER_LIMIT_DEG: Final = 69.0
+"""Declination at which a wandering boresight is turned back, degrees."""
+
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
@@ -147,6 +156,11 @@ def add_noise(
     return mags, places, identity
 
 
+def _random_motion(rng: np.random.Generator) -> tuple[Array, float]:
+    """Shift (2,) and turn of a frame, degrees."""
+    return rng.uniform(-SHIFT_PX, SHIFT_PX, 2) * PIXEL_DEG, rng.uniform(-ROTATION_DEG, ROTATION_DEG)
+
+
 def moved_frames(
     rng: np.random.Generator,
     brightness: Array,
@@ -155,13 +169,11 @@ def moved_frames(
     *,
     count: int,
     radius_deg: float,
-    shift_px: float = 25.0,
-    rotation_deg: float = 2.5,
 ) -> Iterator[SimulatedFrame]:
     """Frames of the false-star experiments: the first one still and clean of noise, the others moved from it.
 
-    Every frame has its own false stars. The later ones get noise, are shifted by U(−shift, shift) pixels per axis
-    and turned by U(−rotation, rotation) about the centre, and lose what leaves the circular field. With the
+    Every frame has its own false stars. The later ones get noise, are moved about the centre (`SHIFT_PX`,
+    `ROTATION_DEG`), and lose what leaves the circular field. With the
     published seven stars and a radius of 21° this makes 6.6 true stars a frame, as the published tables have it.
 
     Parameters
@@ -174,8 +186,8 @@ def moved_frames(
         Noise of the later frames and number of false stars of all.
     count
         Number of moved frames; one more is made.
-    radius_deg, shift_px, rotation_deg
-        Field and motion.
+    radius_deg
+        Radius of the field.
     """
     clean = NoiseModel(false_stars=noise.false_stars, magnitude_range=noise.magnitude_range)
     mags, places, identity = add_noise(rng, brightness, positions, clean, radius_deg)
@@ -183,8 +195,7 @@ def moved_frames(
     yield SimulatedFrame(ObservedFrame(mags, places), identity, math.nan, math.nan, 0.0, still, 0.0)
     for _ in range(count):
         mags, places, identity = add_noise(rng, brightness, positions, noise, radius_deg)
-        shift = rng.uniform(-shift_px, shift_px, 2) * PIXEL_DEG
-        turn = rng.uniform(-rotation_deg, rotation_deg)
+        shift, turn = _random_motion(rng)
         places = turned(places, turn) + shift
         inside = np.sum(places**2, axis=1) <= radius_deg**2
         yield SimulatedFrame(
@@ -207,10 +218,7 @@ def sky_sequence(
     *,
     count: int,
     margin_deg: float = 2.0,
-    shift_px: float = 25.0,
-    rotation_deg: float = 2.5,
     wander: bool = False,
-    dec_limit_deg: float = 69.0,
 ) -> Iterator[SimulatedFrame]:
     """Frames of the flat sky in motion, for the recursive algorithm; every one has its noise.
 
@@ -231,12 +239,9 @@ def sky_sequence(
     margin_deg
         Width of the rim beyond the field of the features in which objects are seen too, so that a star about to
         enter that field is known by then.
-    shift_px, rotation_deg
-        Motion: U(−shift, shift) pixels per axis and U(−rotation, rotation).
     wander
-        Move from the frame before; otherwise, as in the published experiments, from the first frame.
-    dec_limit_deg
-        Declination at which a wandering boresight is turned back, so that frames stay on the grid.
+        Move from the frame before; otherwise, as in the published experiments, from the first frame. At a declination
+        of `WANDER_LIMIT_DEG` the boresight is turned back, so that frames stay on the grid.
     """
     if sky.geometry != "planar":
         raise SkyError("simulator: the thesis's frames are planar; give a planar sky")
@@ -247,10 +252,9 @@ def sky_sequence(
     for i in range(count):
         before = place
         if i > 0:
-            move = np.concatenate([rng.uniform(-shift_px, shift_px, 2) * PIXEL_DEG, [0.0]])
-            move[2] = rng.uniform(-rotation_deg, rotation_deg)
+            move = np.append(*_random_motion(rng))
             place = (before if wander else start) + move
-            if abs(place[1]) > dec_limit_deg:
+            if abs(place[1]) > WANDER_LIMIT_DEG:
                 place[1] -= 2.0 * move[1]
         mags, positions, source = wide.stars_in_frame(float(place[0]) % 360.0, float(place[1]))
         brightness, places, identity = add_noise(rng, mags, positions, noise, radius)

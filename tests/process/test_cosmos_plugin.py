@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Self
@@ -21,6 +21,7 @@ pytestmark = pytest.mark.process
 
 ICD = load_unit()
 CHANGES_THE_DIALECT = frozenset({"reset", "restore_parameters", "default_parameters"})
+DEFAULT = str(ICD.parameters["serial_dialect"].default)
 DIALECTS = tuple(ICD.enums["serial_dialect"].values)
 
 
@@ -78,16 +79,31 @@ class Cosmos:
 
 
 @pytest.fixture(params=DIALECTS)
-def cosmos(request: pytest.FixtureRequest, emulator, can_obc: ObcClient, tmp_path: Path) -> Iterator[Cosmos]:
+def dialect(request: pytest.FixtureRequest, can_obc: ObcClient) -> Iterator[str]:
+    """A dialect that the emulator replies in, until it is commanded another."""
     pytest.importorskip(
         "openc3.packets.packet_config", reason="openc3 drives the emulator; it is not installed (make cosmos)"
     )
+    can_obc.wait_for("device_status", lambda reading: reading["mode"] != "boot", within_s=60.0)
     can_obc.command("set_mode", mode="standby")
     can_obc.set_parameter("serial_dialect", request.param)
-    plugin = Plugin(ICD, tmp_path, port=emulator.ready["serial"], dialect=request.param)
-    with Cosmos(plugin) as running:
-        yield running
+    yield request.param
     can_obc.command("default_parameters")
+    can_obc.command("save_parameters")
+
+
+@pytest.fixture
+def connect(emulator, tmp_path: Path) -> Callable[[str], Cosmos]:
+    """A function that installs the plugin for a dialect and makes its interface."""
+    return lambda dialect: Cosmos(
+        Plugin(ICD, tmp_path / dialect, port=emulator.ready["serial"], dialect=dialect)
+    )
+
+
+@pytest.fixture
+def cosmos(dialect: str, connect: Callable[[str], Cosmos]) -> Iterator[Cosmos]:
+    with connect(dialect) as running:
+        yield running
 
 
 def test_every_telemetry_row_is_requested_and_read(cosmos: Cosmos, can_obc: ObcClient) -> None:
@@ -119,6 +135,27 @@ def test_every_command_is_sent_and_answered(cosmos: Cosmos, can_obc: ObcClient) 
         assert (name, packet.read("COMMAND")) == ("ANSWER", row.name.upper())
         seen = can_obc.telemetry("acknowledge")
         assert (seen["last_telecommand"], str(seen["error"]).upper()) == (row.id, packet.read("CODE"))
+
+
+@pytest.mark.parametrize("name", sorted(CHANGES_THE_DIALECT))
+def test_after_a_command_that_changes_the_dialect_cosmos_reconnects_with_the_new_one(
+    name: str, dialect: str, connect: Callable[[str], Cosmos], can_obc: ObcClient
+) -> None:
+    stored = next(other for other in DIALECTS if other not in (dialect, DEFAULT))
+    can_obc.set_parameter("serial_dialect", stored)
+    can_obc.command("save_parameters")
+    can_obc.set_parameter("serial_dialect", dialect)
+    with connect(dialect) as before:
+        before.send(name.upper())
+        answer, packet = before.receive()
+        assert (answer, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", name.upper(), "OK")
+    with connect(DEFAULT if name == "default_parameters" else stored) as after:
+        after.send("REQUEST_IDENTIFICATION")
+        answer, packet = after.receive()
+        assert (answer, packet.read("NODE_TYPE")) == (
+            "IDENTIFICATION",
+            can_obc.telemetry("identification")["node_type"],
+        )
 
 
 def test_a_refusal_comes_with_its_code(cosmos: Cosmos) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping
 from typing import Any, Final
@@ -17,6 +18,7 @@ from starid.thesis.experiments.experiment import (
     Part,
     Results,
     Row,
+    parts_of,
     write_csv,
     write_lines,
 )
@@ -84,36 +86,20 @@ breaks the LSI algorithm, on the grid and off it, and why the thesis puts a filt
 
 
 def _parts(parameters: Parameters) -> list[Part]:
-    cases: list[tuple[str, dict[str, Any]]] = [("none", {})]
-    cases += [
-        (f"{kind}-{level:g}{'-mean' if spread else ''}", {"kind": kind, "level": level, "spread": spread})
-        for kind in _KINDS
-        for level in _LEVELS
-        for spread in (0.0, 1.0)
-    ]
-    cases += [
-        (f"{kind}-{count}", {"kind": kind, "level": count})
-        for kind in ("false", "missing")
-        for count in (1, 2, 3)
-    ]
-    cases += [
-        (f"root-{kind}-{level:g}", {"kind": kind, "level": level, "spread": 0.0, "root": True})
-        for kind in _KINDS
-        for level in _LEVELS
-    ]
-    cases += [
-        (f"six-{kind}-{level:g}", {"kind": kind, "level": level, "spread": 0.0, "six": True})
-        for kind in _KINDS
-        for level in _LEVELS
-        if kind == "both" or level == _LEVELS[-1]
+    both, noises = (ON, OFF), {"kind": _KINDS, "level": _LEVELS}
+    parts = parts_of("none-{grid}", grid=both)
+    for kind, level in itertools.product(_KINDS, _LEVELS):
+        for key, spread in (("{kind}-{level:g}-{grid}", 0.0), ("{kind}-{level:g}-mean-{grid}", 1.0)):
+            parts += parts_of(key, kind=[kind], level=[level], spread=[spread], grid=both)
+    parts += parts_of("{kind}-{level}-{grid}", kind=("false", "missing"), level=(1, 2, 3), grid=both)
+    parts += parts_of("root-{kind}-{level:g}-{grid}", **noises, spread=[0.0], root=[True], grid=both)
+    parts += [
+        part
+        for part in parts_of("six-{kind}-{level:g}-{grid}", **noises, spread=[0.0], six=[True], grid=[ON])
+        if part.values["kind"] == "both" or part.values["level"] == _LEVELS[-1]
     ]
     wanted = parameters["cases"]
-    return [
-        Part(f"{key}-{grid}", {**values, "grid": grid})
-        for key, values in cases
-        if not wanted or key in wanted
-        for grid in ((ON,) if values.get("six") else (ON, OFF))
-    ]
+    return [part for part in parts if not wanted or part.key.rpartition("-")[0] in wanted]
 
 
 def _work(context: Context, part: Part) -> Results:

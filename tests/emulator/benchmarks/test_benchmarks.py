@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starhil.emulator.benchmarks.centroid import cramer_rao_px, measure_centroids
-from starhil.emulator.benchmarks.frame import measure_frames
+from starhil.emulator.benchmarks.frame import measure_bodies, measure_frames
 from starhil.emulator.cli.app import main
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.model import SensorModel
@@ -58,6 +58,14 @@ def test_frames_are_timed_stage_by_stage() -> None:
     assert list(rows) == ["render", "detect", "identify", "all"]
     assert all(0.0 < row.least_ms <= row.median_ms <= row.p99_ms for row in rows.values())
     assert rows["all"].least_ms > rows["render"].least_ms
+
+
+def test_frames_with_bodies_are_timed_against_those_without() -> None:
+    rows = measure_bodies(frames=2)
+    assert [(row.in_field, row.stage) for row in rows] == [
+        (body, stage) for body in ("none", "earth", "moon") for stage in ("render", "all")
+    ]
+    assert all(row.frames == 2 and row.ratio == row.with_ms / row.without_ms for row in rows)
 
 
 @pytest.mark.parametrize("call", [lambda: measure_centroids(frames=0), lambda: measure_frames(frames=0)])

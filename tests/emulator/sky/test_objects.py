@@ -99,8 +99,8 @@ def test_a_wide_earth_matches_a_computation_per_pixel(
         monkeypatch.setattr("starhil.emulator.sky.light._WIDE_EARTH_DEG", wide_from_deg)
         light = AreaPainter(camera, 1.8e6, 0.8).paint(objects, ORION)
         assert (light.earth is None) == (wide_from_deg > radius_deg)
-        mean = np.empty_like(flat)
-        light.draw(mean, flat, flat, 1.0, 1.0, 0.0, np.inf)
+        mean = np.zeros_like(flat)
+        light.draw(mean, flat, flat.astype(np.uint16), 1.0, 1.0, 1.0, 0.0, np.inf)
         return mean, light.seen_at(pixels), light.covered_share
 
     mean, visible, share = painted(0.0)
@@ -116,8 +116,8 @@ def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(rend
     camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
     light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
-    mean = np.empty_like(zero)
-    light.draw(mean, zero, np.ones_like(zero), 0.0, 0.2, 0.0, np.inf)
+    mean = zero.copy()
+    light.draw(mean, zero, np.ones(zero.shape, dtype=np.uint16), 1.0, 0.0, 0.2, 0.0, np.inf)
     x, y = np.meshgrid(np.arange(0, 937, 3), np.arange(0, 937, 3))
     seen = camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
     chord2 = np.sum((seen - ORION.to_sensor(icrs_vector(80.0, 2.0))) ** 2, axis=1)
