@@ -72,7 +72,7 @@ class SlipFraming(_Model):
 
     @property
     def escaped(self) -> tuple[int, int]:
-        """Bytes that follow an escape byte in place of `end` and `escape`."""
+        """Bytes that follow an escape byte instead of `end` and `escape`."""
         if self.xor is not None:
             return self.end ^ self.xor, self.escape ^ self.xor
         return self.substitutes or (0xDC, 0xDD)
