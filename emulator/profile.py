@@ -43,7 +43,8 @@ class RunConfig(Strict):
     """Seed, clock, algorithm and saved state of a run."""
 
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
-    """Seed of all noise and faults; the same seed, profile and commands give the same bytes on the stepped clock."""
+    """Seed of all noise and faults; the same seed, profile and commands give the same bytes on the stepped
+    clock."""
     clock: str = "real"
     """`real`, `scaled:FACTOR` or `stepped` (time passes only by the control channel's `step`)."""
     algorithm: Literal["geometric", "lsi", "rsi"] = "geometric"
@@ -51,7 +52,8 @@ class RunConfig(Strict):
     worker: Literal["process", "thread"] = "process"
     """Where frames are rendered and solved: in a worker process, or in a thread of the emulator."""
     state_dir: str = ""
-    """Folder for what survives a restart: saved parameters, boot count, CANopen settings. Empty: nothing does."""
+    """Folder for what survives a restart: saved parameters, boot count, CANopen settings. Empty: nothing
+    does."""
     start_unix_s: Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S)] = 1_767_225_600.0
     """The device's clock at the start of the run, until it is set: 2026-01-01."""
 
@@ -150,14 +152,16 @@ class RadiationConfig(Strict):
     quiet_s: ParticleRate = 0.0
     """Particles per second outside the South Atlantic Anomaly."""
     anomaly_s: ParticleRate = 0.0
-    """Particles per second in addition in its centre at an altitude of 500 km; needs a truth with a position."""
+    """Particles per second in addition in its centre at an altitude of 500 km; needs a truth with a
+    position."""
 
 
 class ImagesConfig(Strict):
     """Source of images instead of rendered ones; `[camera]` then describes the camera that takes them."""
 
     folder: str = ""
-    """Folder of PNG, TIFF or JPEG images, taken in the order of their names; relative to the profile's folder."""
+    """Folder of PNG, TIFF or JPEG images, taken in the order of their names; relative to the profile's
+    folder."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as OpenCV's `VideoCapture` opens it."""
     repeat: bool = True
@@ -263,13 +267,15 @@ class Profile(Strict):
     sensor: dict[str, Any] = Field(default_factory=dict)
     """Fields of `starhil.emulator.sensor.model.SensorModel`, except those that are device parameters."""
     sky: dict[str, Any] = Field(default_factory=dict)
-    """Date and bodies (`starhil.emulator.sky.view.Sky`), and fields of `starhil.emulator.sky.objects.SkyObjects`."""
+    """Date and bodies (`starhil.emulator.sky.view.Sky`), and fields of
+    `starhil.emulator.sky.objects.SkyObjects`."""
     identifier: dict[str, Any] = Field(default_factory=dict)
     """Options of the star identification algorithm."""
     truth: TruthConfig = FixedConfig(kind="fixed")
     """True attitude of the sensor."""
     orbit: OrbitConfig | None = None
-    """True orbit of the spacecraft; none: the sensor is at the Earth's centre, and the Earth is not in its sky."""
+    """True orbit of the spacecraft; none: the sensor is at the Earth's centre, and the Earth is not in its
+    sky."""
     images: ImagesConfig = ImagesConfig()
     """Images from elsewhere."""
     device: DeviceConfig = DeviceConfig()
@@ -287,7 +293,8 @@ class Profile(Strict):
     calibration: dict[str, Any] = Field(default_factory=dict)
     """Notes that `starhil calibrate` writes for people; not used."""
     health: dict[str, float] = Field(default_factory=dict)
-    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit; default: 0."""
+    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit;
+    default: 0."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Defaults of device parameters, named as in the interface definition."""
 

@@ -95,7 +95,8 @@ class StepPump:
     Parameters
     ----------
     devices
-        Scheduler and pipeline of each device on the clock. Of simultaneous events, the first device's run first.
+        Scheduler and pipeline of each device on the clock. Of simultaneous events, the first device's run
+        first.
     transports
         Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, its transport is not
         waited for until it reads again.

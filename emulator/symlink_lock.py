@@ -1,7 +1,8 @@
 """Locks on symlinks and other names, each held by one running emulator.
 
-A lock is an abstract Unix socket. The kernel releases it when the process ends, and reports the process ID to another process that
-connects to it. Abstract sockets belong to a network namespace: emulators in different containers do not see each other's locks.
+A lock is an abstract Unix socket. The kernel releases it when the process ends, and reports the process ID to
+another process that connects to it. Abstract sockets belong to a network namespace: emulators in different
+containers do not see each other's locks.
 """
 
 from __future__ import annotations

@@ -127,7 +127,8 @@ class Recorder:
         self.clock: Clock = self._latched or clock
         self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8", buffering=1)
         self._held: list[Callable[[], None]] | None = []
-        """Entries that arrived while the links were being opened, which takes no time on the tape; None once open."""
+        """Entries that arrived while the links were being opened, which takes no time on the tape; None once
+        open."""
 
     def begin(self) -> None:
         """Process the entries that arrived while the links were being opened."""

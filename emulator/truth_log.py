@@ -29,7 +29,8 @@ COLUMNS: Final = (
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
 )  # fmt: skip
-"""Columns: Unix time on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured attitude.
+"""Columns: Unix time on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured
+attitude.
 
 `latency_ms` is simulation time from mid-exposure to publication; `processing_ms` and the three after
 it are wall time, and empty on the stepped clock, so that the same run gives the same file.

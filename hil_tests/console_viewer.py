@@ -1,6 +1,7 @@
 """A viewer of a console without a screen, for measurements: `python -m starhil.hil_tests.console_viewer ADDRESS`.
 
-It asks for what an open page asks for, images and the rows that the page shows first, and reads all that comes.
+It asks for what an open page asks for, images and the rows that the page shows first, and reads all that
+comes.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """CAN framing of the CubeSpace family: 29-bit CAN IDs and segments that count down, as sans-I/O receivers.
 
-CAN ID: message type[28:24], telecommand or telemetry id[23:16], source[15:8], destination[7:0]. Up to 8 bytes of data fit
-one frame. Longer data are split into segments of 7 bytes, each followed by a byte that counts the remaining segments down
-to 0; the last segment may be shorter.
+CAN ID: message type[28:24], telecommand or telemetry id[23:16], source[15:8], destination[7:0]. Up to 8 bytes
+of data fit one frame. Longer data are split into segments of 7 bytes, each followed by a byte that counts the
+remaining segments down to 0; the last segment may be shorter.
 
-The CAN ID is packed by shifts: every frame needs it, and a `construct.BitStruct` takes 78 µs to build and 15 µs to parse
-where the shifts take 3 µs and 7 µs.
+The CAN ID is packed by shifts: every frame needs it, and a `construct.BitStruct` takes 78 µs to build and 15
+µs to parse where the shifts take 3 µs and 7 µs.
 """
 
 from __future__ import annotations
@@ -139,9 +139,9 @@ def encode_request_frames(request: Request, source: int, destination: int) -> li
 def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
     """Return the frames of a reply from the device at `source` to `reply.destination`.
 
-    Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is first, body … and last,
-    each with the counter. Burst packets are segmented telemetry with the burst's id. Public sources confirm the three
-    types, but neither this layout nor the burst layout; both are ours.
+    Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is first, body …
+    and last, each with the counter. Burst packets are segmented telemetry with the burst's id. Public sources
+    confirm the three types, but neither this layout nor the burst layout; both are ours.
     """
     if reply.kind is ReplyKind.ECHO:
         raise ProtocolError("CAN has no echo messages")
@@ -225,8 +225,8 @@ class _Assembler:
     def add(self, key: int, payload: bytes, now: float) -> tuple[bytes | None, LinkFault | None]:
         """Add a segment; return the message if it is complete, and the fault if there is one.
 
-        A segment out of order breaks its message. Its further segments are skipped until one counts 0, which ends the
-        message, or counts at least as high as the first, which starts a new one.
+        A segment out of order breaks its message. Its further segments are skipped until one counts 0, which
+        ends the message, or counts at least as high as the first, which starts a new one.
         """
         if not payload:
             self.drop(key)
@@ -373,7 +373,8 @@ _REPLY_TYPES: Final[dict[int, ReplyKind]] = {
 class CanHostReceiver(_Receiver[Reply]):
     """The OBC's end: frames in, replies and faults out.
 
-    Frames to other addresses and requests of other masters are ignored, and if `device` is set, frames of other devices.
+    Frames to other addresses and requests of other masters are ignored, and if `device` is set, frames of
+    other devices.
     """
 
     def __init__(

@@ -1,10 +1,10 @@
 """Codecs of the rows of an interface definition: physical values to wire bytes and back.
 
-construct declares and packs the layout of a row; `Field` converts between raw and physical values, with limits and
-error texts that name row and field. Against scalars in construct and shifts of our own, the declaration of bit fields
-in construct costs nothing to encode and 1.4 times the time to decode, at most: 146 and 110 µs for the 39 fields of
-`star_tracker`, 21 and 15 µs for the 3 of `quaternion`. `Struct.compile` would save up to half of that, but takes
-1.3 ms per row at first use.
+construct declares and packs the layout of a row; `Field` converts between raw and physical values, with
+limits and error texts that name row and field. Against scalars in construct and shifts of our own, the
+declaration of bit fields in construct costs nothing to encode and 1.4 times the time to decode, at most: 146
+and 110 µs for the 39 fields of `star_tracker`, 21 and 15 µs for the 3 of `quaternion`. `Struct.compile` would
+save up to half of that, but takes 1.3 ms per row at first use.
 """
 
 from __future__ import annotations
@@ -387,13 +387,14 @@ class Row:
         Parameters
         ----------
         values:
-            Values by field name. In telemetry a missing value becomes the default or zero; a telecommand needs every
-            field that has no default.
+            Values by field name. In telemetry a missing value becomes the default or zero; a telecommand
+            needs every field that has no default.
         check:
-            Reject values outside the limits. If false, reject only what the type cannot hold (for tests that send
-            invalid values on purpose).
+            Reject values outside the limits. If false, reject only what the type cannot hold (for tests that
+            send invalid values on purpose).
         saturate:
-            Clip numbers to the limits, or wrap counters, instead of rejecting them, as the unit does with telemetry.
+            Clip numbers to the limits, or wrap counters, instead of rejecting them, as the unit does with
+            telemetry.
 
         Raises
         ------
@@ -420,8 +421,9 @@ class Row:
     def decode(self, data: bytes, *, check: bool | None = None) -> dict[str, Value]:
         """Decode the row's bytes to physical values by name.
 
-        With `check`, a value outside the limits raises FieldError. By default telecommands are checked (the device
-        protects itself) and telemetry is not (the OBC sees what arrived). A wrong length always raises LengthError.
+        With `check`, a value outside the limits raises FieldError. By default telecommands are checked (the
+        device protects itself) and telemetry is not (the OBC sees what arrived). A wrong length always raises
+        LengthError.
         """
         if len(data) != self.size:
             raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {self.size}")

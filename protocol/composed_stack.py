@@ -324,7 +324,8 @@ class ComposedStack(SerialStack):
 class ComposedHostReceiver:
     """The OBC's end of a composed link.
 
-    An echo of the request is verified and consumed; it is reported as the ACK of a telecommand that has no other answer.
+    An echo of the request is verified and consumed; it is reported as the ACK of a telecommand that has no
+    other answer.
     """
 
     def __init__(self, stack: ComposedStack) -> None:

@@ -1,7 +1,7 @@
 """The device model: the parameters, quantities and actions of the emulated star sensor, for any interface.
 
-`configs/units/model.toml` declares them; units bind the fields of their rows to them by name. The functions that compute
-quantities and perform actions belong to the emulator.
+`configs/units/model.toml` declares them; units bind the fields of their rows to them by name. The functions
+that compute quantities and perform actions belong to the emulator.
 """
 
 from __future__ import annotations

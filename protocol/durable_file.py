@@ -10,7 +10,8 @@ from pathlib import Path
 def replace_durably(path: Path, data: bytes) -> None:
     """Write a new file beside an old one, flush it to the disk, and rename it over the old one; the folder must exist.
 
-    One process at a time may do so: the temporary file has a fixed name, so that an interrupted call leaves at most one.
+    One process at a time may do so: the temporary file has a fixed name, so that an interrupted call leaves
+    at most one.
 
     Raises
     ------

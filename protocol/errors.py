@@ -15,7 +15,8 @@ class ProtocolError(Exception):
 def reason(error: Exception) -> str:
     """Return the reason of a failure: the system's text for the error number, else the error's own text.
 
-    The texts of an event loop repeat the address. An invalid host name has a negative error number or is a ValueError.
+    The texts of an event loop repeat the address. An invalid host name has a negative error number or is a
+    ValueError.
     """
     number = getattr(error, "errno", None)
     if isinstance(number, int) and number > 0:

@@ -1,8 +1,9 @@
 """Fields written as text, one line of an ICD's table in a few words.
 
-`TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` a named one, `bytes NAME SIZE` and `text NAME SIZE` a string, and
-`bits NAME[:WIDTH] …` flags and groups of bits from the lowest up, which fill whole bytes. `-` stands for no name or no unit.
-Braces repeat the field as in a shell: `i16 mag{0,1}_{x,y,z} uT 0.01` is six fields, `u8 css{0..9}` ten.
+`TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` a named one, `bytes NAME SIZE` and `text NAME
+SIZE` a string, and `bits NAME[:WIDTH] …` flags and groups of bits from the lowest up, which fill whole bytes.
+`-` stands for no name or no unit. Braces repeat the field as in a shell: `i16 mag{0,1}_{x,y,z} uT 0.01` is
+six fields, `u8 css{0..9}` ten.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Fair use of one event loop by many connections, and the socket options of TCP connections.
 
-Each connection reads a limited amount per turn of the loop, and no traffic waits behind the backlog of another sender.
+Each connection reads a limited amount per turn of the loop, and no traffic waits behind the backlog of
+another sender.
 """
 
 from __future__ import annotations
@@ -59,8 +60,8 @@ def limit_buffers(transport: asyncio.BaseTransport) -> None:
 def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
     """Close a silent TCP connection within about ten seconds of the other machine's disappearance.
 
-    With `must_read` a peer that is alive but reads nothing for that long is lost too. That is right for a server, but
-    not for a client program that is halted in a debugger.
+    With `must_read` a peer that is alive but reads nothing for that long is lost too. That is right for a
+    server, but not for a client program that is halted in a debugger.
     """
     connection = _tcp_socket(transport)
     if connection is None:
@@ -80,8 +81,8 @@ def _tcp_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
 class FairQueue:
     """Lines that wait for one receiver; their senders take turns, one line each.
 
-    Lines of one sender keep their order. When the queue is full, the sender with the most waiting bytes loses its oldest
-    line: the stalest one.
+    Lines of one sender keep their order. When the queue is full, the sender with the most waiting bytes loses
+    its oldest line: the stalest one.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
 """Framings of serial links, selected by data: where a message begins and ends in a stream of bytes.
 
-A framing turns a body (header, data and check) into bytes, and makes deframers, which do the reverse. A deframer is sans-I/O:
-it is fed bytes with their time of arrival and returns what its `interpret` makes of each body, and the faults.
+A framing turns a body (header, data and check) into bytes, and makes deframers, which do the reverse. A
+deframer is sans-I/O: it is fed bytes with their time of arrival and returns what its `interpret` makes of
+each body, and the faults.
 """
 
 from __future__ import annotations

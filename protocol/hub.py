@@ -1,9 +1,10 @@
 """A CAN bus over TCP for machines without kernel CAN: an asyncio server of the socketcand text protocol.
 
-Each client opens a bus by name and receives every frame that the other clients of that bus send, in the order of each
-sender. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all. Senders take turns in that queue.
-When it is full, frames of the sender with the most waiting bytes are dropped for that client and counted, so a flood
-delays and loses only its own frames. A malformed command is answered by an error and changes nothing.
+Each client opens a bus by name and receives every frame that the other clients of that bus send, in the order
+of each sender. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all. Senders take
+turns in that queue. When it is full, frames of the sender with the most waiting bytes are dropped for that
+client and counted, so a flood delays and loses only its own frames. A malformed command is answered by an
+error and changes nothing.
 """
 
 from __future__ import annotations
@@ -33,14 +34,15 @@ DEFAULT_BUS: Final = "vcan0"
 BACKLOG_LIMIT: Final = 256 * 1024
 """Most bytes that wait for one slow client: about 4500 frames, half a second of a bus at 1 Mbit/s.
 
-A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read and delay later ones.
+A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read and delay later
+ones.
 """
 
 SETTLE_S: Final = 1.0
 """Longest time that frames are withheld from a client that has just entered raw mode.
 
-python-can's client rejects the answer to `< rawmode >` if a frame follows it in the same read. Anything that the client
-sends shows that it has read the answer, and ends the wait.
+python-can's client rejects the answer to `< rawmode >` if a frame follows it in the same read. Anything that
+the client sends shows that it has read the answer, and ends the wait.
 """
 
 FLUSH_LOG_S: Final = 0.5

@@ -78,7 +78,8 @@ class InterfaceDefinition:
     parameters: Names[Parameter]
     """The parameters that the unit exposes."""
     device_parameters: Names[Parameter]
-    """All parameters of the device: those exposed as the unit has them, the others as the device model has them."""
+    """All parameters of the device: those exposed as the unit has them, the others as the device model has
+    them."""
     sections: tuple[Section, ...] = ()
     """Documentation that accompanies the rows, such as conventions."""
     canopen: RawTable | None = None

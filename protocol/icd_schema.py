@@ -50,11 +50,13 @@ class ConventionsModel(_Model):
     quaternion: Literal["rotation", "attitude"] = "rotation"
     """`rotation`: v_sensor = q v q*; `attitude`: the conjugate, the q of an attitude matrix A(q)."""
     scalar_sign: Literal["positive", "any"] = "positive"
-    """`positive`: the scalar part is never negative; `any`: the sign that is closer to the last reported quaternion."""
+    """`positive`: the scalar part is never negative; `any`: the sign that is closer to the last reported
+    quaternion."""
     axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] = ["+x", "+y", "+z"]
     """Axes of the reported frame in terms of the sensor's (+x right in the image, +y down, +z boresight)."""
     epoch: str = "unix"
-    """Epoch of all times: `unix`, `gps`, `j2000`, `midnight` (of the current day), or a date such as `2000-01-01`."""
+    """Epoch of all times: `unix`, `gps`, `j2000`, `midnight` (of the current day), or a date such as
+    `2000-01-01`."""
     byte_order: Order = "little"
     """Default byte order of fields."""
 
@@ -95,7 +97,8 @@ class _BoundModel(_Model):
     enum: str | None = None
     """Name of an enumeration, of the unit or of the device model."""
     default: Scalar | None = None
-    """Value used if a client omits the field of a telecommand, or if a telemetry field has no value or no number for it."""
+    """Value used if a client omits the field of a telecommand, or if a telemetry field has no value or no
+    number for it."""
     parameter: str | None = None
     """Parameter that the field sets or reports."""
     value: str | None = None
@@ -132,7 +135,8 @@ class FieldModel(_BoundModel):
     """One field of a row; unused and sent as zeros if it has no name. A string instead of a table is its `text`."""
 
     text: str | None = None
-    """Short form of one or several fields, such as `i16 mag{0,1}_{x,y,z} uT 0.01`, instead of all other keys."""
+    """Short form of one or several fields, such as `i16 mag{0,1}_{x,y,z} uT 0.01`, instead of all other
+    keys."""
     count: Annotated[int, Field(ge=2, le=64)] | None = None
     """Expands to the fields name_1 … name_count; `[n]` in a quantity's or argument's name is the number."""
     repeat: RepeatModel | None = None
@@ -173,7 +177,8 @@ class RowModel(_Model):
     id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
     """ID on the wire."""
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the row's number."""
+    """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the row's
+    number."""
     name: Name
     """Name for clients, sessions and exports."""
     class_: str | None = Field(default=None, alias="class")
@@ -181,7 +186,8 @@ class RowModel(_Model):
     doc: str
     """Description."""
     provenance: Provenance | None = None
-    """`confirmed`: from a public source; `proxy`: public for another unit of the family; `ours`: chosen here; default: the unit's."""
+    """`confirmed`: from a public source; `proxy`: public for another unit of the family; `ours`: chosen here;
+    default: the unit's."""
     source: str = ""
     """Public source of the row."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
@@ -193,7 +199,8 @@ class RowModel(_Model):
     unbound: Literal["zeros"] | None = None
     """`zeros`: fields without a binding are sent as zeros; default: they are an error."""
     readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """ID of the telemetry that reports the arguments that a telecommand named `set_…` was last accepted with; it has the name without `set_`."""
+    """ID of the telemetry that reports the arguments that a telecommand named `set_…` was last accepted with;
+    it has the name without `set_`."""
     action: str | None = None
     """Action that a telecommand performs."""
     arguments: dict[Name, Scalar] = {}

@@ -1,6 +1,7 @@
 """Transfer of images and files, for both ends: image frames with a checksum, burst packets and the hole map.
 
-Image frames follow the CubeSense node, bursts the CubeComputer. No public source gives the checksum rules; both are ours.
+Image frames follow the CubeSense node, bursts the CubeComputer. No public source gives the checksum rules;
+both are ours.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Schema of `[link.serial]` and `[link.can]` in a unit's definition.
 
-A serial message consists of header, data and checksum; the framing marks where it begins and ends. The header is a list of
-fields by role; the checksum covers header and data unless `covers` lists other parts.
+A serial message consists of header, data and checksum; the framing marks where it begins and ends. The header
+is a list of fields by role; the checksum covers header and data unless `covers` lists other parts.
 """
 
 from __future__ import annotations
@@ -65,13 +65,14 @@ class SlipFraming(_Model):
     substitutes: tuple[Byte, Byte] | None = None
     """Escaped forms of `end` and `escape`; default without `xor`: `[0xDC, 0xDD]`."""
     xor: Byte | None = None
-    """XOR mask applied to an escaped byte, instead of `substitutes` (HDLC: end 0x7E, escape 0x7D, xor 0x20)."""
+    """XOR mask applied to an escaped byte, instead of `substitutes` (HDLC: end 0x7E, escape 0x7D, xor
+    0x20)."""
     leading_end: bool = True
     """Whether an `end` byte also precedes each message."""
 
     @property
     def escaped(self) -> tuple[int, int]:
-        """Bytes that follow an escape byte in place of `end` and `escape`."""
+        """Bytes that follow an escape byte instead of `end` and `escape`."""
         if self.xor is not None:
             return self.end ^ self.xor, self.escape ^ self.xor
         return self.substitutes or (0xDC, 0xDD)
@@ -225,10 +226,11 @@ class HeaderBitModel(_Model):
 class HeaderFieldModel(_Model):
     """One field of a header.
 
-    Roles: `address` is the device's address in both directions; `source` (in a request) and `destination` (in a reply) are
-    the OBC's. `class`, `id` and `status` are the codes of class, row and error. `length` is described by `includes`. `ack` is
-    0 in a refusal, else 1; `final` is 1 in the last reply to a request. A reply repeats the `sequence` and `flags` of its
-    request. `ticks` is the time since start, `time` the unit's time.
+    Roles: `address` is the device's address in both directions; `source` (in a request) and `destination` (in
+    a reply) are the OBC's. `class`, `id` and `status` are the codes of class, row and error. `length` is
+    described by `includes`. `ack` is 0 in a refusal, else 1; `final` is 1 in the last reply to a request. A
+    reply repeats the `sequence` and `flags` of its request. `ticks` is the time since start, `time` the
+    unit's time.
     """
 
     role: Role | None = None

@@ -12,9 +12,10 @@ In `unit.py`, beside the TOML files of a unit whose `[unit]` says `plugin = "uni
     def blink(device, arguments):
         device.reset("command")
 
-An action's function returns nothing, messages that follow the answer, or `bytes`, the data of the answer; a list of them is
-as many answers. A quantity's function gets the `starhil.emulator.device.snapshot.Snapshot` of the device, an action's the
-device and its arguments by name. Framings and checks are used by `starhil.protocol.composed_stack`.
+An action's function returns nothing, messages that follow the answer, or `bytes`, the data of the answer; a
+list of them is as many answers. A quantity's function gets the `starhil.emulator.device.snapshot.Snapshot` of
+the device, an action's the device and its arguments by name. Framings and checks are used by
+`starhil.protocol.composed_stack`.
 """
 
 from __future__ import annotations

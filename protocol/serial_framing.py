@@ -1,7 +1,8 @@
 """Serial framing of the CubeSpace family: `1F 7F <id> <data> 1F FF` with 0x1F doubled, as a sans-I/O state machine.
 
-Three public dialects of replies are in use: a (CubeComputer: the reply carries the id), b (stand-alone CubeSense node:
-it does not) and c (generation 2: the start byte distinguishes ACK, NACK, event and unsolicited telemetry).
+Three public dialects of replies are in use: a (CubeComputer: the reply carries the id), b (stand-alone
+CubeSense node: it does not) and c (generation 2: the start byte distinguishes ACK, NACK, event and
+unsolicited telemetry).
 """
 
 from __future__ import annotations
@@ -77,8 +78,9 @@ class Packet:
 class Deframer:
     """Finds packets in a stream of bytes; each run of junk yields one fault.
 
-    A run of junk ends at the next start of a message or after a silence of the timeout. An id of 0x1F is ambiguous in
-    practice: some senders double it, others do not. Both forms are read as id 0x1F unless they are a start or an end.
+    A run of junk ends at the next start of a message or after a silence of the timeout. An id of 0x1F is
+    ambiguous in practice: some senders double it, others do not. Both forms are read as id 0x1F unless they
+    are a start or an end.
     """
 
     def __init__(
@@ -247,13 +249,14 @@ def encode_request(request: Request, *, stuff_id: bool = True) -> bytes:
 def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
     """Frame a device's reply in a dialect.
 
-    In dialects a and b the NACK of a telemetry request is the error code instead of the telemetry; no public source
-    shows that form, it is ours. Burst packets have the same form in all dialects.
+    In dialects a and b the NACK of a telemetry request is the error code instead of the telemetry; no public
+    source shows that form, it is ours. Burst packets have the same form in all dialects.
 
     Raises
     ------
     ProtocolError
-        The dialect cannot carry the reply (unsolicited telemetry and events exist in dialect c only, echoes in none).
+        The dialect cannot carry the reply (unsolicited telemetry and events exist in dialect c only, echoes
+        in none).
     """
     if reply.kind is ReplyKind.ECHO:
         raise ProtocolError(f"serial dialect {dialect} has no echo messages")

@@ -1,7 +1,7 @@
 """The serial link of a unit as its definition describes it, sans-I/O.
 
-A unit of the CubeSpace family keeps the codec of `serial_framing`, with its three reply dialects; every other unit
-is composed of the parts in `framings`, `checks` and `envelope` (`composed_stack`).
+A unit of the CubeSpace family keeps the codec of `serial_framing`, with its three reply dialects; every other
+unit is composed of the parts in `framings`, `checks` and `envelope` (`composed_stack`).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The socketcand text protocol, sans-I/O: split a stream into commands `< … >`, convert frames to text and back.
 
-One extension: after `< remote >` (answered by `< ok >`) a client may send and receive remote frames. Their CAN ID has
-eight digits with the kernel's flags 40000000 (remote) and 80000000 (29-bit). Other clients never receive remote frames,
-because the plain protocol cannot distinguish them from data frames.
+One extension: after `< remote >` (answered by `< ok >`) a client may send and receive remote frames. Their
+CAN ID has eight digits with the kernel's flags 40000000 (remote) and 80000000 (29-bit). Other clients never
+receive remote frames, because the plain protocol cannot distinguish them from data frames.
 """
 
 from __future__ import annotations

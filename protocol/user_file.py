@@ -22,7 +22,8 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
     Raises
     ------
     OSError
-        The file cannot be read, is not a regular file, or holds more than `limit` bytes; `strerror` gives the reason.
+        The file cannot be read, is not a regular file, or holds more than `limit` bytes; `strerror` gives the
+        reason.
     ValueError
         The name is not valid for a file.
     """

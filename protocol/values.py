@@ -141,7 +141,8 @@ class Parameter:
     def check(self, value: Value) -> bool | int | float | str:
         """Return the value in the parameter's type, or raise FieldError that names the limits.
 
-        Numbers are accepted for booleans (0, 1) and members of enumerations, since set_parameter sends numbers.
+        Numbers are accepted for booleans (0, 1) and members of enumerations, since set_parameter sends
+        numbers.
         """
         if self.enum is not None:
             return self.enum.names[self.enum.number(value, self.name)]

@@ -1,13 +1,13 @@
 """Run the emulator for a while under load and faults, and fail if memory, descriptors or latency grow.
 
-The emulator solves ten frames per second and serves a pty and a CAN hub. In each round a session runs over both
-links; then the control channel injects faults into sky, device and wires, requests are sent, and the faults are
-cleared. After each round, resident memory and open descriptors of all processes (emulator, pipeline worker, hub)
-and the 99th percentile of the latency of each link are measured.
+The emulator solves ten frames per second and serves a pty and a CAN hub. In each round a session runs over
+both links; then the control channel injects faults into sky, device and wires, requests are sent, and the
+faults are cleared. After each round, resident memory and open descriptors of all processes (emulator,
+pipeline worker, hub) and the 99th percentile of the latency of each link are measured.
 
-The first quarter of the time is the warm-up, in which caches, frame logs and the allocator's arenas fill. Of the
-rest, the first and the last third are compared by their medians, so that one bad round on a busy machine does not
-matter:
+The first quarter of the time is the warm-up, in which caches, frame logs and the allocator's arenas fill. Of
+the rest, the first and the last third are compared by their medians, so that one bad round on a busy machine
+does not matter:
 
 memory        may grow by 8 MB, since the allocator fluctuates. In 15 minutes about 4500 frames and 60 sessions lie
               between the two thirds, so a leak of 2 kB per frame or 140 kB per session fails.

@@ -3,14 +3,15 @@
 
     tools/vcan_guest.py [--share FOLDER]... [--time-out SECONDS] [--memory SIZE] -- COMMAND [ARGUMENT...]
 
-For machines whose kernel has no CAN. The guest sees the host's file system under the same paths, so the virtual
-environment of this clone works unchanged. Files written by the guest are discarded, except below the folders named
-by --share. The command gets the caller's environment, working folder and arguments, but no standard input. Its
-output is passed on as it is written, and its exit status is returned.
+For machines whose kernel has no CAN. The guest sees the host's file system under the same paths, so the
+virtual environment of this clone works unchanged. Files written by the guest are discarded, except below the
+folders named by --share. The command gets the caller's environment, working folder and arguments, but no
+standard input. Its output is passed on as it is written, and its exit status is returned.
 
-Other exit statuses: 2 for a wrong call, 69 if a program is missing, 124 after a timeout, 125 if the guest did not
-start or died (its console is printed then). Root is not needed. Requires the Debian packages user-mode-linux,
-can-utils, kmod and iproute2; see tools/install_test_packages. Uses only the standard library and leaves no files.
+Other exit statuses: 2 for a wrong call, 69 if a program is missing, 124 after a timeout, 125 if the guest did
+not start or died (its console is printed then). Root is not needed. Requires the Debian packages
+user-mode-linux, can-utils, kmod and iproute2; see tools/install_test_packages. Uses only the standard library
+and leaves no files.
 """
 
 from __future__ import annotations
@@ -126,8 +127,8 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
 def source_times(folder: Path) -> dict[str, int]:
     """Return the times of change (ns) of the Python files below a folder, hidden folders left out.
 
-    The host file system shows a guest whole seconds only. Caches of compiled code compare the full time, so that the
-    guest must set it again; otherwise everything would be compiled again.
+    The host file system shows a guest whole seconds only. Caches of compiled code compare the full time, so
+    that the guest must set it again; otherwise everything would be compiled again.
     """
     times = {}
     for directory, names, files in os.walk(folder):

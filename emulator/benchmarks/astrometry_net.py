@@ -1,8 +1,8 @@
 """Star identification by `solve-field` of astrometry.net, which is run once for each scene.
 
-It reads the positions as a FITS table and writes the projection that it found as a FITS header; both are made and read
-here, since that takes a few lines. Debian's packages `astrometry.net` and `astrometry-data-tycho2-10-19` hold the program and an
-index of patterns from 1° to 33°.
+It reads the positions as a FITS table and writes the projection that it found as a FITS header; both are made
+and read here, since that takes a few lines. Debian's packages `astrometry.net` and
+`astrometry-data-tycho2-10-19` hold the program and an index of patterns from 1° to 33°.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Accuracy campaigns: from photons to attitude at random attitudes, in seeded, resumable, parallel chunks.
 
-A frame depends only on the plan, its number and the code, so a chunk is the same whichever process computes it,
-and an interrupted campaign can be resumed with the same code. The plan file records the versions of everything
-that affects the result; chunks of different versions are never mixed.
+A frame depends only on the plan, its number and the code, so a chunk is the same whichever process computes
+it, and an interrupted campaign can be resumed with the same code. The plan file records the versions of
+everything that affects the result; chunks of different versions are never mixed.
 """
 
 from __future__ import annotations
@@ -317,10 +317,10 @@ def run_campaign(
 def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     """Summarise the rows (RECORD) of a campaign: counts, errors in arcseconds, times in milliseconds.
 
-    `wrong` counts valid attitudes off by more than 0.1° in boresight or roll. `pole_frames` and `ra_wrap_frames`
-    count frames with a celestial pole, or RA 0°, in the field; `…_valid` how many of them are valid.
-    `normalised_squared_error` is the mean of the squared error over its covariance. If the body rate varies,
-    `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 … °/s.
+    `wrong` counts valid attitudes off by more than 0.1° in boresight or roll. `pole_frames` and
+    `ra_wrap_frames` count frames with a celestial pole, or RA 0°, in the field; `…_valid` how many of them
+    are valid. `normalised_squared_error` is the mean of the squared error over its covariance. If the body
+    rate varies, `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 … °/s.
     """
     valid = rows[rows["valid"]]
     limit = 3600 * WRONG_DEG

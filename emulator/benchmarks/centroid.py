@@ -1,9 +1,9 @@
 """Centroid accuracy on rendered images of the real sky, compared with the Cramér–Rao bound.
 
-The bound is computed per star from its true position and electrons, the true spot and trail, and the true variance
-of every pixel: shot noise of star, sky and dark current, read noise, rounding, and the spread of the pixels'
-sensitivity, which a single image cannot distinguish from light. Saturated pixels carry no information. Flux is
-treated as unknown, the sky as known.
+The bound is computed per star from its true position and electrons, the true spot and trail, and the true
+variance of every pixel: shot noise of star, sky and dark current, read noise, rounding, and the spread of the
+pixels' sensitivity, which a single image cannot distinguish from light. Saturated pixels carry no
+information. Flux is treated as unknown, the sky as known.
 """
 
 from __future__ import annotations

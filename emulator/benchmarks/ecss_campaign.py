@@ -1,8 +1,8 @@
 """Frames of a performance campaign per ECSS-E-ST-60-20C: a profile's device under one influence at a time.
 
-Every frame is rendered, detected and identified, lost in space, by the image pipeline of the device with the parameters
-of its profile. A frame depends only on the plan, the name of its condition and its number, so a campaign can be
-interrupted and resumed, and run in any number of processes.
+Every frame is rendered, detected and identified, lost in space, by the image pipeline of the device with the
+parameters of its profile. A frame depends only on the plan, the name of its condition and its number, so a
+campaign can be interrupted and resumed, and run in any number of processes.
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ class EcssPlan:
     seed
         Seed of attitudes and noise.
     fields, positions, repeats
-        Directions of the sky, sub-pixel positions in each, and frames at each position, for the kinds of error.
+        Directions of the sky, sub-pixel positions in each, and frames at each position, for the kinds of
+        error.
     thermal_fields, thermal_points
         Directions, and points of the orbit at which each is seen, for the thermo-elastic error.
     dated_fields, dates, dated_repeats

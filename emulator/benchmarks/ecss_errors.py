@@ -1,15 +1,16 @@
 """Attitude errors split into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
 
-An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y lie across the boresight,
-z about it. In the main series each field (direction of the sky) is seen at several sub-pixel positions, and each
-position in several frames, so that the error is
+An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y lie across the
+boresight, z about it. In the main series each field (direction of the sky) is seen at several sub-pixel
+positions, and each position in several frames, so that the error is
 
     e = bias + field + position + noise
 
-with a random term for each level. A nested analysis of variance gives unbiased estimates of their variances (Henderson's
-method 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests their significance: a term that is not
-significant is reported as zero, with the smallest value that would have been significant. Thermo-elastic error and aberration
-residual come from separate series, in which fields are repeated at other temperatures and dates.
+with a random term for each level. A nested analysis of variance gives unbiased estimates of their variances
+(Henderson's method 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests their
+significance: a term that is not significant is reported as zero, with the smallest value that would have been
+significant. Thermo-elastic error and aberration residual come from separate series, in which fields are
+repeated at other temperatures and dates.
 """
 
 from __future__ import annotations
@@ -208,9 +209,9 @@ def static_errors(
 def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confidence: float) -> ErrorLine:
     """Return the error that differs between dates: aberration as far as the device does not correct it.
 
-    The conditions of the first series are dates. As aberration moves the stars over the pixels too, the pixel spatial
-    error of the second one, that of `static_errors`, is taken from their variance. None as a series gives a line that
-    is not evaluated.
+    The conditions of the first series are dates. As aberration moves the stars over the pixels too, the pixel
+    spatial error of the second one, that of `static_errors`, is taken from their variance. None as a series
+    gives a line that is not evaluated.
     """
     if dated is None:
         return ErrorLine(ABERRATION, None, np.zeros(3))
@@ -224,8 +225,8 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
 def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:
     """Return the error that follows the temperature, the same in all fields.
 
-    The conditions of the series are points of the orbit. The size is the quantile of the deviation from the mean over
-    them. What temperature does differently from field to field is not in it.
+    The conditions of the series are points of the orbit. The size is the quantile of the deviation from the
+    mean over them. What temperature does differently from field to field is not in it.
 
     Raises
     ------

@@ -139,8 +139,8 @@ def measure_bodies(
 ) -> list[BodiesRow]:
     """Measure what bodies and aberration by date and orbit add to a frame, both sorts of frames in turns.
 
-    Attitudes are random, those of "moon" around the Moon; where light passes the baffle no frame is measured. The
-    processor time of one thread is taken, with the computation of the sky.
+    Attitudes are random, those of "moon" around the Moon; where light passes the baffle no frame is measured.
+    The processor time of one thread is taken, with the computation of the sky.
     """
     camera, catalog = Camera.from_fov(), load_catalog()
     renderer = Renderer(camera, catalog, seed=seed)

@@ -73,7 +73,8 @@ ROWS: Final[dict[str, SceneSettings]] = {
 """Row of the table → scene: "σ px, false, missing" of stars to V 5.5 in 42° where nothing else is said."""
 
 PAPERS: Final = tuple(ROWS)[-9:]
-"""Scenes of the sensors that the papers of the published algorithms simulate; with 12 stars at least, for the sparse fields' share."""
+"""Scenes of the sensors that the papers of the published algorithms simulate; with 12 stars at least, for the
+sparse fields' share."""
 
 WINDOW_SIGMAS: Final = 20.0 / 3.0
 """Largest distance of a star from its predicted position that a solver that tracks is given, in errors of the prediction."""
@@ -86,11 +87,13 @@ LEADERBOARD: Final = (*STANDARD, *tuple(ROWS)[13:22])
 
 WRONG_ARCSEC: Final = 360.0
 WRONG_ROLL_ARCSEC: Final = 3600.0
-"""A valid attitude whose boresight or roll is off the truth by more than these is wrong. It is ill-conditioned if the least-squares
-attitude of the true matches is within these of it: two or three stars close together determine no attitude better."""
+"""A valid attitude whose boresight or roll is off the truth by more than these is wrong. It is
+ill-conditioned if the least-squares attitude of the true matches is within these of it: two or three stars
+close together determine no attitude better."""
 
 PEER_LIMIT_V: Final = 5.5
-"""Lowest magnitude limit of the databases of third-party solvers and published algorithms; otherwise the scenes'."""
+"""Lowest magnitude limit of the databases of third-party solvers and published algorithms; otherwise the
+scenes'."""
 
 _BLEND_PX: Final = 2.0
 _DEEPER_V: Final = 0.5
@@ -200,8 +203,8 @@ def run(
     Returns
     -------
     dict
-        `rows` (list of `Tally.report`), `solvers` (what each takes for each field: database, time to build or load it,
-        growth of resident memory), `skipped`, `versions`, `seed`.
+        `rows` (list of `Tally.report`), `solvers` (what each takes for each field: database, time to build or
+        load it, growth of resident memory), `skipped`, `versions`, `seed`.
     """
     if frames < 1:
         raise EmulatorError(f"--frames {frames}: must be at least 1")

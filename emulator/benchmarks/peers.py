@@ -1,8 +1,9 @@
 """Star identification solvers, third-party and ours, behind one interface, to compare them on the same scenes.
 
-Names of solvers: `OWN`, the published algorithms (`CLASSICS`) and the third-party `PEERS`. Not listed by ``all`` are `VARIANTS`, the
-thesis's LSI with another solver of its equations (their verified answers are LSI's), and a published algorithm with the suffix
-`EVEN`, whose guide stars are thinned out to be evenly spread.
+Names of solvers: `OWN`, the published algorithms (`CLASSICS`) and the third-party `PEERS`. Not listed by
+``all`` are `VARIANTS`, the thesis's LSI with another solver of its equations (their verified answers are
+LSI's), and a published algorithm with the suffix `EVEN`, whose guide stars are thinned out to be evenly
+spread.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ EVEN_PER_FIELD: Final = 12
 MIN_SIGMA_PX: Final = 0.1
 """Lowest centroid noise passed to a raw published algorithm."""
 MIN_FEATURE_FIELD_DEG: Final = 30.0
-"""Narrowest field for which a feature database (lsi, rsi) is built: its size grows with the inverse square of the field."""
+"""Narrowest field for which a feature database (lsi, rsi) is built: its size grows with the inverse square of
+the field."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +96,8 @@ class Solver:
     reset : callable
         Discards what it remembers of earlier scenes.
     track : callable or None
-        Solves a scene near a predicted attitude, if it can; its third argument is the largest distance of a star from its
-        predicted position, pixels.
+        Solves a scene near a predicted attitude, if it can; its third argument is the largest distance of a
+        star from its predicted position, pixels.
     database_bytes : int or None
         Size of its database, if known.
     build_seconds : float or None
@@ -129,13 +131,13 @@ def make_solver(name: str, camera: Camera, stars: StarCatalog, *, raw: bool = Fa
     Parameters
     ----------
     name : str
-        One of `ALL` or `VARIANTS`, one of `CLASSICS` with `EVEN`, or MODULE:FUNCTION, a custom function that takes camera and
-        catalogue and returns a `Solver`.
+        One of `ALL` or `VARIANTS`, one of `CLASSICS` with `EVEN`, or MODULE:FUNCTION, a custom function that
+        takes camera and catalogue and returns a `Solver`.
     camera : Camera
         Camera of the scenes.
     stars : StarCatalog
-        Catalogue for the databases of third-party solvers: doubles merged, as in the scenes. Our solvers use their default
-        catalogue; the published algorithms use its faintest star as the sensor's limit.
+        Catalogue for the databases of third-party solvers: doubles merged, as in the scenes. Our solvers use
+        their default catalogue; the published algorithms use its faintest star as the sensor's limit.
     raw : bool
         Whether published algorithms answer without verification.
 

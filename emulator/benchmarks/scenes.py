@@ -1,9 +1,9 @@
 """Benchmark scenes: simulated detections, without rendering images.
 
-A scene is a random attitude, the catalogue stars in the field with noisy positions and magnitudes, false stars and
-missing ones. As in the published comparison of solvers, magnitude noise is 0.1, false stars have uniform positions
-and magnitudes drawn from the 20 brightest stars in the field, missing stars are drawn from the same, and doubles
-within 2 px are merged.
+A scene is a random attitude, the catalogue stars in the field with noisy positions and magnitudes, false
+stars and missing ones. As in the published comparison of solvers, magnitude noise is 0.1, false stars have
+uniform positions and magnitudes drawn from the 20 brightest stars in the field, missing stars are drawn from
+the same, and doubles within 2 px are merged.
 """
 
 from __future__ import annotations

@@ -116,7 +116,8 @@ def command(
 ) -> None:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
-    A line on stdout, `ready serial=… dialect=… can=… seed=…`, reports that the emulator accepts commands, and where.
+    A line on stdout, `ready serial=… dialect=… can=… seed=…`, reports that the emulator accepts commands, and
+    where.
     """
     from starhil.emulator.pipeline.worker_process import take_worker
 

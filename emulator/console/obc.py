@@ -142,7 +142,8 @@ class ConsoleObc:
         Returns
         -------
         row, data, values, problem
-            The row, its bytes, the values by field, and what the definition has against them; empty if nothing.
+            The row, its bytes, the values by field, and what the definition has against them; empty if
+            nothing.
 
         Raises
         ------

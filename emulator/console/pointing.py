@@ -32,9 +32,9 @@ def pointing_request(
     Parameters
     ----------
     wanted
-        `kind`: `slew`, `rate` or `fixed`. For a slew and `fixed`, `to`: `star` (a name, or HIP and its number), or
-        `ra_deg` and `dec_deg`; without `roll_deg`, the roll stays. An empty `to` is the current attitude. For a slew,
-        `max_rate_deg_s`. For `rate`, `rate_deg_s`: three numbers, in the sensor frame.
+        `kind`: `slew`, `rate` or `fixed`. For a slew and `fixed`, `to`: `star` (a name, or HIP and its
+        number), or `ra_deg` and `dec_deg`; without `roll_deg`, the roll stays. An empty `to` is the current
+        attitude. For a slew, `max_rate_deg_s`. For `rate`, `rate_deg_s`: three numbers, in the sensor frame.
     truth
         Present truth of the sensor, as the control channel answers it.
     mount

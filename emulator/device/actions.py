@@ -1,9 +1,10 @@
 """The actions of the device: a function for each name that `configs/units/model.toml` declares.
 
-`starhil.emulator.device.bindings.TelecommandBinding.execute` calls them. An action gets its arguments by name, range-checked
-and in the declared units, and returns the messages that follow the answer, if there are any. To answer with an error, it raises
-`Refused`, whose `argument` names the argument at fault. An action that continues in the background marks the acknowledge as
-continuing and ends it itself; its telecommand is answered at once, unless the action is in `ANSWERED_WHEN_DONE`.
+`starhil.emulator.device.bindings.TelecommandBinding.execute` calls them. An action gets its arguments by
+name, range-checked and in the declared units, and returns the messages that follow the answer, if there are
+any. To answer with an error, it raises `Refused`, whose `argument` names the argument at fault. An action
+that continues in the background marks the acknowledge as continuing and ends it itself; its telecommand is
+answered at once, unless the action is in `ANSWERED_WHEN_DONE`.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class Acknowledge:
     error: ErrorCode = ErrorCode.OK
     parameter_index: int = 0
     continues: bool = False
-    """The action goes on in the background, and ends this itself."""
+    """The action continues in the background, and ends this itself."""
     on_end: Callable[[ErrorCode], None] | None = None
     """Called with the outcome of a telecommand that is answered only once it is done."""
 

@@ -139,7 +139,8 @@ class Parameters(Mapping[str, ParameterValue]):
     def flip_bit(self, name: str, bit: int) -> bool:
         """Flip a bit of a parameter in memory, as a particle does; return whether the result is a valid setting.
 
-        A setting that is not valid is replaced by the default, as the device finds it when it checks its parameters.
+        A setting that is not valid is replaced by the default, as the device finds it when it checks its
+        parameters.
         """
         definition = self._definitions[name]
         flipped = flipped_number(self.number(name), memory_format(definition), bit)

@@ -47,9 +47,9 @@ class FrameTiming:
 class PowerModel:
     """What the unit draws, phase by phase.
 
-    The imager is switched on before an exposure; exposure and processing follow, then the transfer of the result, and
-    the unit idles until the imager is switched on for the next frame. Where the period is too short for all of them,
-    idling is shortened first, then the transfer.
+    The imager is switched on before an exposure; exposure and processing follow, then the transfer of the
+    result, and the unit idles until the imager is switched on for the next frame. Where the period is too
+    short for all of them, idling is shortened first, then the transfer.
     """
 
     def __init__(self, config: PowerConfig) -> None:

@@ -1,7 +1,7 @@
 """The quantities of the device: a function for each name that `configs/units/model.toml` declares.
 
-A function returns the value in the declared unit, or None where there is none: the field then has its default, or 0.
-The function of a numbered quantity, such as `stars[n].x`, also takes the number.
+A function returns the value in the declared unit, or None where there is none: the field then has its
+default, or 0. The function of a numbered quantity, such as `stars[n].x`, also takes the number.
 """
 
 from __future__ import annotations

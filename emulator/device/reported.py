@@ -100,8 +100,8 @@ def axes_turns(conventions: Conventions) -> list[np.ndarray]:
 def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
     """Return the rotation vectors from the sensor frame to the reported frame, radians; zero angles are omitted.
 
-    The reported frame is the sensor frame turned by alpha about x, then by beta about its new y, then by gamma about
-    its new z.
+    The reported frame is the sensor frame turned by alpha about x, then by beta about its new y, then by
+    gamma about its new z.
     """
     turns = []
     for axis, name in enumerate(("mounting_alpha", "mounting_beta", "mounting_gamma")):

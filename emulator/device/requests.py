@@ -67,7 +67,8 @@ class Requests:
         request
             The request as received.
         later
-            Called with the answer to a telecommand that is answered only once it is done; `handle` then returns None.
+            Called with the answer to a telecommand that is answered only once it is done; `handle` then
+            returns None.
         """
         device = self.device
         if device.unresponsive:

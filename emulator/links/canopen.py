@@ -42,7 +42,8 @@ STORAGE_FILE: Final = "canopen.json"
 DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes of the error mode; the number of `device_error` is added."""
 FRAME_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
-"""How the names of quantities begin that change with each exposure: TPDOs that map a row with one are triggered then."""
+"""How the names of quantities begin that change with each exposure: TPDOs that map a row with one are
+triggered then."""
 STATUS_QUANTITY: Final = "mode"
 """TPDOs that map a row with this quantity are triggered when it or the validity of the attitude changes."""
 

@@ -64,7 +64,8 @@ class _RequestQueue:
         self._idle.set()
         self._started: asyncio.Future[PipelineReady] = asyncio.get_running_loop().create_future()
         self.on_failure: Callable[[str], None] | None = None
-        """Called with the reason if the pipeline ends after it was ready; if the start fails, `start` raises."""
+        """Called with the reason if the pipeline ends after it was ready; if the start fails, `start`
+        raises."""
         self.watchers: set[object] = set()
         """Who looks at the frames: unless this is empty, they come with a preview."""
 

@@ -229,7 +229,8 @@ class SlewToConfig(Strict):
     max_rate_deg_s: Annotated[float, Field(ge=1e-6, le=100.0)]
     """Highest body rate."""
     shape: Literal["smooth", "limited"] = "smooth"
-    """Rate over time: `smooth` (no jump in acceleration), or `limited` (constant acceleration, constant rate, constant deceleration)."""
+    """Rate over time: `smooth` (no jump in acceleration), or `limited` (constant acceleration, constant rate,
+    constant deceleration)."""
     acceleration_deg_s2: Annotated[float, Field(ge=1e-6, le=1e6)] = 0.1
     """Acceleration of `limited`."""
 
@@ -298,13 +299,15 @@ class LiveConfig(Strict):
     port: Annotated[int, Field(ge=0, le=65535)] = 0
     """Port to listen at; 0 for a free one, which the ready line names."""
     convention: Literal["rotation", "attitude"] = "rotation"
-    """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42, Basilisk and most textbooks."""
+    """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42,
+    Basilisk and most textbooks."""
     order: Literal["xyzw", "wxyz"] = "xyzw"
     """Position of the scalar in `q`: last or first."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
     """Silence after which the attitude is held and flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
-    """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds of simulation time."""
+    """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds
+    of simulation time."""
     lockstep: bool = False
     """Each message advances the stepped clock to its `t`, and is then answered by a line; over TCP only."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE

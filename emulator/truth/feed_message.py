@@ -8,8 +8,8 @@
     Seconds on the sender's clock, increasing. Optional; default: time of receipt.
 ``q``
     Quaternion between ICRS and body, of length 1 within 1 %. With ``convention = "rotation"`` it rotates
-    vectors (v_body = q ⊗ v_icrs ⊗ q*), with ``"attitude"`` it is the conjugate, as the attitude quaternions of
-    42, Basilisk and most textbooks. ``order`` is ``"xyzw"`` (scalar last) or ``"wxyz"``.
+    vectors (v_body = q ⊗ v_icrs ⊗ q*), with ``"attitude"`` it is the conjugate, as the attitude quaternions
+    of 42, Basilisk and most textbooks. ``order`` is ``"xyzw"`` (scalar last) or ``"wxyz"``.
 ``rate``
     Body rate in the body frame, degrees per second, at most `MAX_RATE_DEG_S` per axis. Optional;
     default: derived from the last two messages, or without ``t`` from messages at least

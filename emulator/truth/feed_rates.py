@@ -22,7 +22,8 @@ SHORTEST_S: Final = 1e-9
 """Shortest time between two messages, seconds: the resolution of simulation time."""
 
 RECEIPT_BASELINE_S: Final = 0.05
-"""Shortest time over which a rate is derived from times of receipt, seconds: messages may arrive in bursts."""
+"""Shortest time over which a rate is derived from times of receipt, seconds: messages may arrive in
+bursts."""
 
 NOISE_RAD: Final = math.radians(0.01)
 """Tolerated error of attitudes when they are compared with a rate, radians."""

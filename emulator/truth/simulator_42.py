@@ -9,10 +9,10 @@ A message is a block of text lines that ends with ``[ENDMSG]``::
     Orb[0].VelN = [-2.623614934750e+03 4.436324912759e+03 5.678236949775e+03]
     [ENDMSG]
 
-``qn`` is an attitude quaternion J2000 → body, scalar last: the conjugate of that used here. ``wn`` is the body rate in
-the body frame, rad/s. ``PosN`` and ``VelN`` belong to the reference orbit, to which ``SC[0].PosR`` and
-``VelR`` are added. Older versions of 42 write no brackets, and ``qn`` of bodies only. 42 waits for four bytes,
-``Ack`` and a zero, after each message if its blocking is on.
+``qn`` is an attitude quaternion J2000 → body, scalar last: the conjugate of that used here. ``wn`` is the
+body rate in the body frame, rad/s. ``PosN`` and ``VelN`` belong to the reference orbit, to which
+``SC[0].PosR`` and ``VelR`` are added. Older versions of 42 write no brackets, and ``qn`` of bodies only. 42
+waits for four bytes, ``Ack`` and a zero, after each message if its blocking is on.
 """
 
 from __future__ import annotations

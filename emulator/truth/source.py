@@ -156,7 +156,8 @@ class SlewSegment:
     rate_rad_s
         Largest rate, rad/s.
     shape
-        `smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant braking).
+        `smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant
+        braking).
     acceleration_rad_s2
         Acceleration of the `limited` shape, rad/s².
     """

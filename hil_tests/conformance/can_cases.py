@@ -292,7 +292,8 @@ FAULTY: Final = (
     ("swapped", "a message with exchanged segments has no effect", (0, 2, 1, 3, 4)),
     ("empty", "a segment without a counter has no effect", ()),
 )
-"""Name, title, and the order in which the five segments of a message are sent; one without a counter if none."""
+"""Name, title, and the order in which the five segments of a message are sent; one without a counter if
+none."""
 
 
 def _faulty_message(title: str, order: tuple[int, ...], probe: CanWire) -> None:

@@ -316,7 +316,8 @@ class DeviceDictionary(Dictionary):
     def _telecommand_variable(self, name: str, key: Key, row: Row, type_: str | None = None) -> ODVariable:
         """Return the variable whose write executes a telecommand.
 
-        The client writes the only value, all bytes (as a number if a type is given), or 1 if the telecommand has no data.
+        The client writes the only value, all bytes (as a number if a type is given), or 1 if the telecommand
+        has no data.
         """
         text = type_ is None and [field.kind for field in row.fields] == ["text"]
         scalar = text or (type_ is None and len(row.slots) == 1 and row.slots[0].type != "bytes")

@@ -1,7 +1,7 @@
 """The object dictionary of a running node: values, access checks and handlers.
 
-`canopen.ObjectDictionary` describes the objects. A `Dictionary` adds an `Entry` to each variable, with the current value
-as bytes on the wire and the functions that read and write it in the device.
+`canopen.ObjectDictionary` describes the objects. A `Dictionary` adds an `Entry` to each variable, with the
+current value as bytes on the wire and the functions that read and write it in the device.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class Entry:
     reader
         Returns the current value from the device instead of `value`.
     writer
-        Writes a value that passed the access, length and range checks, before `value` changes; raises `SdoAbortError` to
-        refuse.
+        Writes a value that passed the access, length and range checks, before `value` changes; raises
+        `SdoAbortError` to refuse.
     maximum_size
         Longest value, bytes, of a type without a fixed size.
     persistent

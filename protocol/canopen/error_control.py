@@ -36,7 +36,8 @@ class ErrorControl:
     context, emergency
         Shared by the node.
     on_failure
-        Called when a supervised node or the guarding master falls silent; applies the error behaviour of 1029h.
+        Called when a supervised node or the guarding master falls silent; applies the error behaviour of
+        1029h.
     """
 
     def __init__(

@@ -71,8 +71,8 @@ class PlacedObject(_Model):
     requests: bool = False
     """A record of all rows, by ID as sub-index: telemetry to read, telecommands to write."""
     telemetry: str | None = None
-    """A record of the fields of a telemetry row; with `telecommand`, which the row must include, a write to one field
-    executes the telecommand with the other fields unchanged."""
+    """A record of the fields of a telemetry row; with `telecommand`, which the row must include, a write to
+    one field executes the telecommand with the other fields unchanged."""
     value: str | None = None
     """A telemetry field to read, as `ROW.FIELD`."""
     telecommand: str | None = None

@@ -61,8 +61,8 @@ def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedO
     Raises
     ------
     SdoAbortError
-        NO_OBJECT for an object that does not exist, NOT_MAPPABLE for one that cannot be mapped in this direction
-        or in this length.
+        NO_OBJECT for an object that does not exist, NOT_MAPPABLE for one that cannot be mapped in this
+        direction or in this length.
     """
     entry_bits = MAPPING_ENTRY.parse(value.to_bytes(4, "big"))
     index, subindex, bits = entry_bits.index, entry_bits.subindex, entry_bits.bits

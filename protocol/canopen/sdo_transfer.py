@@ -1,7 +1,8 @@
 """Segmented and block SDO transfers, server side: one object per active transfer (CiA 301, SDO protocols).
 
-A transfer receives the 8 bytes of each further request and returns the 8-byte answers; `done` is set when it has ended.
-A violation of the protocol raises `SdoAbortError`; the server sends the abort and drops the transfer.
+A transfer receives the 8 bytes of each further request and returns the 8-byte answers; `done` is set when it
+has ended. A violation of the protocol raises `SdoAbortError`; the server sends the abort and drops the
+transfer.
 """
 
 from __future__ import annotations
@@ -124,7 +125,8 @@ class SegmentedUpload(Transfer):
 class BlockDownload(Transfer):
     """The client writes blocks of up to 127 unconfirmed segments, with a CRC over all data at the end.
 
-    After a gap, the confirmation of the block names the last segment in sequence; the client repeats the rest.
+    After a gap, the confirmation of the block names the last segment in sequence; the client repeats the
+    rest.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """A sans-I/O CANopen slave: frames and the time in, frames and events out (CiA 301, CiA 305).
 
-The caller owns bus and clock: it passes each frame to `receive`, calls `tick` at `next_deadline`, sends the returned
-frames in order, and collects the events. The slave never waits, reads a clock or starts a thread.
+The caller owns bus and clock: it passes each frame to `receive`, calls `tick` at `next_deadline`, sends the
+returned frames in order, and collects the events. The slave never waits, reads a clock or starts a thread.
 """
 
 from __future__ import annotations

@@ -65,8 +65,8 @@ class FileStorage:
     Parameters
     ----------
     path
-        The file; the first save creates its folder. One process at a time may use it: the emulator locks its state
-        folder.
+        The file; the first save creates its folder. One process at a time may use it: the emulator locks its
+        state folder.
     """
 
     def __init__(self, path: Path) -> None:

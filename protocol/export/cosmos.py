@@ -1,7 +1,8 @@
 """The interface definition as command and telemetry text of OpenC3 COSMOS.
 
-A packet is the row's identifier followed by its data; in a unit with classes the code of the class is the identifier's upper byte.
-COSMOS truncates the raw values that it computes, so a scaled parameter may be sent one step too small.
+A packet is the row's identifier followed by its data; in a unit with classes the code of the class is the
+identifier's upper byte. COSMOS truncates the raw values that it computes, so a scaled parameter may be sent
+one step too small.
 """
 
 from __future__ import annotations

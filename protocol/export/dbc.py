@@ -1,8 +1,8 @@
 """The interface definition as a CAN database (DBC).
 
-Each row yields its messages between the default addresses: request, telemetry and NACK, or telecommand, ACK and NACK.
-A message longer than 8 bytes describes the data after its segments (7 bytes and a counter each) have been joined, as is
-usual in DBC files for transport protocols.
+Each row yields its messages between the default addresses: request, telemetry and NACK, or telecommand, ACK
+and NACK. A message longer than 8 bytes describes the data after its segments (7 bytes and a counter each)
+have been joined, as is usual in DBC files for transport protocols.
 """
 
 from __future__ import annotations

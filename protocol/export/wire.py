@@ -96,7 +96,7 @@ def _header_cells(field: HeaderFieldModel) -> Iterator[tuple[str, str, str]]:
 def _fixed_value(const: int | None, default: int | None) -> str:
     if const is not None:
         return f"{const:X}h"
-    return "" if default is None else f"{default:X}h unless given"
+    return "" if default is None else f"default {default:X}h"
 
 
 def _serial() -> Section:

@@ -60,8 +60,8 @@ class Transport(ABC, Generic[Item]):
     async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
         """Open the port and pass what arrives to `on_receive`.
 
-        Raises TransportError if the port is not available now. Later failures go to `on_error`, and the transport
-        reconnects automatically.
+        Raises TransportError if the port is not available now. Later failures go to `on_error`, and the
+        transport reconnects automatically.
         """
         self._on_receive = on_receive
         self._on_error = on_error

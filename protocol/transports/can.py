@@ -57,9 +57,10 @@ def open_can(
     Parameters
     ----------
     spec:
-        `auto` (vcan0 where the kernel has it, else the hub at `hub_host:hub_port`, started in this process if none
-        answers there), a kernel interface such as `vcan0` or `socketcan:can0`, `socketcand:HOST:PORT/BUS`,
-        `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only), or `slcan:PORT`.
+        `auto` (vcan0 where the kernel has it, else the hub at `hub_host:hub_port`, started in this process if
+        none answers there), a kernel interface such as `vcan0` or `socketcan:can0`,
+        `socketcand:HOST:PORT/BUS`, `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only),
+        or `slcan:PORT`.
     bitrate:
         Bit rate (bit/s) of adapters that the transport configures (slcan).
 

@@ -31,8 +31,8 @@ class PacedWriter:
     Parameters
     ----------
     write:
-        Writes without blocking and returns how many bytes it accepted (0 if the port is full). OSError means that the
-        port is lost; the bytes are dropped, as on a line without a peer.
+        Writes without blocking and returns how many bytes it accepted (0 if the port is full). OSError means
+        that the port is lost; the bytes are dropped, as on a line without a peer.
     schedule:
         Byte times of the line, or None for no pacing.
     """

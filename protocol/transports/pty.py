@@ -1,7 +1,8 @@
 """Serial transport over a pseudo-terminal, and the detection of who has its slave side open.
 
-A wire stores nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while no process has the
-slave side open. inotify reports the openings and closings when one peer leaves and another comes at once.
+A wire stores nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while no
+process has the slave side open. inotify reports the openings and closings when one peer leaves and another
+comes at once.
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ class PtyPeers:
     path
         Path of the slave side.
 
-    Without inotify (the system has no more instances), a peer that leaves and is replaced at once goes unnoticed.
+    Without inotify (the system has no more instances), a peer that leaves and is replaced at once goes
+    unnoticed.
     """
 
     def __init__(self, master: int, path: str) -> None:
@@ -128,7 +130,8 @@ def _watch(path: str) -> int:
 class PtyTransport(PacedTransport):
     """A new pseudo-terminal; peers open its slave side like any tty, as often as they want.
 
-    As on a wire, bytes sent while no peer has the slave side open are lost, and so are those that a peer left unread.
+    As on a wire, bytes sent while no peer has the slave side open are lost, and so are those that a peer left
+    unread.
     """
 
     def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:

@@ -37,13 +37,15 @@ def open_serial(
     ----------
     spec:
         `auto` or `pty` for a new pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
-        `listen://HOST:PORT` to wait for one peer (with port 0, `description` has the free port that was chosen).
+        `listen://HOST:PORT` to wait for one peer (with port 0, `description` has the free port that was
+        chosen).
     baud:
         Bit rate, 8N1. It sets the pacing, and the hardware of a real tty.
     symlink:
         Path of a symlink to the pseudo-terminal; made atomically, removed at close.
     paced:
-        Whether bytes are sent no faster than the bit rate; by default true, except on a real tty, whose hardware does it.
+        Whether bytes are sent no faster than the bit rate; by default true, except on a real tty, whose
+        hardware does it.
 
     Raises
     ------

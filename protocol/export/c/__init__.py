@@ -1,7 +1,7 @@
 """The interface definition as C99: a header and a source with a codec for each row and the OBC's side of serial link and CAN.
 
-The text needs nothing but the standard library's headers and allocates nothing. `rows` writes the codecs, the files
-`*.h` and `*.c` of this folder hold the links; their `unit_` and `UNIT_` become the prefix of the unit.
+The text needs nothing but the standard library's headers and allocates nothing. `rows` writes the codecs, the
+files `*.h` and `*.c` of this folder hold the links; their `unit_` and `UNIT_` become the prefix of the unit.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The interface definition as a plugin of OpenC3 COSMOS: target, commands and telemetry, and the protocol of the serial line.
 
-The protocol is self-contained Python, put together from the files of this folder, since COSMOS does not have this package.
-It gives COSMOS packets of the form that the format `cosmos` describes, each command of telemetry included, and the packet
-ANSWER for what answers a command.
+The protocol is self-contained Python, put together from the files of this folder, since COSMOS does not have
+this package. It gives COSMOS packets of the form that the format `cosmos` describes, each command of
+telemetry included, and the packet ANSWER for what answers a command.
 """
 
 from __future__ import annotations
