@@ -46,7 +46,7 @@ _SLOTS: Final = (FX, FY, CX, CY, K1, K2, P1, P2, K3)
 _PRIOR_FOCAL: Final = 0.2
 _PRIOR_CENTRE: Final = 0.1
 _PRIOR_DISTORTION: Final = {"k1": 0.5, "k2": 0.5, "p1": 0.02, "p2": 0.02, "k3": 0.5}
-_LEAST_STARS: Final = 2
+_MIN_STARS: Final = 2
 _HUBER: Final = 2.0
 _REJECT: Final = 5.0
 _RAYLEIGH_MEDIAN: Final = 1.17741
@@ -88,10 +88,8 @@ class CalibrationFrame:
         n = len(self.xy_px)
         if len(self.reference) != n:
             raise StaridError(f"calibration: {n} positions and {len(self.reference)} directions in one frame")
-        if n < _LEAST_STARS:
-            raise StaridError(
-                f"calibration: a frame has {n} matched stars, must have at least {_LEAST_STARS}"
-            )
+        if n < _MIN_STARS:
+            raise StaridError(f"calibration: a frame has {n} matched stars, must have at least {_MIN_STARS}")
         if self.sigma_px is not None:
             sigma = np.asarray(self.sigma_px, dtype=np.float64)
             if sigma.shape not in ((n,), (n, 2)) or not (np.isfinite(sigma).all() and (sigma > 0.0).all()):
@@ -275,10 +273,10 @@ class _Bundle:
         limit = _REJECT * self.scale(distances)
         self.used = tuple(d <= limit for d in distances)
         for number, used in enumerate(self.used, start=1):
-            if used.sum() < _LEAST_STARS:
+            if used.sum() < _MIN_STARS:
                 raise StaridError(
                     f"calibration: frame {number} of {len(self.used)}: {used.sum()} of {len(used)} matched "
-                    f"stars fit the other frames, {_LEAST_STARS} needed; check its matches, or leave it out"
+                    f"stars fit the other frames, {_MIN_STARS} needed; check its matches, or leave it out"
                 )
 
     def cost(self, state: _State, scale: float) -> float:

@@ -31,7 +31,7 @@ Method = Literal["davenport", "quest", "esoq2", "foam", "svd"]
 METHODS: Final[tuple[Method, ...]] = get_args(Method)
 """Names of the estimators."""
 
-_LEAST_GAP: Final = 1e-12
+_MIN_GAP: Final = 1e-12
 """Distance of the two largest eigenvalues of K, for weights that sum to 1, below which roll is undetermined."""
 
 _CONJUGATE: Final = np.array([-1.0, -1.0, -1.0, 1.0])
@@ -80,7 +80,7 @@ def solve_wahba(
         raise StaridError(f"wahba: weights must be {n} positive finite numbers")
     profile = (b * (w / w.sum())[:, None]).T @ r
     singular = np.linalg.svd(profile, compute_uv=False)
-    if singular[1] + np.copysign(singular[2], _determinant(profile)) < _LEAST_GAP:
+    if singular[1] + np.copysign(singular[2], _determinant(profile)) < _MIN_GAP:
         raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     return _SOLVERS[method](profile)
 
@@ -110,7 +110,7 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Array:
     information = np.broadcast_to(sigma**-2.0, (len(b),))
     fisher = information.sum() * np.eye(3) - (b * information[:, None]).T @ b
     smallest = np.linalg.eigvalsh(fisher)[0] if len(b) else 0.0
-    if not smallest > _LEAST_GAP * information.sum():
+    if not smallest > _MIN_GAP * information.sum():
         raise StaridError("wahba: the attitude is undetermined; use stars that are further apart")
     inverse: Array = np.linalg.inv(fisher)
     symmetric: Array = 0.5 * (inverse + inverse.T)

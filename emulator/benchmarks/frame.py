@@ -31,7 +31,7 @@ _START: Final = "2026-03-01"
 _INTERVAL_S: Final = 5.0
 _ORBIT: Final = KeplerOrbit(unix_time(_START), 7.07e6, 0.001, math.radians(98.0), math.radians(70.0))
 _BESIDE_MOON_RAD: Final = math.radians(18.0)
-_MOST_TRIES: Final = 20
+_MAX_TRIES: Final = 20
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def measure_bodies(
         if progress is not None:
             progress(f"timing {frames} pairs of frames, in the field: {case}")
         table: list[list[list[float]]] = []
-        for index in range(_MOST_TRIES * (frames + _WARM_UP)):
+        for index in range(_MAX_TRIES * (frames + _WARM_UP)):
             unix_s = _ORBIT.epoch_unix_s + index * _INTERVAL_S
             state, attitude = _ORBIT.state(unix_s), random_attitude(rng)
             objects = skies[1].view(unix_s, state.position_m, state.velocity_m_s).objects

@@ -14,7 +14,7 @@ from starid.camera import Camera
 from starid.imaging.dark_frame import dark_excess, without_dark
 from starid.imaging.image_io import SUFFIXES, grey_of, read_image
 
-_LEAST_BITS: Final = 8
+_MIN_BITS: Final = 8
 
 Counts = npt.NDArray[Any]
 
@@ -131,7 +131,7 @@ def open_images(settings: Mapping[str, Any], camera: Camera) -> ImageSource | No
 
 def used_bits(image: Counts) -> int:
     """Return the number of bits that an image uses, at least 8."""
-    return max(int(image.max(initial=0)).bit_length(), _LEAST_BITS)
+    return max(int(image.max(initial=0)).bit_length(), _MIN_BITS)
 
 
 def _is_image(file: Path) -> bool:

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from starid.jit import compiled_ieee
 
-MOST_GAUSS_NODES: Final = 200
-MOST_NODES: Final = 20_000
+MAX_GAUSS_NODES: Final = 200
+MAX_NODES: Final = 20_000
 MAX_RADIUS_SIGMA: Final = 7.0
 _NODES_PER_SIGMA: Final = 0.85
-_LEAST_NODES: Final = 3
+_MIN_NODES: Final = 3
 _STILL_SIGMA: Final = 1e-3
 _CUT_E: Final = 0.01
 _SQRT_HALF: Final = math.sqrt(0.5)
@@ -24,7 +24,7 @@ _SQRT_HALF: Final = math.sqrt(0.5)
 @lru_cache(maxsize=64)
 def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Return nodes on (−1, 1) and weights that sum to 1: Gauss–Legendre, or midpoints for very many nodes."""
-    if count > MOST_GAUSS_NODES:
+    if count > MAX_GAUSS_NODES:
         nodes = np.linspace(-1.0, 1.0, count, endpoint=False, dtype=np.float64) + 1.0 / count
         return nodes, np.full(count, 1.0 / count, dtype=np.float64)
     nodes, weights = np.polynomial.legendre.leggauss(count)
@@ -52,7 +52,7 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
     if lengths < _STILL_SIGMA:
         return _rule(1)
     return _rule(
-        min(_LEAST_NODES + math.ceil(_NODES_PER_SIGMA * lengths + 2.0 * math.sqrt(lengths)), MOST_NODES)
+        min(_MIN_NODES + math.ceil(_NODES_PER_SIGMA * lengths + 2.0 * math.sqrt(lengths)), MAX_NODES)
     )
 
 

@@ -20,7 +20,7 @@ from starid.jit import compiled_ieee, inner
 GLOW_HEIGHTS: Final = 20.0
 """Heights of the atmosphere above the limb up to which it glows."""
 
-_LEAST_E: Final = 0.05
+_MIN_E: Final = 0.05
 """Light of the atmosphere that is neglected, electrons."""
 
 _ERROR_E: Final = 1.0
@@ -229,7 +229,7 @@ def _cover(
     full_e, saturated_e = brightness * light[1], light[3]
     rows, width = mean.shape
     points = grid.shape[2]
-    reach = min(max(math.log(max(full_e, 1e-9) / _LEAST_E), 1.0), GLOW_HEIGHTS)
+    reach = min(max(math.log(max(full_e, 1e-9) / _MIN_E), 1.0), GLOW_HEIGHTS)
     limits = (full_e, saturated_e, reach, full_e * (distance**2 - 1.0) * step_rad**2 / 4.0)
     full, sky = np.float32(full_e * light[2]), np.float32(light[0])
     shades, emergents = np.empty((2, points), dtype=np.float32), np.empty((2, points), dtype=np.float32)

@@ -16,7 +16,7 @@ from starid.errors import StaridError
 from starid.jit import compiled_ieee, inner
 from starid.wahba import solve_wahba
 
-LEAST_GROUP: Final = 3
+MIN_GROUP: Final = 3
 """Matches that an attitude needs: of two, chance finds as many as one likes."""
 
 
@@ -91,14 +91,14 @@ def largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance: 
     Returns
     -------
     ndarray (k, 2)
-        The group, empty where it has fewer than `LEAST_GROUP` members or is the mirror image of the sky.
+        The group, empty where it has fewer than `MIN_GROUP` members or is the mirror image of the sky.
     """
     none = np.empty((0, 2), dtype=np.int64)
-    if len(pairs) < LEAST_GROUP:
+    if len(pairs) < MIN_GROUP:
         return none
     unique = np.unique(pairs, axis=0)
     group = unique[_largest_group(directions, vectors, unique, tolerance)]
-    if len(group) < LEAST_GROUP or not _same_hand(directions, vectors, group, tolerance):
+    if len(group) < MIN_GROUP or not _same_hand(directions, vectors, group, tolerance):
         return none
     return group[np.argsort(group[:, 0])]
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import (
-    MOST_TIED,
+    MAX_TIED,
     add_winners,
     bright_neighbour,
     grouped,
@@ -45,8 +45,8 @@ RADIUS_SHARE: Final = 0.65
 BUFFER_SHARE: Final = 0.15
 """Buffer radius over the pattern radius."""
 
-LEAST_VOTES: Final = 4
-MOST_NEIGHBOURS: Final = 400
+MIN_VOTES: Final = 4
+MAX_NEIGHBOURS: Final = 400
 
 
 @inner
@@ -81,8 +81,8 @@ def look_up_table(vectors: Array, magnitude: Array, radius: float, buffer: float
 
     Each pattern is aligned with its nearest star beyond the buffer in the brighter half (`bright_neighbour`).
     """
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     cells, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     for star in range(vectors.shape[0]):
         count = neighbours_of(vectors, star, radius, polar, rows)
@@ -113,9 +113,9 @@ def count_votes(
 @compiled_ieee
 def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -> Indices:
     """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    matches = np.empty((seen.shape[0] * MOST_TIED, 2), dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
     filled = 0
     for pivot in range(seen.shape[0]):
         count = neighbours_of(seen, pivot, radius, polar, rows)
@@ -124,7 +124,7 @@ def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -
             continue
         votes = np.zeros(stars, dtype=np.int32)
         count_votes(table, polar, count, aligned, radius, found, votes)
-        filled = add_winners(votes, LEAST_VOTES, pivot, matches, filled)
+        filled = add_winners(votes, MIN_VOTES, pivot, matches, filled)
     return matches[:filled]
 
 

@@ -29,7 +29,7 @@ from starid.arrays import Array, Indices
 from starid.classic.grid import (
     BUFFER_SHARE,
     GRID,
-    MOST_NEIGHBOURS,
+    MAX_NEIGHBOURS,
     RADIUS_SHARE,
     Table,
     count_votes,
@@ -55,8 +55,8 @@ def _look_up(
 ) -> Indices:
     """Matches (m, 2) whose votes pass the Bayesian threshold, the best two of each pivot and alignment."""
     directions, magnitude = seen
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    found = np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     matches = np.empty((directions.shape[0] * ALIGNMENTS * KEPT, 2), dtype=np.int64)
     filled = 0
     hit, miss = math.log(HIT_RATE / fill), math.log((1.0 - HIT_RATE) / (1.0 - fill))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices, Indices32
-from starid.classic.neighbours import MOST_TIED, add_winners, grouped, neighbours_of, turned
+from starid.classic.neighbours import MAX_TIED, add_winners, grouped, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
@@ -35,8 +35,8 @@ INNER: Final = 0.1
 RADIUS_SHARE: Final = 0.65
 """Pattern radius over the width of the field."""
 
-LEAST_AGREEING: Final = 5
-MOST_NEIGHBOURS: Final = SECTORS
+MIN_AGREEING: Final = 5
+MAX_NEIGHBOURS: Final = SECTORS
 
 
 @inner
@@ -58,7 +58,7 @@ def log_polar_string(
 @compiled_ieee
 def _strings(vectors: Array, radius: float) -> NDArray[np.uint8]:
     """Strings (n, `SECTORS`) of all stars."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     codes = np.empty((vectors.shape[0], SECTORS), dtype=np.uint8)
     for star in range(vectors.shape[0]):
         log_polar_string(vectors, star, radius, polar, rows, codes[star])
@@ -97,9 +97,9 @@ def _compare(
 ) -> Indices:
     """Matches (m, 2) of each observed star with the guide stars most like it."""
     start, owner, sectors = index
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     code, shifts = np.empty(SECTORS, dtype=np.uint8), np.empty((stars, SECTORS), dtype=np.int16)
-    matches = np.empty((seen.shape[0] * MOST_TIED, 2), dtype=np.int64)
+    matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
     agreeing = np.empty(stars, dtype=np.int32)
     filled = 0
     for pivot in range(seen.shape[0]):
@@ -112,7 +112,7 @@ def _compare(
             for entry_row in range(start[max(ring - 1, 0)], start[min(ring + 2, RINGS)]):
                 shifts[owner[entry_row], (sectors[entry_row] + SECTORS - place) % SECTORS] += 1
         _most_agreeing(shifts, agreeing)
-        filled = add_winners(agreeing, LEAST_AGREEING, pivot, matches, filled)
+        filled = add_winners(agreeing, MIN_AGREEING, pivot, matches, filled)
     return matches[:filled]
 
 

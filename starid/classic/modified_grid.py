@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices
-from starid.classic.grid import BUFFER_SHARE, GRID, MOST_NEIGHBOURS, RADIUS_SHARE, place_on_grid
+from starid.classic.grid import BUFFER_SHARE, GRID, MAX_NEIGHBOURS, RADIUS_SHARE, place_on_grid
 from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
@@ -33,13 +33,13 @@ GREY_WIDTH: Final = 0.7
 """Standard deviation of the grey around a star, cells."""
 
 GREATEST_COST: Final = 0.65
-LEAST_NEIGHBOURS: Final = 4
+MIN_NEIGHBOURS: Final = 4
 
 
 @compiled_ieee
 def _grey_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np.uint8]:
     """Grey grids (n, `GRID`²) of all stars; empty for one that has no neighbour to be aligned with."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     grey = np.zeros((vectors.shape[0], GRID * GRID), dtype=np.uint8)
     for star in range(vectors.shape[0]):
         count = neighbours_of(vectors, star, radius, polar, rows)
@@ -62,14 +62,14 @@ def _least_cost(
     grey: NDArray[np.uint8], seen: Array, magnitude: Array, radius: float, buffer: float
 ) -> Indices:
     """Guide star of each observed star, −1 without a clear winner."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    cells, weights = np.empty(MOST_NEIGHBOURS, dtype=np.int64), np.empty(MOST_NEIGHBOURS)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    cells, weights = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.empty(MAX_NEIGHBOURS)
     matched = np.full(seen.shape[0], -1, dtype=np.int64)
     brightest, range_of = magnitude[0], max(magnitude[-1] - magnitude[0], 1e-9)
     for pivot in range(seen.shape[0]):
         count = neighbours_of(seen, pivot, radius, polar, rows)
         aligned = nearest_beyond(polar, count, buffer)
-        if aligned < 0 or count < LEAST_NEIGHBOURS:
+        if aligned < 0 or count < MIN_NEIGHBOURS:
             continue
         whole = 0.0
         for i in range(count):

@@ -17,7 +17,7 @@ import numpy as np
 from starid.arrays import Array, Indices, Indices32
 from starid.jit import compiled_ieee, inner
 
-MOST_TIED: Final = 4
+MAX_TIED: Final = 4
 """Guide stars with equally many votes that a pivot may leave to the last step; more of them say nothing."""
 
 
@@ -141,7 +141,7 @@ def grouped(keys: Indices, groups: int) -> tuple[Indices32, Indices]:
 def add_winners(votes: Indices32, least: int, pivot: int, matches: Indices, filled: int) -> int:
     """Append the guide stars with most votes, if they are enough and not too many are tied; return the new number of matches.
 
-    `matches` (n·`MOST_TIED`, 2) receives the pivot and the guide star.
+    `matches` (n·`MAX_TIED`, 2) receives the pivot and the guide star.
     """
     most = votes.max()
     if most < least:
@@ -149,7 +149,7 @@ def add_winners(votes: Indices32, least: int, pivot: int, matches: Indices, fill
     count = 0
     for star in range(votes.shape[0]):
         if votes[star] == most:
-            if count == MOST_TIED:
+            if count == MAX_TIED:
                 return filled
             matches[filled + count, 0], matches[filled + count, 1] = pivot, star
             count += 1

@@ -31,7 +31,7 @@ from starid.jit import compiled_ieee
 NEIGHBOURS: Final = 5
 BUFFER_SHARE: Final = 0.05
 RADIUS_SHARE: Final = 0.5
-LEAST_VOTES: Final = 3
+MIN_VOTES: Final = 3
 MARGIN: Final = 1.3
 
 
@@ -115,5 +115,5 @@ class OrientedSvdIdentifier(ClassicIdentifier):
         best = votes.argmax(axis=1)
         ranked = np.sort(votes, axis=1)
         most, second = ranked[:, -1], ranked[:, -2]
-        reliable = np.flatnonzero((most >= LEAST_VOTES) & (most >= MARGIN * second))
+        reliable = np.flatnonzero((most >= MIN_VOTES) & (most >= MARGIN * second))
         return np.column_stack([reliable, best[reliable]])

@@ -17,7 +17,7 @@ from starid.arrays import Array, Array32, Indices32
 from starid.errors import StaridError
 from starid.jit import compiled_ieee, inner
 
-MOST_STARS: Final = 65_535
+MAX_STARS: Final = 65_535
 """Stars that 16-bit numbers can name."""
 
 
@@ -85,11 +85,11 @@ def pair_table(vectors: Array, longest: float) -> PairTable:
     Raises
     ------
     StaridError
-        More stars than `MOST_STARS`.
+        More stars than `MAX_STARS`.
     """
-    if len(vectors) > MOST_STARS:
+    if len(vectors) > MAX_STARS:
         raise StaridError(
-            f"pair table: {len(vectors)} stars, at most {MOST_STARS} allowed; use a brighter limit"
+            f"pair table: {len(vectors)} stars, at most {MAX_STARS} allowed; use a brighter limit"
         )
     by_z = np.argsort(vectors[:, 2], kind="stable")
     chord, low, high = _close_pairs(np.ascontiguousarray(vectors[by_z]), longest)

@@ -21,11 +21,11 @@ from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import neighbours_of
-from starid.classic.rings import MOST_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_table
+from starid.classic.rings import MAX_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
 
-LEAST_RINGS: Final = 4
+MIN_RINGS: Final = 4
 CANDIDATES: Final = 8
 
 
@@ -34,7 +34,7 @@ def _candidates(
     table: tuple[Indices32, NDArray[np.uint16]], stars: int, seen: Array, radius: float
 ) -> Indices:
     """Candidates (m, 2): row of an observed star, guide star with as many rings in common."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(stars, dtype=np.int32)
     found = np.empty((seen.shape[0] * CANDIDATES, 2), dtype=np.int64)
     filled = 0
@@ -42,7 +42,7 @@ def _candidates(
         radial_votes(table, polar, neighbours_of(seen, pole, radius, polar, rows), radius, votes)
         for _ in range(CANDIDATES):
             best = np.argmax(votes)
-            if votes[best] < LEAST_RINGS:
+            if votes[best] < MIN_RINGS:
                 break
             votes[best] = 0
             found[filled, 0], found[filled, 1] = pole, best

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices, Indices32
 from starid.classic.neighbours import neighbours_of, turned
-from starid.classic.rings import MOST_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_of, ring_table
+from starid.classic.rings import MAX_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_of, ring_table
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
 SECTORS: Final = 60
-LEAST_RINGS: Final = 4
+MIN_RINGS: Final = 4
 CANDIDATES: Final = 10
 
 
@@ -71,7 +71,7 @@ def common_sectors(seen: int, other: int) -> int:
 @compiled_ieee
 def _cyclic_words(vectors: Array, radius: float) -> Indices:
     """Cyclic words (n,) of all stars."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     words = np.empty(vectors.shape[0], dtype=np.int64)
     for star in range(vectors.shape[0]):
         words[star] = cyclic_word(polar, neighbours_of(vectors, star, radius, polar, rows), radius)
@@ -83,7 +83,7 @@ def _identify(
     table: tuple[Indices32, NDArray[np.uint16]], words: Indices, seen: Array, radius: float
 ) -> Indices:
     """Guide star of each observed star, −1 without a clear winner."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(words.shape[0], dtype=np.int32)
     matched = np.full(seen.shape[0], -1, dtype=np.int64)
     for pole in range(seen.shape[0]):
@@ -94,7 +94,7 @@ def _identify(
         for _ in range(CANDIDATES):
             star = int(np.argmax(votes))
             rings = votes[star]
-            if rings < LEAST_RINGS:
+            if rings < MIN_RINGS:
                 break
             votes[star] = 0
             likeness = rings + common_sectors(word, words[star])

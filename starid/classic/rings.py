@@ -24,7 +24,7 @@ INNER: Final = 0.05
 RADIUS_SHARE: Final = 0.5
 """Pattern radius over the width of the field."""
 
-MOST_NEIGHBOURS: Final = 400
+MAX_NEIGHBOURS: Final = 400
 
 
 @inner
@@ -37,7 +37,7 @@ def ring_of(chord: float, radius: float) -> int:
 @compiled_ieee
 def ring_table(vectors: Array, radius: float) -> tuple[Indices32, NDArray[np.uint16]]:
     """Look-up table: first entry of each ring, and the stars that have a neighbour in it, each once."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     rings, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     for star in range(vectors.shape[0]):
         last = -1

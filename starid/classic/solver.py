@@ -31,7 +31,7 @@ from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.classic.agreement import LEAST_GROUP, largest_group
+from starid.classic.agreement import MIN_GROUP, largest_group
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.index_choice import pixels_per_radian
@@ -46,11 +46,11 @@ Database = tuple[NDArray[np.generic], ...]
 BLEND_PX: Final = 2.0
 """Stars closer than this are seen as one."""
 
-LEAST_GUIDE_STARS: Final = 20
+MIN_GUIDE_STARS: Final = 20
 """Guide stars of the whole sky without which there is nothing to identify."""
 
 _VERIFY_WINDOW_PX: Final = 20.0
-_LEAST_TOLERANCE_PX: Final = 0.5
+_MIN_TOLERANCE_PX: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -162,10 +162,10 @@ class ClassicIdentifier(VerifiedIdentifier):
     sigmas: ClassVar[float] = 3.0
     """The same in standard deviations of a distance, where they are."""
 
-    least_group: ClassVar[int] = LEAST_GROUP
+    least_group: ClassVar[int] = MIN_GROUP
     """Matches with agreeing distances that an answer needs."""
 
-    least_stars: ClassVar[int] = LEAST_GROUP
+    least_stars: ClassVar[int] = MIN_GROUP
     """Observed stars without which the algorithm has nothing to work with."""
 
     def __init__(
@@ -218,17 +218,15 @@ class ClassicIdentifier(VerifiedIdentifier):
         """Brightest stars as seen, so many a field."""
         wanted = math.ceil(per_field * 4.0 * math.pi / self._area_sr)
         magnitudes = np.sort(self._catalog.v)
-        if magnitudes.size < LEAST_GUIDE_STARS:
-            raise StaridError(
-                f"classic catalog: {magnitudes.size} stars, at least {LEAST_GUIDE_STARS} needed"
-            )
+        if magnitudes.size < MIN_GUIDE_STARS:
+            raise StaridError(f"classic catalog: {magnitudes.size} stars, at least {MIN_GUIDE_STARS} needed")
         limit = float(magnitudes[min(wanted, magnitudes.size) - 1])
         if self.options.limiting_magnitude is not None:
             limit = min(limit, self.options.limiting_magnitude)
         stars = seen_stars(self._catalog, limit, BLEND_PX / self._px_per_rad)
-        if len(stars) < LEAST_GUIDE_STARS:
+        if len(stars) < MIN_GUIDE_STARS:
             raise StaridError(
-                f"classic limiting_magnitude: {limit:g} leaves {len(stars)} guide stars, at least {LEAST_GUIDE_STARS} needed"
+                f"classic limiting_magnitude: {limit:g} leaves {len(stars)} guide stars, at least {MIN_GUIDE_STARS} needed"
             )
         row = self._catalog.index_of(stars.hip).astype(np.int64)
         return GuideStars(np.ascontiguousarray(stars.vectors), stars.v.copy(), row)
@@ -270,7 +268,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         tolerance_px = self.options.tolerance_px or self.tolerance_px
         if sigmas is not None and rows.size:
             deviation = math.sqrt(2.0 * float(np.mean(sigmas[rows] ** 2)))
-            tolerance_px = max(self.sigmas * deviation, _LEAST_TOLERANCE_PX)
+            tolerance_px = max(self.sigmas * deviation, _MIN_TOLERANCE_PX)
         return Observed(
             np.ascontiguousarray(directions[rows]), magnitude[:count], rows, tolerance_px / self._px_per_rad
         )

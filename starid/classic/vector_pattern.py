@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Array32, Indices, Indices32
-from starid.classic.grid import BUFFER_SHARE, MOST_NEIGHBOURS, RADIUS_SHARE
-from starid.classic.neighbours import MOST_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
+from starid.classic.grid import BUFFER_SHARE, MAX_NEIGHBOURS, RADIUS_SHARE
+from starid.classic.neighbours import MAX_TIED, add_winners, grouped, nearest_beyond, neighbours_of, turned
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
@@ -31,7 +31,7 @@ ELEMENTS: Final = 200
 ANGLE_TOLERANCE: Final = math.radians(4.0)
 """Largest difference of the angle of a neighbour at half the pattern radius."""
 
-LEAST_VOTES: Final = 4
+MIN_VOTES: Final = 4
 
 
 @inner
@@ -44,7 +44,7 @@ def _element(polar: Array, i: int, reference: float, radius: float) -> int:
 @compiled_ieee
 def _patterns(vectors: Array, radius: float, buffer: float) -> tuple[Indices32, NDArray[np.uint16], Array32]:
     """Index: first entry of each element, the stars that have a neighbour there, and its angle."""
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     elements, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     angles = [0.0 for _ in range(0)]
     for star in range(vectors.shape[0]):
@@ -72,8 +72,8 @@ def _vote(
 ) -> Indices:
     """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
     start, owner, angles = index
-    polar, rows = np.empty((MOST_NEIGHBOURS, 2)), np.empty(MOST_NEIGHBOURS, dtype=np.int64)
-    matches = np.empty((seen.shape[0] * MOST_TIED, 2), dtype=np.int64)
+    polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
     filled = 0
     for pivot in range(seen.shape[0]):
         count = neighbours_of(seen, pivot, radius, polar, rows)
@@ -94,7 +94,7 @@ def _vote(
                     if voter[star] != i and min(gap, 2.0 * math.pi - gap) <= allowed:
                         votes[star] += 1
                         voter[star] = i
-        filled = add_winners(votes, LEAST_VOTES, pivot, matches, filled)
+        filled = add_winners(votes, MIN_VOTES, pivot, matches, filled)
     return matches[:filled]
 
 

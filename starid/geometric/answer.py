@@ -31,10 +31,10 @@ from starid.geometric.settings import (
 from starid.geometric.verification import log_false_probability, worth_refining
 from starid.jit import inner
 
-LEAST_MATCHED: Final = 4
+MIN_MATCHED: Final = 4
 """Least number of matches of an answer that is not near a prediction."""
 
-LEAST_TESTED: Final = 4
+MIN_TESTED: Final = 4
 """Detections outside the pattern with which the sequential test can reject."""
 
 
@@ -110,7 +110,7 @@ def test_and_refine(
     used : (int, int, int)
         Detections that the attitude was derived from.
     least_matched : int
-        Least number of matches. Below `LEAST_MATCHED` a few detections are not tested one by one: the bound alone decides.
+        Least number of matches. Below `MIN_MATCHED` a few detections are not tested one by one: the bound alone decides.
     prior : (float, float)
         As in `log_false_probability`.
 
@@ -124,7 +124,7 @@ def test_and_refine(
     rotation, numbers = candidate.frames[2], candidate.numbers
     faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
     odds, order = tests
-    few = least_matched < LEAST_MATCHED and observed.shape[0] < least_matched + LEAST_TESTED
+    few = least_matched < MIN_MATCHED and observed.shape[0] < least_matched + MIN_TESTED
     if not few and not worth_refining(
         index, raw.params, observed, rotation, numbers[SCALE], faintest, settings, odds, order, used
     ):

@@ -22,7 +22,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
-from starid.geometric.answer import LEAST_MATCHED, Answer
+from starid.geometric.answer import MIN_MATCHED, Answer
 from starid.geometric.index_choice import (
     default_limiting_magnitude,
     index_settings,
@@ -51,7 +51,7 @@ from starid.geometric.settings import (
     TOO_FEW,
     WINDOW,
 )
-from starid.geometric.tracking import LEAST_TRACKED, LEAST_TRACKED_KNOWN, track_kernel
+from starid.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KNOWN, track_kernel
 from starid.geometric.verification import WHOLE_SKY
 from starid.single_camera import Measured, SingleCameraIdentifier, near
 from starid.solution import Mode, Reason, Solution
@@ -59,7 +59,7 @@ from starid.solution import Mode, Reason, Solution
 BLEND_PX: Final = 2.0
 TRACKING_WINDOW_PX: Final = 20.0
 WIDEST_TOLERANCE: Final = 0.3
-MOST_PART_STARS: Final = 30
+MAX_PART_STARS: Final = 30
 _QUICK_TRIANGLES: Final = 60
 """Triangles tried at each focal length before any is searched in full."""
 
@@ -104,8 +104,8 @@ class Effort:
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
             if field.name == "part_stars":
-                if not 0 <= value <= MOST_PART_STARS:
-                    raise StaridError(f"identifier part_stars: must be 0…{MOST_PART_STARS}, not {value}")
+                if not 0 <= value <= MAX_PART_STARS:
+                    raise StaridError(f"identifier part_stars: must be 0…{MAX_PART_STARS}, not {value}")
             elif not 0.0 < value < math.inf:
                 raise StaridError(f"identifier {field.name}: must be a positive number, not {value}")
 
@@ -288,9 +288,9 @@ class Identifier(SingleCameraIdentifier):
         """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`)."""
         numbers = self._numbers_for(measured)
         window = (TRACKING_WINDOW_PX if window_px is None else window_px) / self._px_per_rad
-        prior, least = self._prior(window), LEAST_TRACKED_KNOWN if measured.sigmas_known else LEAST_TRACKED
+        prior, least = self._prior(window), MIN_TRACKED_KNOWN if measured.sigmas_known else MIN_TRACKED
         if anywhere:
-            prior, least, numbers = WHOLE_SKY, LEAST_MATCHED, numbers.copy()
+            prior, least, numbers = WHOLE_SKY, MIN_MATCHED, numbers.copy()
             numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
         answer = track_kernel(
             self._index, self._camera.params, measured.xy, measured.flux, measured.sigmas, numbers,

@@ -34,8 +34,8 @@ LARGEST_QUOTA: Final = 20
 SMALLEST_QUOTA: Final = 6
 """Pattern stars in half the field's area: a few bright ones, and as many deep ones as the size of the index allows."""
 
-MOST_BRIGHT: Final = 120_000
-MOST_DEEP: Final = 420_000
+MAX_BRIGHT: Final = 120_000
+MAX_DEEP: Final = 420_000
 """Approximate limits of the numbers of triangles of bright and of deep pattern stars."""
 
 BRIGHT_SIDES: Final = (0.04, 1.3)
@@ -90,10 +90,10 @@ def index_settings(
     least = pixels_per_radian(camera)
     window = window_px / least
     spacing = math.sqrt(4.0 * math.pi / max(len(catalog.brighter_than(limiting_magnitude)), 1))
-    cube = MOST_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
+    cube = MAX_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)
     quota = min(max(int(cube ** (1.0 / 3.0)), SMALLEST_QUOTA), LARGEST_QUOTA)
-    deep = min(_longest_share(MOST_DEEP, quota, area), DEEP_SIDES[1])
-    bright = max(min(_longest_share(MOST_BRIGHT, BRIGHT_QUOTA, area), BRIGHT_SIDES[1]), deep)
+    deep = min(_longest_share(MAX_DEEP, quota, area), DEEP_SIDES[1])
+    bright = max(min(_longest_share(MAX_BRIGHT, BRIGHT_QUOTA, area), BRIGHT_SIDES[1]), deep)
     return IndexSettings(
         limiting_magnitude=limiting_magnitude,
         blend_rad=blend_px / least,

@@ -61,7 +61,7 @@ FEW_MATCHED: Final = 30
 OUTLIER_CHANCE: Final = 3.3e-4
 """Probability that the test rejects a good star: that of a window of 4 sigma."""
 
-LEAST_GATE: Final = 0.5
+MIN_GATE: Final = 0.5
 """Deviation from the expected magnitude that is always accepted."""
 
 PRIOR_FREEDOM: Final = 10.0
@@ -421,7 +421,7 @@ def refine(
             sigma, _ = distances(star_table, seen, rotation, stars, scratch)
             sigma *= math.sqrt(2.0 * matched / freedom)
             numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, stars, scratch)
-            gate = min(gate, max(5.0 * numbers[SCATTER], LEAST_GATE))
+            gate = min(gate, max(5.0 * numbers[SCATTER], MIN_GATE))
             reach = BY_NOISE
     _, numbers[RMS] = distances(star_table, seen, rotation, stars, scratch)
     numbers[SCALE_VARIANCE] = _marginalise(normal, scratch) if free_scale else 0.0

@@ -14,7 +14,7 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.geometric.answer import (
-    LEAST_MATCHED,
+    MIN_MATCHED,
     Answer,
     Candidate,
     make_answer,
@@ -67,7 +67,7 @@ STRICT_GATE: Final = 0.6
 PARTS: Final = 5
 """Parts of the field: four quadrants and the middle."""
 
-MOST_FOUND: Final = 4096
+MAX_FOUND: Final = 4096
 """Most triangles of the index tried for one triangle of detections."""
 
 _SEED: Final = 88172645463325252
@@ -181,7 +181,7 @@ def _try_patterns(
             framed = True
         set_rotation(stars, (a, b, c), frames)
         _, bound = test_and_refine(
-            index, raw, observed, settings, candidate, tests, corners, LEAST_MATCHED, WHOLE_SKY
+            index, raw, observed, settings, candidate, tests, corners, MIN_MATCHED, WHOLE_SKY
         )
         if bound < settings[LOG_CHANCE]:
             return bound
@@ -254,10 +254,10 @@ def identify_kernel(
     observed = observe(raw)
     n = observed.shape[0]
     candidate = new_candidate(n)
-    if n < LEAST_MATCHED:
+    if n < MIN_MATCHED:
         return make_answer(TOO_FEW, observed, candidate, settings, 0.0, 0, 0)
     odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
-    found = np.empty(MOST_FOUND, dtype=np.int64)
+    found = np.empty(MAX_FOUND, dtype=np.int64)
     spread, limit, numbers = settings[SCALE_TOLERANCE], int(settings[MAX_TRIANGLES]), index.numbers
     tolerance, gate = settings[SEARCH_TOLERANCE], settings[MAGNITUDE_GATE]
     widest = numbers[SIDE_STEP] * SIDE_STEPS / (1.0 - spread)

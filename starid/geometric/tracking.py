@@ -6,7 +6,7 @@ refinement and verification as one found lost in space. A prediction that is off
 window, roll included, is followed; anything else is excluded.
 
 Three matched stars can be enough, and two where the errors of the positions are known: the bound on the probability of
-a false answer says whether they are. An answer of fewer than `LEAST_MATCHED` is compared with all others near the prediction,
+a false answer says whether they are. An answer of fewer than `MIN_MATCHED` is compared with all others near the prediction,
 and its bound is that of the best one with which it has not even two matches in common.
 """
 
@@ -18,7 +18,7 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.geometric.answer import (
-    LEAST_MATCHED,
+    MIN_MATCHED,
     Answer,
     Candidate,
     make_answer,
@@ -60,10 +60,10 @@ PAIRED: Final = 16
 CANDIDATES: Final = 6
 """Catalogue stars considered for each of them, the brightest in its window."""
 
-LEAST_TRACKED: Final = 3
+MIN_TRACKED: Final = 3
 """Least number of matches near a prediction: two leave one residual, from which no noise can be estimated."""
 
-LEAST_TRACKED_KNOWN: Final = 2
+MIN_TRACKED_KNOWN: Final = 2
 """The same where the errors of the positions are known."""
 
 
@@ -173,7 +173,7 @@ def _try_detections(
             matched, bound = _try_pair(
                 index, raw, observed, settings, candidate, tests, detections, (a, b), least_matched, prior
             )
-            if matched >= LEAST_MATCHED and bound < settings[LOG_CHANCE_TRACKING]:
+            if matched >= MIN_MATCHED and bound < settings[LOG_CHANCE_TRACKING]:
                 return bound
             if matched > 0 and bound < 0.0:
                 _weigh(candidate, bound, best, bounds)

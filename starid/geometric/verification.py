@@ -66,8 +66,8 @@ angle in which one star may lie (sr)."""
 ZERO_POINT_RANGE: Final = 10.0
 """Magnitudes over which the photometric zero point may lie."""
 
-LEAST_NOISE: Final = 0.05
-MOST_NOISE: Final = 5.0
+MIN_NOISE: Final = 0.05
+MAX_NOISE: Final = 5.0
 """Range of the centroid noise where it is estimated, pixels."""
 
 SHARES: Final = (0.2, 0.5, 0.9)
@@ -243,7 +243,7 @@ def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
     """Variance of unit weight that the bound is computed with, and the logarithm of the factor for averaging over it.
 
     Where the caller stated the errors, the prior of the variance is the scaled inverse χ² of `PRIOR_FREEDOM` degrees of
-    freedom about 1; else the noise is uniform in its logarithm from `LEAST_NOISE` to `MOST_NOISE`. Both averages by Laplace's
+    freedom about 1; else the noise is uniform in its logarithm from `MIN_NOISE` to `MAX_NOISE`. Both averages by Laplace's
     method, or by the integral's bound where the estimate lies below the range.
     """
     variance = numbers[VARIANCE]
@@ -252,9 +252,9 @@ def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
         density = -0.5 * PRIOR_FREEDOM * (math.log(variance) + 1.0 / variance - 1.0)
         return variance, density + 0.5 * math.log(PRIOR_FREEDOM / (PRIOR_FREEDOM + freedom))
     width = math.sqrt(math.pi / freedom)
-    if variance < LEAST_NOISE * LEAST_NOISE:
-        variance, width = LEAST_NOISE * LEAST_NOISE, 1.0 / freedom
-    return variance, min(math.log(width / math.log(MOST_NOISE / LEAST_NOISE)), 0.0)
+    if variance < MIN_NOISE * MIN_NOISE:
+        variance, width = MIN_NOISE * MIN_NOISE, 1.0 / freedom
+    return variance, min(math.log(width / math.log(MAX_NOISE / MIN_NOISE)), 0.0)
 
 
 @inner

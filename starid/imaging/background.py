@@ -15,7 +15,7 @@ from starid.jit import compiled_ieee, compiled_sums
 BLOCK_PX: Final = 32
 """Side of a block, pixels: stars cover a percent of it, and glare is nearly plane within it."""
 
-LEAST_NOISE_DN: Final = 12.0**-0.5
+MIN_NOISE_DN: Final = 12.0**-0.5
 """Standard deviation of rounding to whole counts."""
 
 _ROW_STEP: Final = 4
@@ -23,7 +23,7 @@ _FIRST_SAMPLES: Final = 16
 _CLIP_SIGMA: Final = 3.5
 _QUARTILE_SIGMA: Final = 1.349
 _ROUNDS: Final = 2
-_LEAST_SAMPLES: Final = 8.0
+_MIN_SAMPLES: Final = 8.0
 
 
 def median(values: npt.NDArray[np.floating]) -> float:
@@ -83,7 +83,7 @@ def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float
             tilt2 += inside * dx[k] * dx[k]
             lean += off * dy[k]
             lean2 += inside * dy[k] * dy[k]
-        if kept < np.float32(_LEAST_SAMPLES):
+        if kept < np.float32(_MIN_SAMPLES):
             break
         mean = total / kept
         explained = mean * mean
@@ -94,7 +94,7 @@ def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float
         if lean2 > np.float32(0.0):
             across += lean / lean2
             explained += lean * lean / (lean2 * kept)
-        sigma = np.sqrt(max(squares / kept - explained, np.float32(LEAST_NOISE_DN**2)))
+        sigma = np.sqrt(max(squares / kept - explained, np.float32(MIN_NOISE_DN**2)))
     plane[0], plane[1], plane[2], plane[3] = level, along, across, sigma
 
 

@@ -31,7 +31,7 @@ _CONVERGED_FLUX: Final = 0.01
 _SETTLED_PX: Final = 0.02
 _MAX_STEP_PX: Final = 1.0
 _FLOOR_FLUX: Final = 1e-6
-_LEAST_PIXELS: Final = 5
+_MIN_PIXELS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _FAR: Final = 5.0
 SHORT_TRAIL_PX: Final = 0.5
@@ -233,7 +233,7 @@ def fit_star(
         c_yf = a_xy * a_xf - a_xx * a_yf
         c_ff = a_xx * a_yy - a_xy * a_xy
         determinant = a_xx * c_xx + a_xy * c_xy + a_xf * c_xf
-        if sums[10] < _LEAST_PIXELS or not determinant > 0.0:
+        if sums[10] < _MIN_PIXELS or not determinant > 0.0:
             return
         scale = 1.0 / determinant
         step_x = (c_xx * b_x + c_xy * b_y + c_xf * b_f) * scale

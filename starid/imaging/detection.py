@@ -59,7 +59,7 @@ from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.windows import (
     COLUMNS,
-    LEAST_SPREAD_PX,
+    MIN_SPREAD_PX,
     SEEN_BEFORE,
     START_Y,
     WINDOW_COLUMNS,
@@ -71,9 +71,9 @@ from starid.imaging.windows import (
 Grid: TypeAlias = Array32
 Table: TypeAlias = Array
 
-LEAST_SIDE_PX: Final = 16
+MIN_SIDE_PX: Final = 16
 _ASSUMED_SIGMA_PX: Final = 0.9
-_MOST_PEAKS: Final = 8192
+_MAX_PEAKS: Final = 8192
 _HIGHER: Final = 1.5
 _STARS_FOR_A_GLANCE: Final = 12
 _STARS_FOR_SHAPE: Final = 30
@@ -82,12 +82,12 @@ _MISFITS_FOR_TRAILS: Final = 8
 _MISFIT_SHARE: Final = 0.1
 _SHAPE_WINDOW_PX: Final = 40
 _STARS_FOR_WIDTH: Final = 15
-_LEAST_FOR_WIDTH: Final = 3
+_MIN_FOR_WIDTH: Final = 3
 _TRAIL_FILTER_PX: Final = 1.5
 _OTHER_WIDTH: Final = 0.3
 _MISFIT_SIGMA: Final = 3.0
 _RELAX: Final = 0.8
-_MOST_NEIGHBOURS: Final = 64
+_MAX_NEIGHBOURS: Final = 64
 
 
 @dataclass(frozen=True)
@@ -329,7 +329,7 @@ def _checked_image(image: npt.NDArray[np.generic]) -> GreyImage:
         raise StaridError(f"image: shape must be (h, w), not {image.shape}{colour}")
     if image.dtype.kind != "u" or image.dtype.itemsize > 2:
         raise StaridError(f"image: type must be uint8 or uint16, not {image.dtype}; scale it to counts first")
-    if min(image.shape) < LEAST_SIDE_PX:
+    if min(image.shape) < MIN_SIDE_PX:
         raise StaridError(f"image: must be at least 16×16 pixels, not {image.shape[1]}×{image.shape[0]}")
     return np.ascontiguousarray(image, dtype=image.dtype.newbyteorder("="))
 
@@ -367,7 +367,7 @@ def _without_hot_pixels(
     scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float
 ) -> tuple[Indices32, Grid, Table]:
     """Candidates that are more than a hot pixel, their heights, and (n, 3) the hot pixels with the sky under them."""
-    if sigma_px < LEAST_SPREAD_PX:
+    if sigma_px < MIN_SPREAD_PX:
         return peaks, heights, np.zeros((0, 3))
     sky = np.empty(len(peaks))
     sky_under_lone_pixels(scene.counts, peaks, *scene.grids, sky)
@@ -397,12 +397,12 @@ def _search(
     search: Callable[[Grid, Indices32, Grid], int], background: Background, factor: float
 ) -> tuple[Indices32, Grid]:
     """Search for peaks above `factor` times the noise, or above a higher threshold where there are too many."""
-    peaks = np.empty((_MOST_PEAKS, 2), dtype=np.int32)
-    heights = np.empty(_MOST_PEAKS, dtype=np.float32)
+    peaks = np.empty((_MAX_PEAKS, 2), dtype=np.int32)
+    heights = np.empty(_MAX_PEAKS, dtype=np.float32)
     while True:
         threshold = (background.level + np.float32(factor) * background.noise).astype(np.float32)
         count = search(threshold, peaks, heights)
-        if count < _MOST_PEAKS:
+        if count < _MAX_PEAKS:
             break
         factor *= _HIGHER
     peaks, heights = peaks[:count], heights[:count]
@@ -431,7 +431,7 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_S
     if settings.psf_sigma_px is None and shape.trail_px == 0.0:
         widths = np.empty(_STARS_FOR_WIDTH)
         fitted = spot_widths(scene.counts, tries, *scene.grids, start, scene.saturation, widths)
-        if fitted >= _LEAST_FOR_WIDTH:
+        if fitted >= _MIN_FOR_WIDTH:
             shape = dataclasses.replace(shape, sigma_px=float(np.median(widths[:fitted])), stars=fitted)
     if settings.follow_trails:
         return shape
@@ -460,7 +460,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     pixels = np.empty(total, dtype=np.float32)
     cut_windows(counts, windows, *scene.level, scene.saturation, pixels)
     first = np.empty(count + 1, dtype=np.int32)
-    neighbours = np.empty(_MOST_NEIGHBOURS * count, dtype=np.int32)
+    neighbours = np.empty(_MAX_NEIGHBOURS * count, dtype=np.int32)
     find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
     ratio = _RELAX * settings.threshold_sigma
     stars = np.zeros((count, FIT_COLUMNS))

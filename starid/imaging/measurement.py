@@ -52,7 +52,7 @@ AGAIN: Final = (1, 4)
 FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
 """Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""
 
-_LEAST_EXPLAINED: Final = 0.55
+_MIN_EXPLAINED: Final = 0.55
 _SHARP_SIGMA_PX: Final = 0.5
 _WANDER_PX: Final = 1.5
 _WING_SHARE: Final = 0.6
@@ -64,7 +64,7 @@ _AT_REST: Final = 0.5
 _STRAY_SIGMA: Final = 7.0
 _STRAY_DISTANCE_SIGMA: Final = 2.0
 FIT_PARAMETERS: Final = 3
-_LEAST_SIDE: Final = 11
+_MIN_SIDE: Final = 11
 
 
 @compiled_ieee
@@ -243,7 +243,7 @@ def _classify_fit(
     by_shape, by_pixel, total, used = explained(pixels, model)
     if sigma > _SHARP_SIGMA_PX and by_pixel > by_shape:
         return float(HOT_PIXEL)
-    if by_shape < _LEAST_EXPLAINED * (total - 2.0 * used * noise * noise):
+    if by_shape < _MIN_EXPLAINED * (total - 2.0 * used * noise * noise):
         return float(NOT_A_STAR)
     return float(GOOD)
 
@@ -329,7 +329,7 @@ def measure(
         Filled with bits `SATURATED`, `AT_EDGE`.
     """
     sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
-    largest, side = 1, _LEAST_SIDE
+    largest, side = 1, _MIN_SIDE
     for k in range(windows.shape[0]):
         if windows[k, COLUMNS] > 0.0:
             largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))

@@ -29,16 +29,16 @@ from starid.photometry import EVEN_PAIR
 _UNKNOWNS: Final = 6
 _ITERATIONS: Final = 25
 _CONVERGED_PX: Final = 2e-3
-_MOST_STEP_PX: Final = 0.4
-_MOST_CHANGE: Final = 0.5
+_MAX_STEP_PX: Final = 0.4
+_MAX_CHANGE: Final = 0.5
 _BETTER: Final = 0.5
 _HOPEFUL_STEPS: Final = 10
 """Steps within which the fit of a true pair is better than that of one star; a worse fit is then abandoned."""
 
-_LEAST_SIGNAL: Final = 6.0
-_LEAST_SHARE: Final = 0.03
+_MIN_SIGNAL: Final = 6.0
+_MIN_SHARE: Final = 0.03
 _CLOSEST_SIGMA: Final = 1.0
-_LEAST_SIDE: Final = 11
+_MIN_SIDE: Final = 11
 _PAIR_SIGMA: Final = 2.5
 _FAR_SIGMA: Final = 4.0
 _CORE_SIGMA: Final = 1.0
@@ -147,13 +147,13 @@ def fit_pair(
             for j in range(_UNKNOWNS):
                 step[i] += inverse[i, j] * right[j]
         longest = max(abs(step[0]), abs(step[1]), abs(step[3]), abs(step[4]))
-        shrink = min(1.0, _MOST_STEP_PX / max(longest, 1e-12))
+        shrink = min(1.0, _MAX_STEP_PX / max(longest, 1e-12))
         for star in range(2):
             pair[star, X] += shrink * step[3 * star]
             pair[star, Y] += shrink * step[3 * star + 1]
             flux = pair[star, FLUX]
             change = shrink * step[3 * star + 2]
-            pair[star, FLUX] = flux + min(max(change, -_MOST_CHANGE * flux), max(flux, -change))
+            pair[star, FLUX] = flux + min(max(change, -_MAX_CHANGE * flux), max(flux, -change))
             pair[star, VAR_X] = inverse[3 * star, 3 * star]
             pair[star, VAR_Y] = inverse[3 * star + 1, 3 * star + 1]
             pair[star, VAR_FLUX] = inverse[3 * star + 2, 3 * star + 2]
@@ -212,7 +212,7 @@ def _is_better(pair: Array, chi2: float, sigma: float, models: Array, pixels: Ar
     total = pair[0, FLUX] + pair[1, FLUX]
     for k in range(2):
         flux = pair[k, FLUX]
-        if flux < _LEAST_SHARE * total or flux < _LEAST_SIGNAL * math.sqrt(pair[k, VAR_FLUX]):
+        if flux < _MIN_SHARE * total or flux < _MIN_SIGNAL * math.sqrt(pair[k, VAR_FLUX]):
             return False
     # the fainter one's own light, all but one pixel's
     highest = everything = 0.0
@@ -322,7 +322,7 @@ def split_pairs(
         Number of pairs resolved as two stars.
     """
     sigma, per_dn, model_error = noise
-    largest, side = 1, _LEAST_SIDE
+    largest, side = 1, _MIN_SIDE
     for k in suspects:
         largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
         side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))

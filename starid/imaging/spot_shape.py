@@ -23,14 +23,14 @@ _PIXEL_VARIANCE: Final = 1.0 / 12.0
 _ITERATIONS: Final = 30
 _SETTLED: Final = 1e-2
 _WEIGHT_END: Final = 12.0
-_LEAST_FOR_SPOT: Final = 3
+_MIN_FOR_SPOT: Final = 3
 _ROUND_BELOW_PX: Final = 1.0
-_LEAST_SIGMA_PX: Final = 0.3
+_MIN_SIGMA_PX: Final = 0.3
 _UNEXPLAINED: Final = 0.4
 _LONG_PX: Final = 2.5
-_LEAST_LONG: Final = 6
+_MIN_LONG: Final = 6
 _AGREES: Final = 0.3
-_MOST_AGREE: Final = 0.5
+_MAX_AGREE: Final = 0.5
 
 
 @dataclass(frozen=True)
@@ -183,11 +183,11 @@ def shape_from_moments(
         Width to assume where there are too few stars.
     """
     still = np.zeros(FLOW_TERMS)
-    if len(table) < _LEAST_FOR_SPOT:
+    if len(table) < _MIN_FOR_SPOT:
         return SpotShape(known_sigma_px or assumed_sigma_px, still, 0.0, 0)
     mean, split = _mean_and_split(table)
     across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else median(mean - split)
-    across = max(across, _LEAST_SIGMA_PX**2 + _PIXEL_VARIANCE)
+    across = max(across, _MIN_SIGMA_PX**2 + _PIXEL_VARIANCE)
     # a short trail of length L makes the split L²/24
     if math.sqrt(24.0 * median(split)) > _ROUND_BELOW_PX:
         positions, trails, length = _trails(table, width, height, across)
@@ -218,13 +218,13 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
         Shape of the round objects; returned unchanged unless enough of the long ones agree on a flow.
     """
     longest = table[long_trails(table, shape.sigma_px)]
-    if len(longest) < _LEAST_LONG:
+    if len(longest) < _MIN_LONG:
         return shape
     found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
     positions, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
     off = np.array([mismatch(found.flow, positions, trails, k)[0] for k in range(len(positions))])
     agree = np.count_nonzero(off < _AGREES * length)
-    return found if found.trail_px > 0.0 and agree >= max(_LEAST_LONG, _MOST_AGREE * len(longest)) else shape
+    return found if found.trail_px > 0.0 and agree >= max(_MIN_LONG, _MAX_AGREE * len(longest)) else shape
 
 
 def _mean_and_split(table: Array) -> tuple[Array, Array]:
@@ -245,7 +245,7 @@ def _trails(table: Array, width: int, height: int, across: float) -> tuple[Array
 
 def _sigma(variance: float, known: float | None) -> float:
     """Standard deviation of the spot from its variance on pixels."""
-    return known or math.sqrt(max(variance - _PIXEL_VARIANCE, _LEAST_SIGMA_PX**2))
+    return known or math.sqrt(max(variance - _PIXEL_VARIANCE, _MIN_SIGMA_PX**2))
 
 
 @lru_cache(maxsize=1)

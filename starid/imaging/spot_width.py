@@ -18,7 +18,7 @@ _REACH_SIGMA: Final = 3.5
 _LARGEST_HALF_WIDTH: Final = 28
 _ROUNDS: Final = 8
 _STEP: Final = 0.02
-_MOST_CHANGE: Final = 0.3
+_MAX_CHANGE: Final = 0.3
 _SETTLED: Final = 0.01
 _MODEL_ERROR: Final = 0.02
 
@@ -80,7 +80,7 @@ def _one_width(
         if not determinant > 0.0:
             return math.nan
         change = (ff * bs - fs * bf) / determinant
-        change = min(max(change, -_MOST_CHANGE * sigma), _MOST_CHANGE * sigma)
+        change = min(max(change, -_MAX_CHANGE * sigma), _MAX_CHANGE * sigma)
         sigma += change
         if not NARROWEST_PX <= sigma <= WIDEST_PX:
             return math.nan

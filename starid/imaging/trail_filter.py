@@ -19,7 +19,7 @@ from starid.jit import compiled_ieee
 
 _TILE_COLUMNS: Final = 128
 _TILE_ROWS: Final = 32
-_MOST_STEPS: Final = 96
+_MAX_STEPS: Final = 96
 
 
 @compiled_ieee
@@ -67,7 +67,7 @@ def trail_steps(flow: Array, width: int, height: int) -> int:
     lengths = [
         math.hypot(*trail_at(flow, x * (width - 1), y * (height - 1), width, height)) for x, y in corners
     ]
-    return min(max(math.ceil(max(lengths)), 1), _MOST_STEPS)
+    return min(max(math.ceil(max(lengths)), 1), _MAX_STEPS)
 
 
 def sum_along_trails(image: GreyImage, flow: Array, steps: int) -> tuple[npt.NDArray[np.uint16], float]:

@@ -21,11 +21,11 @@ from starid.jit import compiled_ieee
 FLOW_TERMS: Final = 5
 _TRANSLATION: Final = 2
 _WITH_ROLL: Final = 3
-_LEAST_FOR_ROLL: Final = 5
-_LEAST_FOR_FLOW: Final = 12
+_MIN_FOR_ROLL: Final = 5
+_MIN_FOR_FLOW: Final = 12
 _STARTS_FROM: Final = 7
 _CLIP: Final = 3.0
-_LEAST_CLIP_PX: Final = 0.1
+_MIN_CLIP_PX: Final = 0.1
 _ROUNDS: Final = 4
 _SINGULAR: Final = 1e-12
 
@@ -165,12 +165,12 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
                 if left < least:
                     least = left
                     flow[:] = start
-    used = _TRANSLATION if count < _LEAST_FOR_ROLL else _WITH_ROLL if count < _LEAST_FOR_FLOW else FLOW_TERMS
+    used = _TRANSLATION if count < _MIN_FOR_ROLL else _WITH_ROLL if count < _MIN_FOR_FLOW else FLOW_TERMS
     off = np.empty(count)
     for _ in range(_ROUNDS):
         for k in range(count):
             off[k], senses[k] = mismatch(flow, positions, trails, k)
-        limit = max(_CLIP * np.median(off), _LEAST_CLIP_PX)
+        limit = max(_CLIP * np.median(off), _MIN_CLIP_PX)
         kept = 0
         for k in range(count):
             if off[k] > limit:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starid.arrays import Array, Array32, GreyImage, Indices32
-from starid.imaging.background import LEAST_NOISE_DN, interpolate_at
+from starid.imaging.background import MIN_NOISE_DN, interpolate_at
 from starid.imaging.trail_flow import trail_at
 from starid.jit import compiled_ieee
 
@@ -36,13 +36,13 @@ sky and noise of a pixel (counts); half-width of its saturated patch; its trail;
 LARGEST_HALF_WIDTH: Final = 40
 """Half-width of a window at most, pixels."""
 
-MOST_SATURATED: Final = 400
+MAX_SATURATED: Final = 400
 """Least number of connected saturated pixels of an object that is not a star."""
 
 PATCH_REACH: Final = 40
 """Largest distance of the saturated patch of a star from its peak, pixels."""
 
-LEAST_SPREAD_PX: Final = 0.5
+MIN_SPREAD_PX: Final = 0.5
 """Standard deviation of a spot from which the light of a star reaches more than one pixel."""
 
 EXTENDED: Final = -1.0
@@ -51,14 +51,14 @@ NO_ROOM: Final = -3.0
 ONE_PIXEL: Final = -4.0
 """Values of COLUMNS for candidates without a window."""
 
-_MOST_PATCHES: Final = 1000
+_MAX_PATCHES: Final = 1000
 _RING_PIXELS: Final = 48
 _RING_SHIFT_SIGMA: Final = 0.6
 _BLOCK_OF_MORE_THAN_SKY: Final = 1.5
 _RING_OF_MORE_THAN_SKY: Final = 2.0
 _QUARTILE_SIGMA: Final = 1.349
-_LEAST_REACH_SIGMA: Final = 2.5
-_MOST_REACH_SIGMA: Final = 6.0
+_MIN_REACH_SIGMA: Final = 2.5
+_MAX_REACH_SIGMA: Final = 6.0
 _VISIBLE_NOISE: Final = 0.33
 _ALONE_SIGMA: Final = 8.0
 _ALONE_SHARE: Final = 0.125
@@ -69,7 +69,7 @@ def light_radius(sigma: float, flux: float, noise: float) -> int:
     """Half-width of the square in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
     peak = flux / (2.0 * math.pi * sigma * sigma)
     ratio = max(peak / (_VISIBLE_NOISE * noise), 1.0)
-    reach = max(_LEAST_REACH_SIGMA, min(math.sqrt(2.0 * math.log(ratio)), _MOST_REACH_SIGMA))
+    reach = max(_MIN_REACH_SIGMA, min(math.sqrt(2.0 * math.log(ratio)), _MAX_REACH_SIGMA))
     return min(max(math.ceil(reach * sigma + 0.5), 2), LARGEST_HALF_WIDTH)
 
 
@@ -146,7 +146,7 @@ def _saturated_patch(
         waiting -= 1
         column, row = stack[waiting, 0], stack[waiting, 1]
         count += 1
-        if count >= MOST_SATURATED or max(abs(column - x), abs(row - y)) >= PATCH_REACH:
+        if count >= MAX_SATURATED or max(abs(column - x), abs(row - y)) >= PATCH_REACH:
             return False
         total_x += column
         total_y += row
@@ -188,7 +188,7 @@ def _sky_under(
         noise = max(spread, typical_noise)
     elif spread > _RING_OF_MORE_THAN_SKY * noise:
         noise = spread
-    if abs(around - base) > _RING_SHIFT_SIGMA * noise + 0.5 * LEAST_NOISE_DN:
+    if abs(around - base) > _RING_SHIFT_SIGMA * noise + 0.5 * MIN_NOISE_DN:
         base = around
     return base, noise
 
@@ -281,8 +281,8 @@ def lay_windows(
         circle[0, k] = math.cos(2.0 * math.pi * k / _RING_PIXELS)
         circle[1, k] = math.sin(2.0 * math.pi * k / _RING_PIXELS)
     seen = np.empty((2 * PATCH_REACH + 1, 2 * PATCH_REACH + 1), np.uint8)
-    stack = np.empty((2 * MOST_SATURATED, 2), np.int32)
-    patches = np.empty((_MOST_PATCHES, 7))
+    stack = np.empty((2 * MAX_SATURATED, 2), np.int32)
+    patches = np.empty((_MAX_PATCHES, 7))
     patch_count = 0
     total = 0
     for k in range(peaks.shape[0]):
@@ -297,7 +297,7 @@ def lay_windows(
             if not _saturated_patch(image, column, row, saturation, seen, stack, patch):
                 window[COLUMNS] = EXTENDED
                 continue
-            patch_count = min(patch_count + 1, _MOST_PATCHES - 1)
+            patch_count = min(patch_count + 1, _MAX_PATCHES - 1)
         x, y, extra = patch[0], patch[1], patch[2]
         trail_x, trail_y = trail_at(flow, x, y, width, height)
         radius = light_radius(sigma, float(flux[k]), typical_noise)
@@ -314,7 +314,7 @@ def lay_windows(
             typical_noise,
         )
         window[BASE] = sky_level
-        if sigma >= LEAST_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
+        if sigma >= MIN_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
             window[COLUMNS] = ONE_PIXEL
             continue
         left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)

@@ -41,7 +41,7 @@ CELLS: Final = 60
 NARROWEST_DEG: Final = 1.0
 """Narrowest field: a square one of this width has three stars of Hipparcos on average."""
 
-MOST_AT_ONCE: Final = 500
+MAX_AT_ONCE: Final = 500
 """Most detections used in one attempt."""
 
 WINDOW_PX: Final = 20.0
@@ -146,7 +146,7 @@ class RoughSearch:
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
         """All attempts, the cheap ones first."""
         brightest = np.argsort(-flux, kind="stable")
-        choices = [brightest[:MOST_AT_ONCE]]
+        choices = [brightest[:MAX_AT_ONCE]]
         choices += [even_choice(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
         known_lens = any(self._first.camera.distortion)
         for number in rounds:

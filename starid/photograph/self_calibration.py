@@ -47,7 +47,7 @@ attitude, and stays at the image's centre."""
 
 _ROUNDS: Final = 4
 _WINDOW_SIGMAS: Final = 5.0
-_LEAST_WINDOW_PX: Final = 1.0
+_MIN_WINDOW_PX: Final = 1.0
 _SIGMA_FLOOR_PX: Final = 0.02
 _MAGNITUDE_MARGIN: Final = 0.3
 _BLEND_PX: Final = 2.0
@@ -235,7 +235,7 @@ def _paired(
     xy, inside = camera.project(attitude.to_sensor(sky.vectors[near]))
     near, xy = near[inside], xy[inside]
     measured = np.asarray(stars.xy_px, dtype=np.float64)
-    window = max(_WINDOW_SIGMAS * sigma_px, _LEAST_WINDOW_PX)
+    window = max(_WINDOW_SIGMAS * sigma_px, _MIN_WINDOW_PX)
     distance, of_catalog = cKDTree(xy).query(measured, distance_upper_bound=window)
     _, of_detection = cKDTree(measured).query(xy)
     chosen = np.flatnonzero(np.isfinite(distance))

@@ -16,13 +16,13 @@ import numpy as np
 from starid.arrays import GreyImage
 from starid.imaging.detection import Detections, DetectionSettings, detect
 
-MOST_STARS: Final = 2000
+MAX_STARS: Final = 2000
 """Most detections of each view."""
 
 FACTORS: Final = (2, 4)
 """Pixels along each axis that are averaged for the coarser views."""
 
-LEAST_SIDE_PX: Final = 180
+MIN_SIDE_PX: Final = 180
 """Least side of a coarser view."""
 
 _FAR_SIGMAS: Final = 4.0
@@ -45,15 +45,15 @@ def views(image: GreyImage, settings: DetectionSettings | None = None) -> Iterat
     image : ndarray (h, w) of uint8 or uint16
         Grey.
     settings : DetectionSettings, optional
-        For the detection; by default `max_stars` is `MOST_STARS`.
+        For the detection; by default `max_stars` is `MAX_STARS`.
     """
-    chosen = settings or DetectionSettings(max_stars=MOST_STARS)
+    chosen = settings or DetectionSettings(max_stars=MAX_STARS)
     plain = detect(image, chosen)
     yield View(plain)
     if has_dark_tail(image):
         yield View(detect(np.invert(image), chosen))
     for factor in FACTORS:
-        if min(image.shape) >= factor * LEAST_SIDE_PX:
+        if min(image.shape) >= factor * MIN_SIDE_PX:
             yield View(_coarser(image, factor, chosen))
     yield View(plain, mirrored=True)
 

@@ -20,7 +20,7 @@ DICTIONARY_SIDE: Final = 3
 DICTIONARY_SIZE: Final = DICTIONARY_SIDE * DICTIONARY_SIDE
 """Cells in a dictionary: the nearest one and its neighbours."""
 
-MOST_CELLS: Final = 200_000_000
+MAX_CELLS: Final = 200_000_000
 """Most frames of a grid, counted as if no circle of declination were shorter than the equator: 1.2 GB of features."""
 
 _FULL_TURN: Final = 360.0
@@ -176,9 +176,9 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
     if not (math.isfinite(fov_deg) and 0.0 < fov_deg <= 120.0):
         raise GridError(f"grid: a frame {fov_deg}° wide is not possible; give more than 0° and at most 120°")
     step = fov_deg * (1.0 - overlap)
-    if not MOST_CELLS * step**2 >= _FULL_TURN * 180.0:
+    if not MAX_CELLS * step**2 >= _FULL_TURN * 180.0:
         raise GridError(
-            f"grid: frames {fov_deg}° wide that overlap by {100.0 * overlap:.9g} % are more than {MOST_CELLS} all over the "
+            f"grid: frames {fov_deg}° wide that overlap by {100.0 * overlap:.9g} % are more than {MAX_CELLS} all over the "
             "sky; give less overlap or wider frames"
         )
     if geometry == "planar":

@@ -17,7 +17,7 @@ _MAX_COUPLES: Final = 40_000
 _MAX_HYPOTHESES: Final = 300
 _ENOUGH: Final = 0.45
 _GATE: Final = 4.5
-_LEAST_PAIR: Final = 15.0
+_MIN_PAIR: Final = 15.0
 
 
 @compiled
@@ -185,7 +185,7 @@ def find_motion(
     sizes = (MAX_VOTERS * MAX_VOTERS, MAX_VOTERS * MAX_VOTERS)
     first = (np.empty(sizes[0]), np.empty(sizes[0]), np.empty((sizes[0], 2), dtype=np.int64))
     second = (np.empty(sizes[1]), np.empty(sizes[1]), np.empty((sizes[1], 2), dtype=np.int64))
-    least = max(_LEAST_PAIR * sigma, 0.05)
+    least = max(_MIN_PAIR * sigma, 0.05)
     counts = (
         _pairs(before, brightness_before, least, first[0], first[1], first[2]),
         _pairs(now, brightness_now, least, second[0], second[1], second[2]),

@@ -25,7 +25,7 @@ MIN_SAMPLES_SHARE: Final = 0.5
 MAX_OBJECTS: Final = 48
 """Most objects in a frame: 1 128 pairs, 1 272 384 disparities."""
 
-_MOST_BINS: Final = 1_048_576
+_MAX_BINS: Final = 1_048_576
 
 
 def pair_count(objects: int) -> int:
@@ -144,8 +144,8 @@ def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indic
     width = points[:, 1].max() - points[:, 1].min()
     height = points[:, 2].max() - points[:, 2].min()
     # a little wider than ε, as the quotient of a point on a bin's edge may round either way
-    side = max(1.000001 * epsilon, math.sqrt((width + epsilon) * (height + epsilon) / _MOST_BINS))
-    side = max(side, max(width, height) / _MOST_BINS)
+    side = max(1.000001 * epsilon, math.sqrt((width + epsilon) * (height + epsilon) / _MAX_BINS))
+    side = max(side, max(width, height) / _MAX_BINS)
     order = np.empty(n, dtype=np.int64)
     shape = np.empty(2, dtype=np.int64)
     where, start = _bin_points(points, side, order, shape)

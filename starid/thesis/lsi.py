@@ -34,7 +34,7 @@ Solver = Literal["exact", "matlab", "sklearn"]
 _WHOLE_SKY_DEG: Final = 720.0
 _CODES_PER_RADIAN: Final = 255.0 / (2.0 * math.pi)
 _RESULT_SIZE: Final = 16
-_LEAST_WEIGHT: Final = 1e-3
+_MIN_WEIGHT: Final = 1e-3
 
 RA, DEC, THETA, ERROR, LAMBDA, BORESIGHT, POINTER = 1, 2, 3, 4, 5, 6, 9
 """Places in a row of results after Σω: α, δ (degrees), θ (radians), ε_ψ, λ, boresight and pointer vectors."""
@@ -278,7 +278,7 @@ def estimate_from_path(
         result = work.results[row]
         omega[:] = path[chosen[row]]
         total = omega.sum()
-        if total < _LEAST_WEIGHT:
+        if total < _MIN_WEIGHT:
             for j in range(9):
                 omega[j] = 1.0 if work.cells[j] == cell else 0.0
             total = 1.0

@@ -41,9 +41,9 @@ STARS_PER_FIELD: Final = 60
 WINDOW_PX: Final = 12.0
 """Window in which a candidate is verified, pixels."""
 
-_FEWEST_STARS: Final = 5
+_MIN_STARS: Final = 5
 _MAGNITUDE_GATE: Final = 0.8
-_MOST_VOTERS: Final = 60
+_MAX_VOTERS: Final = 60
 _ZERO_POINT_STEPS: Final = (0.0, 0.15, -0.15, 0.3, -0.3, 0.5, -0.5)
 _ZERO_POINT_STAR: Final = 25
 _BLEND_PX: Final = 2.0
@@ -52,7 +52,7 @@ _SPREAD: Final = 0.8
 _SPOTS_PER_BAND: Final = 100_000.0
 _STAGES: Final = (200, 3000)
 _OFFSET_SHARE: Final = 0.055
-_FEWEST_VOTES: Final = 6.0
+_MIN_VOTES: Final = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +221,7 @@ class LsiIdentifier(VerifiedIdentifier):
     def warm_up(self) -> None:
         """Compile, or load, the kernels, so that the first real frame is not late."""
         self.verifier.warm_up()
-        xy = self._camera.border(4)[:_FEWEST_STARS] * 0.25 + 0.375 * np.array(
+        xy = self._camera.border(4)[:_MIN_STARS] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
         self._first_verified(Measured.of(xy, np.ones(len(xy))), [0.0])
@@ -263,7 +263,7 @@ class LsiIdentifier(VerifiedIdentifier):
             return [self._given_zero_point]
         shown = [] if self._zero_point is None else [self._zero_point]
         bright = np.sort(flux[flux > 0.0])[::-1]
-        if bright.size < _FEWEST_STARS:
+        if bright.size < _MIN_STARS:
             return shown
         rank = min(_ZERO_POINT_STAR, bright.size) - 1
         guess = self._star_magnitude + 2.5 * math.log10(float(bright[rank]))
@@ -271,7 +271,7 @@ class LsiIdentifier(VerifiedIdentifier):
 
     def learn(self, solution: Solution, flux: Array) -> None:
         """Take the zero point that the matched stars of a valid answer show, where none was given."""
-        if self._given_zero_point is None and solution.star_count >= _FEWEST_STARS:
+        if self._given_zero_point is None and solution.star_count >= _MIN_STARS:
             magnitudes = self._catalog.v[solution.catalog_index]
             found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
             self._zero_point = float(np.median(found))
@@ -291,7 +291,7 @@ class LsiIdentifier(VerifiedIdentifier):
     def features(self, field: FieldStars) -> FeatureVector | None:
         """Feature vector of the stars above the brightness limit; None if there are too few."""
         bright = field.magnitude <= self.database.parameters.kappa
-        if np.count_nonzero(bright) < _FEWEST_STARS:
+        if np.count_nonzero(bright) < _MIN_STARS:
             return None
         return extract_features(field.magnitude[bright], field.place[bright])
 
@@ -345,10 +345,10 @@ class LsiIdentifier(VerifiedIdentifier):
 
         The last item has no attitude unless the last candidate gave one.
         """
-        voters = min(field.magnitude.size, _MOST_VOTERS)
+        voters = min(field.magnitude.size, _MAX_VOTERS)
         observed = np.column_stack([field.place[:voters], field.magnitude[:voters]])
         sky = self.database.sky
-        settings = np.array([self._offset_px, _MAGNITUDE_GATE, _VOTE_SHARE, _FEWEST_VOTES])
+        settings = np.array([self._offset_px, _MAGNITUDE_GATE, _VOTE_SHARE, _MIN_VOTES])
         matched = np.empty((voters, 2), dtype=np.int64)
         start = 0
         while start < len(candidates):

@@ -19,7 +19,7 @@ from starid.thesis.rsi_memory import AnswerMemory, Prediction
 
 Mode = Literal["lsi", "rsi"]
 
-_FEWEST_VOTES: Final = 2
+_MIN_VOTES: Final = 2
 
 
 class RsiError(StaridError):
@@ -240,7 +240,7 @@ class RecursiveIdentification:
 
     def _trusts(self, predicted: Prediction) -> bool:
         """Whether the region around a prediction is searched: not after a doubtful frame, unless several answers agree."""
-        return not self._searches_all or predicted.votes >= _FEWEST_VOTES
+        return not self._searches_all or predicted.votes >= _MIN_VOTES
 
     def _voted(self, estimate: LsiEstimate, features: FeatureVector) -> tuple[LsiEstimate, float]:
         """Remember a valid answer; return answer and roll: with a memory, those that most answers agree on."""
@@ -250,7 +250,7 @@ class RecursiveIdentification:
         elif self.settings.memory == 0:
             self._memory.clear()
         agreed = self._memory.prediction() if self.settings.memory > 0 else None
-        if agreed is None or agreed.votes < _FEWEST_VOTES:
+        if agreed is None or agreed.votes < _MIN_VOTES:
             return estimate, roll
         theta = math.remainder(math.radians(features.theta_deg - agreed.roll_deg), 2.0 * math.pi)
         voted = replace(

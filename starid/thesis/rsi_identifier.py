@@ -25,7 +25,7 @@ from starid.thesis.lsi_identifier import WINDOW_PX, FieldStars, LsiIdentifier, L
 from starid.thesis.rsi import RsiSettings, region_side
 from starid.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings
 
-_FEWEST_MATCHES: Final = 3
+_MIN_MATCHES: Final = 3
 _SPOT_DEG: Final = 1.0
 
 
@@ -190,7 +190,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         if before is None:
             return everything, self._settings.gamma_min_deg
         result = self._filter(before, frame)
-        if result.matches.shape[0] < _FEWEST_MATCHES:
+        if result.matches.shape[0] < _MIN_MATCHES:
             return everything, self._settings.gamma_min_deg
         motion = matched_motion(before, frame, result.matches)
         if motion is None:

@@ -25,10 +25,10 @@ MAX_OBJECTS: Final = 2000
 """Most objects of a frame."""
 
 _REFITS: Final = 3
-_LEAST_OBJECTS: Final = 2
-_LEAST_SCORE: Final = 2.0
+_MIN_OBJECTS: Final = 2
+_MIN_SCORE: Final = 2.0
 _SCATTER_FRAMES: Final = 3
-_LEAST_SPREAD: Final = 0.5
+_MIN_SPREAD: Final = 0.5
 _SUMS: Final = 11
 _FADING: Final = 0.95
 _MOTION_NOISE: Final = 0.05
@@ -72,7 +72,7 @@ class TrackFilterSettings:
     def __post_init__(self) -> None:
         if not (self.position_sigma_deg > 0.0 and self.brightness_sigma > 0.0 and self.gate > 0.0):
             raise FilterError("filter: the errors of position and brightness and the gate must be positive")
-        if self.history < 1 or self.confirm < _LEAST_OBJECTS:
+        if self.history < 1 or self.confirm < _MIN_OBJECTS:
             raise FilterError(
                 "filter: a star is remembered for one frame at least and confirmed by two at least"
             )
@@ -184,7 +184,7 @@ class TrackFilter:
         motion = self._find_motion(positions, brightness)
         if motion is None:
             fresh = self._new_tracks(positions, brightness)
-            self._tracks = self._tracks.joined(fresh) if len(frame) < _LEAST_OBJECTS else fresh
+            self._tracks = self._tracks.joined(fresh) if len(frame) < _MIN_OBJECTS else fresh
             self._suspect = np.zeros(len(self._tracks), dtype=np.bool_)
             return TrackResult(np.zeros(len(frame), dtype=np.bool_), fresh.number, None)
         partner = self._associate(positions, brightness, motion)
@@ -233,7 +233,7 @@ class TrackFilter:
     def _find_motion(self, positions: Array, brightness: Array) -> Array | None:
         """Motion since the frame before, from the objects seen most often and the brightest; None if none fits."""
         tracks, settings = self._tracks, self.settings
-        if len(tracks) < _LEAST_OBJECTS or brightness.size < _LEAST_OBJECTS:
+        if len(tracks) < _MIN_OBJECTS or brightness.size < _MIN_OBJECTS:
             return None
         voters = np.lexsort((tracks.brightness, -np.minimum(tracks.seen, 2)))[:MAX_VOTERS]
         brightest = np.argsort(brightness, kind="stable")[:MAX_VOTERS]
@@ -249,7 +249,7 @@ class TrackFilter:
             settings.max_shift_deg,
             motion,
         )
-        return motion if score >= _LEAST_SCORE else None
+        return motion if score >= _MIN_SCORE else None
 
     def _associate(self, positions: Array, brightness: Array, motion: Array) -> Indices:
         """Match tracks and objects and refine the motion in place; the object of each track, −1 for none."""
@@ -271,13 +271,13 @@ class TrackFilter:
                 partner,
             )
             chosen = partner >= 0
-            if np.count_nonzero(chosen & trusted) > _LEAST_OBJECTS:
+            if np.count_nonzero(chosen & trusted) > _MIN_OBJECTS:
                 chosen &= trusted
             objects = positions[np.maximum(partner, 0)]
             if turn > 0:
                 distance = np.hypot(*(objects - predicted).T) / np.sqrt(variance)
                 near = chosen & (distance <= _TRIM * max(float(np.median(distance[chosen])), 1.0))
-                chosen = near if np.count_nonzero(near) > _LEAST_OBJECTS else chosen
+                chosen = near if np.count_nonzero(near) > _MIN_OBJECTS else chosen
             if rigid_fit(tracks.position, objects, chosen, motion):
                 arm = np.sum((tracks.position - tracks.position[chosen].mean(axis=0)) ** 2, axis=1)
                 share = 1.0 / np.count_nonzero(chosen) + arm / max(float(arm[chosen].sum()), 1e-12)
@@ -312,13 +312,13 @@ class TrackFilter:
         tracks = self._tracks
         result = np.zeros(len(tracks), dtype=np.bool_)
         old = np.flatnonzero(tracks.seen >= _SCATTER_FRAMES)
-        if old.size <= _LEAST_OBJECTS:
+        if old.size <= _MIN_OBJECTS:
             return result
         n, t, tt, x, y, xx, tx, ty, u, v, uu = tracks.sums[old].T
         as_star = np.maximum(xx - (x * x + y * y) / n, 0.0)
         as_fixed = np.maximum(uu - (u * u + v * v) / n, 0.0)
         usual = max(self.settings.position_sigma_deg**2, float(np.median(as_star / (2.0 * n))))
-        spread = np.maximum(tt - t * t / n, _LEAST_SPREAD)
+        spread = np.maximum(tt - t * t / n, _MIN_SPREAD)
         velocity = np.column_stack([tx - t * x / n, ty - t * y / n]) / spread[:, None]
         velocity -= np.median(velocity, axis=0)
         drift = np.sum(velocity**2, axis=1) * spread / usual

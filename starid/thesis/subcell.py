@@ -27,7 +27,7 @@ _DIFFERENCE_DEG = 1e-4
 _MAX_STEPS = 8
 _CONVERGED_DEG = 1e-7
 _AGREED = 1e-12
-_MOST_STARS = 2048
+_MAX_STARS = 2048
 _NEAR = 0.0075
 _SEEN = 0.9
 _NO_STARS = np.empty((0, 2))
@@ -172,7 +172,7 @@ def subcell_kernel(
     of stars seen.
     """
     compares = positions.shape[0] > 0
-    found = np.empty((_MOST_STARS if compares else 0, 3))
+    found = np.empty((_MAX_STARS if compares else 0, 3))
     rows = np.empty(found.shape[0], dtype=np.int64)
     most = -1.0
     stored_neighbours(index, observation * 2.55, distances, cells)

@@ -13,7 +13,7 @@ from starid.thesis.experiments.rsi_parts import BY_TABLE, FIELDS, LSI_ONLY, SETT
 
 _SHOWN: Final = 40
 _LEAST: Final = 1e-4
-_MOST_MS: Final = 1.0
+_MAX_MS: Final = 1.0
 
 
 def rsi_figures(context: Context, results: Mapping[str, Results]) -> list[str]:
@@ -154,7 +154,7 @@ def _run_times(context: Context, results: Mapping[str, Results]) -> str:
             lines += right.plot(frames, numbers["lasso_ms"], "k:", label="LASSO / ms (right)")
             axis.set(title=f"μ = f = {factor}, τ = {tau:g}", ylim=(0.0, 4.0))
             right.grid(visible=False)
-            right.set_ylim(0.0, _MOST_MS)
+            right.set_ylim(0.0, _MAX_MS)
             if (i, j) == (0, 0):
                 fig.legend(handles=lines, loc="outside lower center", ncols=4)
     for axis in axes[-1]:

@@ -12,7 +12,7 @@ from starid.classic import grid, oriented_svd, svd
 from starid.classic.agreement import largest_group
 from starid.classic.log_polar import _strings
 from starid.classic.neighbours import neighbour_list
-from starid.classic.pairs import MOST_STARS, pair_table, pairs_within
+from starid.classic.pairs import MAX_STARS, pair_table, pairs_within
 from starid.classic.subgraph import simplest_size
 from starid.errors import StaridError
 
@@ -47,7 +47,7 @@ def test_a_pair_table_of_equal_distances_or_none_is_searched_too() -> None:
 
 def test_more_stars_than_16_bits_can_name_are_rejected() -> None:
     with pytest.raises(StaridError, match="brighter limit"):
-        pair_table(np.zeros((MOST_STARS + 1, 3)), 0.1)
+        pair_table(np.zeros((MAX_STARS + 1, 3)), 0.1)
 
 
 @pytest.mark.parametrize("seed", range(4))

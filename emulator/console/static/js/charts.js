@@ -5,7 +5,7 @@ import { fixed, make } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
 const WINDOWS = [[60, "1 min"], [300, "5 min"], [900, "15 min"], [3600, "1 h"]];
-const MOST_POINTS = 900;
+const MAX_POINTS = 900;
 const REDRAW_MS = 200;
 const NICE = [1, 1.5, 2, 3, 5, 7, 10];
 
@@ -269,12 +269,12 @@ export class Charts {
   }
 }
 
-// Rows of the window in groups [first, last], at most MOST_POINTS of them.
+// Rows of the window in groups [first, last], at most MAX_POINTS of them.
 function pick(rows, from, to) {
   if (!rows.length) return [];
   const first = rows.find(from);
   const last = rows.find(to);
-  const size = Math.max(1, Math.ceil((last - first + 1) / MOST_POINTS));
+  const size = Math.max(1, Math.ceil((last - first + 1) / MAX_POINTS));
   const groups = [];
   for (let begin = first - (first % size); begin <= last; begin += size) groups.push([Math.max(begin, rows.start), Math.min(begin + size - 1, last)]);
   return groups.filter((group) => group[1] >= group[0]);

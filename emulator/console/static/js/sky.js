@@ -4,7 +4,7 @@ import { fixed, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
 const HOVER_PX = 14;
-const MOST_ZOOM = 16;
+const MAX_ZOOM = 16;
 
 export class Sky {
   constructor(store) {
@@ -77,7 +77,7 @@ export class Sky {
 
   zoomAt(x, y, factor) {
     const before = this.scale();
-    this.zoom = Math.min(Math.max(this.zoom * factor, 1), MOST_ZOOM);
+    this.zoom = Math.min(Math.max(this.zoom * factor, 1), MAX_ZOOM);
     const after = this.scale();
     this.offset[0] += x / before - x / after;
     this.offset[1] += y / before - y / after;
