@@ -29,7 +29,7 @@ class WireLog(ABC):
 
     @abstractmethod
     def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:
-        """Return one line without its end."""
+        """Format one line, without the newline."""
 
     def sent(self, item: bytes | CanFrame) -> None:
         """Log an item at the moment that it is handed to the transport."""
@@ -40,7 +40,7 @@ class WireLog(ABC):
         self._write("RX", item)
 
     def note(self, text: str) -> None:
-        """Write a comment line, where the format has such a thing."""
+        """Write a comment line; a format without comments drops it."""
         line = self._comment(self._now(), text)
         if line is not None and not self._file.closed:
             self._file.write(line + "\n")

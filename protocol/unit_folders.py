@@ -15,7 +15,7 @@ UNITS_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "unit
 """Folder of the bundled units."""
 
 SKELETON: Final = UNITS_FOLDER.parent / "new_unit.toml"
-"""Definition from which a user's own begins."""
+"""Template that `starhil unit new` copies."""
 
 
 def bundled_units() -> list[str]:
@@ -24,7 +24,7 @@ def bundled_units() -> list[str]:
 
 
 def find_unit(name_or_folder: str | Path) -> Path:
-    """Return the folder of a unit: an existing folder or file, else a bundled unit's.
+    """Return the path of a unit: a bundled unit by name, else an existing folder or TOML file.
 
     Raises IcdError that offers similar names.
     """

@@ -11,7 +11,7 @@ A message is a block of text lines that ends with ``[ENDMSG]``::
 
 ``qn`` is an attitude quaternion J2000 → body, scalar last: the conjugate of that used here. ``wn`` is the
 body rate in the body frame, rad/s. ``PosN`` and ``VelN`` belong to the reference orbit, to which
-``SC[0].PosR`` and ``VelR`` are added. Older versions of 42 write no brackets, and ``qn`` of bodies only. 42
+``SC[0].PosR`` and ``VelR`` are added. Older versions of 42 write no brackets, and only ``SC[0].B[0].qn``. 42
 waits for four bytes, ``Ack`` and a zero, after each message if its blocking is on.
 """
 
@@ -69,7 +69,7 @@ class Format42:
         quaternion = _vector(values, 4, f"{body}.qn", f"{body}.B[0].qn")
         rate = _vector(values, 3, f"{body}.B[0].wn", f"{body}.wn")
         if quaternion is None or rate is None:
-            raise FeedError(f"no {body}.{'qn' if quaternion is None else 'wn'}; {_PREFIXES}")
+            raise FeedError(f"no {body}.{'qn' if quaternion is None else 'B[0].wn'}; {_PREFIXES}")
         if self._first_ns is None:
             self._first_ns = time_ns
         position = _sum(_vector(values, 3, f"{self._orbit}.PosN"), _vector(values, 3, f"{body}.PosR"))

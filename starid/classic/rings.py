@@ -3,7 +3,7 @@
 The distances from a star to its neighbours, quantised into rings, make a binary vector that no rotation changes. A look-up table
 leads from each ring to the guide stars that have a neighbour in it; every ring of an observed star is a vote for them.
 
-own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.3 px of 937 each).
+own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.2 px of 937 each).
 """
 
 from __future__ import annotations

@@ -67,9 +67,9 @@ class AnswerMemory:
         answers[:, _X : _Y + 1] = motion.apply(answers[:, _X : _Y + 1])
 
     def prediction(self) -> Prediction | None:
-        """Return the prediction that most answers agree on, the latest of several, or None without answers.
+        """Return the prediction that most answers agree on, of equal ones the latest; None without answers.
 
-        The rolls, each carried forward with the motion, are voted on first, as the motion in the sky depends on them.
+        The roll comes first, as the motion in the sky depends on it: a median about the roll that is nearest to all others.
         """
         answers = self._answers
         if answers.shape[0] == 0:

@@ -55,6 +55,7 @@ def page(browser, emulator):
     opened.on("pageerror", lambda error: said.append(str(error)))
     opened.goto(emulator.ready["view"])
     opened.wait_for_selector("#link[data-state=connected]")
+    opened.wait_for_function("() => starhil.store.hello")
     yield opened
     opened.close()
     assert said == []

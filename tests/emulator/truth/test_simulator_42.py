@@ -59,7 +59,7 @@ def test_time_counts_from_the_first_block_to_the_nanosecond_over_the_turn_of_a_y
         (b"TIME", b"TAME", "no line TIME"),
         (b"[ENDMSG]", b"", r"without \[ENDMSG\]"),
         (b"qn = ", b"qm = ", r"no SC\[0\].qn; give 42 the prefixes"),
-        (b"wn = ", b"wm = ", r"no SC\[0\].wn"),
+        (b"wn = ", b"wm = ", r"no SC\[0\].B\[0\].wn"),
         (b"SC[0]", b"SC[1]", r"no SC\[0\].qn"),
         (b"qn = [", b"qn = [1 ", r"SC\[0\].qn is not 4 finite numbers"),
         (b"wn = [", b"wn = [x", "not 3 finite numbers"),

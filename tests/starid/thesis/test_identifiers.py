@@ -193,7 +193,7 @@ CAMERA_DATABASE = DatabaseParameters.for_camera(DEFAULT_CAMERA, overlap=0.9, kap
         ),
         (DatabaseParameters(overlap=0.9), 2026.0, "is planar"),
         (dataclasses.replace(CAMERA_DATABASE, direction="faintest"), 2026.0, "circles of the brightest"),
-        (dataclasses.replace(CAMERA_DATABASE, band="hp"), 2026.0, "made of hp magnitudes"),
+        (dataclasses.replace(CAMERA_DATABASE, band="hp"), 2026.0, "has hp magnitudes"),
         (CAMERA_DATABASE, 1991.25, "another catalogue or epoch"),
     ],
 )
