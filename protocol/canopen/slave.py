@@ -127,7 +127,6 @@ class CanopenSlave:
     def tick(self, now: float) -> list[CanFrame]:
         """Act on the timers that have expired."""
         self._begin(now)
-        self._end_silence()
         if self._context.state is not NmtState.INITIALISING and self._silence is None:
             for data in self.sdo.tick(now):
                 self._context.send(SDO_TRANSMIT + self.node_id, data)
@@ -230,6 +229,7 @@ class CanopenSlave:
 
     def _begin(self, now: float) -> None:
         self._context.now = now
+        self._end_silence()
         self.dictionary.new_instant()
 
     def _collect_frames(self) -> list[CanFrame]:

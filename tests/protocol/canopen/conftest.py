@@ -35,8 +35,10 @@ NODE = 0x2C
 class Bench:
     """One slave, a manual clock, and the frames and events of the slave."""
 
-    def __init__(self, node_id: int = NODE, storage: ParameterStorage | None = None, **options) -> None:
-        self.dictionary: DeviceDictionary = build_dictionary(load_unit())
+    def __init__(
+        self, node_id: int = NODE, storage: ParameterStorage | None = None, unit: str = "cubestar", **options
+    ) -> None:
+        self.dictionary: DeviceDictionary = build_dictionary(load_unit(unit))
         self.application = StandInApplication(self.dictionary.icd)
         self.dictionary.application = self.application
         self.storage = storage

@@ -165,6 +165,15 @@ def test_activated_bit_timing_makes_silence_before_and_after(bench):
     assert bench.sdo("40 00 10 00") != ""
 
 
+def test_a_frame_just_after_the_silence_is_answered_though_no_timer_has_run(bench):
+    lss(bench, "04 01")
+    lss(bench, "13 00 02")
+    assert lss(bench, "15 64 00") == []  # 100 ms
+    bench.now += 0.21
+    assert bench.sdo("40 00 10 00") != ""
+    assert bench.slave.bit_rate == 500_000
+
+
 def test_store_survives_the_power_cycle(new_bench):
     storage = MemoryStorage()
     bench = new_bench(storage=storage).power_on()

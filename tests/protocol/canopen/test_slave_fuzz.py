@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import random
 
+import pytest
+
 from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.icd import load_unit
+from starhil.protocol.unit_folders import bundled_units
 from tests.protocol.canopen.conftest import NODE, Bench
 from tests.protocol.test_fuzz import INPUTS, SEED
 
@@ -34,6 +38,7 @@ LSS_COMMANDS = (
     0x5E,
 )
 NMT_COMMANDS = (1, 2, 128, 129, 130)
+UNITS = [name for name in bundled_units() if load_unit(name).canopen is not None]
 MAX_ANSWERS = 200
 """Frames that one frame may be answered by: a block of 127 segments and what goes with it."""
 LONGEST_SILENCE_S = 2 * 65.535
@@ -68,10 +73,10 @@ def frames(source: random.Random, entries: list[tuple[int, int]]):
         yield CanFrame(identifier, b"" if remote else bytes(data), extended=extended, remote=remote)
 
 
-def test_the_slave_answers_in_order_and_survives_any_input():
+@pytest.mark.parametrize("unit", UNITS)
+def test_the_slave_answers_in_order_and_survives_any_input(unit):
     source = random.Random(SEED)
-    bench = Bench().power_on()
-    bench.show(bytes(3000))
+    bench = shown(unit)
     entries = [(item.index, item.subindex) for item in all_entries(bench)]
     for number, frame in zip(range(INPUTS), frames(source, entries), strict=False):
         bench.now += source.choice((0.0, 0.0001, 0.001, 0.02))
@@ -87,7 +92,14 @@ def test_the_slave_answers_in_order_and_survives_any_input():
                 assert len(answer.data) == 8
         bench.slave.take_events()
         if number % 1000 == 999:
-            bench = alive(bench)
+            bench = alive(bench, unit)
+
+
+def shown(unit: str) -> Bench:
+    """A slave of a unit that is on and has an image."""
+    bench = Bench(unit=unit).power_on()
+    bench.show(bytes(3000))
+    return bench
 
 
 def all_entries(bench: Bench):
@@ -96,14 +108,12 @@ def all_entries(bench: Bench):
         yield from (item.subindices.values() if hasattr(item, "subindices") else [item])
 
 
-def alive(bench: Bench) -> Bench:
+def alive(bench: Bench, unit: str) -> Bench:
     """After a node reset it boots up and answers; a slave whose node-ID changed is replaced."""
     bench.now += LONGEST_SILENCE_S
     bench.frame(0x000, bytes((0x81, NODE)))  # also puts a node-ID of LSS into force
     bench.advance(0.1)
     if bench.slave.node_id != NODE:
-        bench = Bench().power_on()
-        bench.show(bytes(3000))
-        return bench
+        return shown(unit)
     assert bench.sdo("40 00 10 00").startswith("43001000")
     return bench
