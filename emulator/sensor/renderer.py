@@ -21,6 +21,7 @@ from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_c
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import AreaLight, AreaPainter
+from starhil.emulator.sky.light_grid import Backdrop
 from starhil.emulator.sky.objects import PointSource, SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -367,11 +368,15 @@ class Renderer:
         elif area.flooded:
             self._work.fill(_FLOOD_WELLS * self.sensor.full_well_e)
         else:
-            limits = (
-                _GLARE_SHARE * self.sensor.read_noise_e,
-                _BRIGHTER * self.sensor.saturation_dn * self.sensor.gain_e_per_dn,
+            backdrop = Backdrop(
+                self._still,
+                *self._sensitivity,
+                sky_e_s=float(self._sky_e_s),
+                exposure_s=exposure_s,
+                min_glare_e=_GLARE_SHARE * self.sensor.read_noise_e,
+                saturated_e=_BRIGHTER * self.sensor.saturation_dn * self.sensor.gain_e_per_dn,
             )
-            area.draw(self._work, self._still, *self._sensitivity, float(self._sky_e_s), exposure_s, *limits)
+            area.draw(self._work, backdrop)
         return self._work
 
     def _paths(

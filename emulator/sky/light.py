@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.field import disc_in_field
-from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Sensitivity, fill, interpolated
+from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, fill, interpolated
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
 from starid.attitude import Attitude
@@ -73,20 +73,12 @@ class Patch:
         seen[inside] = self.passed[row[inside], column[inside]]
         return seen
 
-    def cover(
-        self,
-        mean: Image,
-        still: Image,
-        sensitivity: Sensitivity,
-        unit: float,
-        sky_e_s: float,
-        exposure_s: float,
-    ) -> None:
-        """Put it in front of the mean electrons (h, w), in place; `still` is of sky and dark current alone."""
-        sensed = sensitivity[self.box] * np.float32(unit * exposure_s)
-        behind, sky = mean[self.box], sensed * np.float32(sky_e_s)
+    def cover(self, mean: Image, backdrop: Backdrop) -> None:
+        """Put it in front of the mean electrons (h, w), in place."""
+        sensed = backdrop.sensitivity[self.box] * np.float32(backdrop.unit * backdrop.exposure_s)
+        behind, sky = mean[self.box], sensed * np.float32(backdrop.sky_e_s)
         if self.hides_glare:
-            dark = still[self.box] - sky
+            dark = backdrop.still[self.box] - sky
             seen = dark + (behind - dark) * self.passed
         else:
             seen = behind - sky * (1.0 - self.passed)
@@ -141,36 +133,24 @@ class AreaLight:
     def _layers(self) -> tuple[Patch | WideEarth, ...]:
         return (*self.behind, *(() if self.earth is None else (self.earth,)), *self.in_front)
 
-    def draw(
-        self,
-        mean: Image,
-        still: Image,
-        sensitivity: Sensitivity,
-        unit: float,
-        sky_e_s: float,
-        exposure_s: float,
-        least_e: float,
-        saturated_e: float,
-    ) -> None:
-        """Fill the mean electrons (h, w) with `still`, which is of sky and dark current, and all light and shadow.
+    def draw(self, mean: Image, backdrop: Backdrop) -> None:
+        """Fill the mean electrons (h, w) with the backdrop, and all light and shadow.
 
         What `mean` holds before must be finite: it stays behind a wide Earth until that is drawn.
-        `sensitivity` is in units of `unit`. Glare of less than `least_e` electrons everywhere is left out, and where the light is more than `saturated_e` it
-        need not be exact.
         """
-        glare = self.glare if self.glare is not None and exposure_s * np.max(self.glare) > least_e else None
+        glare = self.glare
+        if glare is not None and backdrop.exposure_s * np.max(glare) <= backdrop.min_glare_e:
+            glare = None
         if glare is None and self.earth is None:
-            np.copyto(mean, still)
+            np.copyto(mean, backdrop.still)
         else:
             none = np.empty((0, 0), dtype=np.float32)
             hidden = none if self.earth is None else self.earth.grid[2]
-            fill(mean, still, sensitivity, none if glare is None else glare, hidden, unit * exposure_s)
-        for patch in self.behind:
-            patch.cover(mean, still, sensitivity, unit, sky_e_s, exposure_s)
-        if self.earth is not None:
-            self.earth.cover(mean, still, sensitivity, unit, sky_e_s, exposure_s, saturated_e)
-        for patch in self.in_front:
-            patch.cover(mean, still, sensitivity, unit, sky_e_s, exposure_s)
+            exposure_s = backdrop.unit * backdrop.exposure_s
+            smooth = none if glare is None else glare
+            fill(mean, backdrop.still, backdrop.sensitivity, smooth, hidden, exposure_s)
+        for layer in self._layers:
+            layer.cover(mean, backdrop)
 
 
 def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
@@ -249,7 +229,7 @@ def _add_earth(
     Parameters
     ----------
     electrons_s, transmission : ndarray (h, w), float32
-        As in `AreaLight`.
+        `light` and `passed` of a `Patch`.
     directions : ndarray (3, h, w), float32
         Of the pixels, sensor frame.
     nadir, sun : ndarray (3,)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -16,6 +18,37 @@ Sensitivity = npt.NDArray[np.uint16]
 
 GLARE_STEP: Final = 8
 """Pixels between the points at which smooth light is computed."""
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """An exposure without bodies, and how exact their light must be.
+
+    Attributes
+    ----------
+    still : ndarray (h, w), float32
+        Mean electrons of sky and dark current.
+    sensitivity : ndarray (h, w), uint16
+        Relative signal of each pixel, in units of `unit`.
+    unit : float
+        Relative signal of a sensitivity of 1.
+    sky_e_s : float
+        Light of the sky, electrons/s in a pixel of mean sensitivity.
+    exposure_s : float
+        Length of the exposure.
+    min_glare_e : float
+        Glare of fewer electrons everywhere is left out.
+    saturated_e : float
+        Electrons above which light need not be exact.
+    """
+
+    still: Image
+    sensitivity: Sensitivity
+    unit: float
+    sky_e_s: float
+    exposure_s: float
+    min_glare_e: float = 0.0
+    saturated_e: float = math.inf
 
 
 @compiled_ieee

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Sensitivity, expand
+from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Sensitivity, expand
 from starid.jit import compiled_ieee, inner
 
 GLOW_HEIGHTS: Final = 20.0
@@ -77,30 +77,12 @@ class WideEarth:
         """Fraction of the cells of the grid that receive less than half of the sky's light."""
         return float(np.count_nonzero(self.grid[2, :-1, :-1] < 0.5) / self.grid[2, :-1, :-1].size)
 
-    def cover(
-        self,
-        mean: Image,
-        still: Image,
-        sensitivity: Sensitivity,
-        unit: float,
-        sky_e_s: float,
-        exposure_s: float,
-        saturated_e: float,
-    ) -> None:
-        """Put the Earth in front of the mean electrons (h, w), in place.
-
-        `still` is `mean` without the light of bodies, sky and dark current, and `unit` that of `sensitivity`. Cells with more than `saturated_e` electrons in
-        every pixel need no more than that.
-        """
+    def cover(self, mean: Image, backdrop: Backdrop) -> None:
+        """Put the Earth in front of the mean electrons (h, w), in place."""
         body = (self.distance, self.behind, self.brightness, self.step_rad)
-        _cover(
-            mean,
-            still,
-            sensitivity,
-            self.grid,
-            body,
-            (unit * sky_e_s * exposure_s, exposure_s, unit, saturated_e),
-        )
+        unit, exposure_s = backdrop.unit, backdrop.exposure_s
+        light = (unit * backdrop.sky_e_s * exposure_s, exposure_s, unit, backdrop.saturated_e)
+        _cover(mean, backdrop.still, backdrop.sensitivity, self.grid, body, light)
 
 
 @inner

@@ -61,7 +61,7 @@ _ROUNDING_ERROR_DEG: Final = 1e-12
 
 _PUBLISHED_CORRELATION: Final = (0.427, 0.680, 0.635, 0.999, 0.997, 0.901)
 _KINDS: Final = ("transient", "stationary", "drifting")
-_CROWD_NOTE: Final = """Counted are the true stars that were in the field in the two frames before as well, since the filter wants three sightings, and all false ones. Drifting stars that move by less than the gate from frame to frame need a few frames more to be told. The time is that of the quickest tenth of the frames, since other work on the machine adds to the rest."""
+_CROWD_NOTE: Final = """Counted are the true stars that were in the field in the two frames before as well, since the filter wants three sightings, and all false ones. Drifting stars that move by less than the gate from frame to frame need a few more frames before the filter recognises them. The time is that of the quickest tenth of the frames, since other work on the machine adds to the rest."""
 
 
 def _choice_parts(parameters: Parameters) -> list[Part]:

@@ -9,6 +9,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.light import AreaPainter
+from starhil.emulator.sky.light_grid import Backdrop
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
@@ -100,7 +101,7 @@ def test_a_wide_earth_matches_a_computation_per_pixel(
         light = AreaPainter(camera, 1.8e6, 0.8).paint(objects, ORION)
         assert (light.earth is None) == (wide_from_deg > radius_deg)
         mean = np.zeros_like(flat)
-        light.draw(mean, flat, flat.astype(np.uint16), 1.0, 1.0, 1.0, 0.0, np.inf)
+        light.draw(mean, Backdrop(flat, flat.astype(np.uint16), 1.0, sky_e_s=1.0, exposure_s=1.0))
         return mean, light.seen_at(pixels), light.covered_share
 
     mean, visible, share = painted(0.0)
@@ -117,7 +118,7 @@ def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(rend
     light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
     mean = zero.copy()
-    light.draw(mean, zero, np.ones(zero.shape, dtype=np.uint16), 1.0, 0.0, 0.2, 0.0, np.inf)
+    light.draw(mean, Backdrop(zero, np.ones(zero.shape, dtype=np.uint16), 1.0, sky_e_s=0.0, exposure_s=0.2))
     x, y = np.meshgrid(np.arange(0, 937, 3), np.arange(0, 937, 3))
     seen = camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
     chord2 = np.sum((seen - ORION.to_sensor(icrs_vector(80.0, 2.0))) ** 2, axis=1)
