@@ -47,10 +47,14 @@ STAGES: Final = ("render", "detect", "identify")
 RECORD: Final = np.dtype(
     [
         ("frame", np.int64),
-        *((name, np.float64) for name in ("dec_deg", "ra_deg", "roll_deg")),
+        ("dec_deg", np.float64),
+        ("ra_deg", np.float64),
+        ("roll_deg", np.float64),
         ("valid", np.bool_),
         ("reason", "U24"),
-        *((name, np.float64) for name in ("rate_deg_s", "cross_arcsec", "roll_arcsec")),
+        ("rate_deg_s", np.float64),
+        ("cross_arcsec", np.float64),
+        ("roll_arcsec", np.float64),
         ("normalised_squared_error", np.float64),
         ("detected", np.int32),
         ("matched", np.int32),

@@ -29,9 +29,6 @@ QUIET_NOISE_E: Final = 3.0
 """Read and rounding noise, electrons, below which the discreteness of electrons matters."""
 
 _WELL_MARGIN_SIGMA: Final = 7.0
-_FARTHEST_SIGMA: Final = 8.0
-"""More than the largest deviate that is drawn."""
-
 _LN2: Final = np.float32(0.6931471805599453)
 
 
@@ -173,11 +170,11 @@ def _digitize_kernel(
     expected: npt.NDArray[np.float32],
     state: npt.NDArray[np.uint32],
     generator: np.random.Generator,
-    levels: tuple[float, float, float, float, float, float, float, float],
+    levels: tuple[float, float, float, float, float, float, float],
     counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
 ) -> None:
     """Convert mean electrons (n,) to counts (n,); `levels` as in `digitize`."""
-    read_noise, full_well, gain_e_per_dn, offset_dn, max_dn, few, near_full, beyond = levels
+    read_noise, full_well, gain_e_per_dn, offset_dn, max_dn, few, near_full = levels
     read = np.float32(read_noise)
     read_variance = np.float32(read_noise * read_noise)
     to_dn = np.float32(1.0 / gain_e_per_dn)
@@ -194,15 +191,10 @@ def _digitize_kernel(
     uniform = np.empty(LANES, np.float32)
     normal = np.empty(BLOCK, np.float32)
     for start in range(0, expected.size, BLOCK):
+        fill_normal(state, bits_a, bits_b, uniform, normal)
         length = min(BLOCK, expected.size - start)
         mean = expected[start : start + length]
         out = counts[start : start + length]
-        if mean[0] > beyond and mean[-1] > beyond and np.min(mean) > beyond:
-            _next_bits(state, bits_a)
-            _next_bits(state, bits_b)
-            out[:] = np.int32(top)
-            continue
-        fill_normal(state, bits_a, bits_b, uniform, normal)
         for i in range(length):
             electrons = mean[i]
             variance = electrons + read_variance + tiny
@@ -252,11 +244,6 @@ def digitize(
     )
     if few < 0.0 and least_e / digitizer.gain_e_per_dn + digitizer.offset_dn > digitizer.max_dn:
         near_full = math.inf  # the converter saturates before the well: no pixel needs its own number
-    beyond = math.inf  # from here on no deviate changes a count
-    if near_full == math.inf:
-        top_e = digitizer.max_dn * digitizer.gain_e_per_dn
-        noise_e = math.sqrt(top_e + digitizer.read_noise_e**2)
-        beyond = top_e + _FARTHEST_SIGMA * noise_e + _FARTHEST_SIGMA**2
     levels = (
         digitizer.read_noise_e,
         digitizer.full_well_e,
@@ -265,7 +252,6 @@ def digitize(
         float(digitizer.max_dn),
         few,
         near_full,
-        beyond,
     )
     dtype = np.uint8 if digitizer.max_dn <= np.iinfo(np.uint8).max else np.uint16
     counts = np.empty(expected_e.shape, dtype=dtype)

@@ -2,9 +2,9 @@
 
 All directions are apparent: with light time, the observer's parallax and aberration. The Sun's place is good
 to 0.1″, the Moon's to 20″ (`erfa.moon98`), the planets' to 1.5′ (`erfa.plan94`). Magnitudes of the planets
-follow Mallama & Hilton 2018, Saturn's with its rings. The series are evaluated once a slot of time and its motion is
-interpolated: Earth, Sun and Moon on cubics through places and velocities at both ends (1 m and 20 µm/s), the planets on
-straight lines (0.01″ for Mercury).
+follow Mallama & Hilton 2018, Saturn's with its rings. The series are evaluated once per slot of ten minutes, and the
+motion within it is interpolated: Earth, Sun and Moon on cubics through places and velocities at both ends (1 m and
+20 µm/s), the planets on straight lines (0.01″ for Mercury).
 """
 
 from __future__ import annotations

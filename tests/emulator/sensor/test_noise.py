@@ -115,7 +115,7 @@ def test_the_same_seed_and_image_number_give_the_same_noise() -> None:
 
 
 def test_light_that_saturates_changes_no_count_beside_it() -> None:
-    """Pixels that no deviate can bring below the largest count are not drawn, and the noise of the others is the same."""
+    """The noise of a pixel does not depend on the light of others."""
     sky = np.full(SHAPE, 50.0, dtype=np.float32)
     lit = sky.copy()
     lit[100:300] = 8_000.0
