@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import os
 import re
+import signal
 import socket
 import subprocess
 import sys
@@ -43,14 +44,23 @@ def write_files(folder: Path, *names: str, **instead: str) -> None:
         (folder / name).write_text(text, encoding="utf-8")
 
 
-def printed(folder: Path, *command: str) -> dict[str, list[float]]:
-    """Run a program; return the numbers that it prints by the text before them."""
-    done = subprocess.run(
-        [sys.executable, *command], cwd=folder, capture_output=True, text=True, timeout=WITHIN_S,
-        env={**os.environ, "MPLBACKEND": "Agg"},
+def start(folder: Path, *command: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, *command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "MPLBACKEND": "Agg"}, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
-    lines = [re.match(r"(\D+?):? *([-\d].*|\[.*)$", line) for line in done.stdout.splitlines()]
+
+
+def printed(program: subprocess.Popen[str]) -> dict[str, list[float]]:
+    """Wait for the end of a program; return the numbers that it prints by the text before them."""
+    with program:
+        try:
+            output, errors = program.communicate(timeout=WITHIN_S)
+        except subprocess.TimeoutExpired:
+            program.kill()
+            raise
+    assert program.returncode == 0, errors
+    lines = [re.match(r"(\D+?):? *([-\d].*|\[.*)$", line) for line in output.splitlines()]
     return {
         line[1]: [float(number) for number in re.findall(r"\d+(?:\.\d+)?", line[2])] for line in lines if line
     }
@@ -69,11 +79,31 @@ def test_basilisk_in_lock_step(motion, seconds, tmp_path):
     command = emulator_command(profile=str(tmp_path / "basilisk.toml"))
     with EmulatorProcess(command) as emulator:
         write_files(tmp_path, "orbit.py", port=port, serial=emulator.ready["serial"])
-        figures = printed(tmp_path, "orbit.py", motion, str(seconds))
+        figures = printed(start(tmp_path, "orbit.py", motion, str(seconds)))
     assert figures["attitudes read"][0] > seconds - 4
     assert figures["largest error of the rate"][0] < 0.01
     assert figures["within"][1] >= 99.7
     assert (tmp_path / f"{motion}.png").read_bytes().startswith(PNG)
+
+
+@needs_basilisk
+def test_basilisk_in_real_time(tmp_path):
+    port = str(free_port())
+    write_files(tmp_path, "basilisk.toml", port=port)
+    command = emulator_command(
+        profile=str(tmp_path / "basilisk.toml"),
+        settings=["truth.lockstep=false"],
+        truth_log=tmp_path / "truth.csv",
+        extra=["--clock", "real"],
+    )
+    with EmulatorProcess(command) as emulator:
+        write_files(tmp_path, "orbit.py", "obc.py", port=port, serial=emulator.ready["serial"])
+        obc = start(tmp_path, "obc.py")
+        assert printed(start(tmp_path, "orbit.py", "tumble", "6", "--real-time")) == {}
+        obc.send_signal(signal.SIGINT)
+        figures = printed(obc)
+    assert figures["attitudes read"][0] >= 3
+    assert figures["largest error of the attitude"][0] < 20.0
 
 
 @needs_basilisk
@@ -111,14 +141,14 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
             write_files(tmp_path, "obc.py", serial=emulator.ready["serial"])
             simulator = threading.Thread(target=send_as_42, args=(server, blocks_of_42(201)), daemon=True)
             simulator.start()
-            figures = printed(tmp_path, "obc.py")
+            figures = printed(start(tmp_path, "obc.py"))
             simulator.join(WITHIN_S)
             assert not simulator.is_alive()
     assert len((tmp_path / "truth.csv").read_text().splitlines()) == 21
     assert figures["attitudes read"][0] >= 1
     assert figures["largest error of the attitude"][0] < 20.0
     assert figures["largest error of the rate"][0] < 0.01
-    assert (tmp_path / "42.png").read_bytes().startswith(PNG)
+    assert (tmp_path / "obc.png").read_bytes().startswith(PNG)
     replay = [installed_command(), "replay", str(tmp_path / "recorded")]
     done = subprocess.run(replay, capture_output=True, text=True, timeout=WITHIN_S)
     assert (done.returncode, done.stderr) == (0, "")
@@ -135,7 +165,7 @@ def test_two_heads_on_one_bus(tmp_path):
             assert emulator.ready["can.2"] == emulator.ready["can"] == bus
             assert emulator.ready["seed.2"] != emulator.ready["seed"]
             write_files(tmp_path, "heads.py", can=bus, control=str(control))
-            figures = printed(tmp_path, "heads.py")
+            figures = printed(start(tmp_path, "heads.py"))
     assert figures["attitudes read"] == [30.0, 30.0]
     assert figures["the two heads agree on the body within"][0] < 20.0
     assert (tmp_path / "heads.png").read_bytes().startswith(PNG)
