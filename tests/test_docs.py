@@ -26,6 +26,8 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sky.view import Sky
+from starhil.emulator.truth.source import TruthStatus
+from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.raw_traffic import format_frame
@@ -217,6 +219,18 @@ def test_every_link_between_documents_leads_somewhere():
                     for heading in headings
                 }
                 assert anchor in anchors, f"{file.name}: {target}"
+
+
+def test_files_and_caches_has_every_column_and_status_of_the_truth_log():
+    text = (DOCS / "files-and-caches.md").read_text(encoding="utf-8")
+    (section,) = re.findall(r"^## Truth log\n(.*?)^## ", text, re.MULTILINE | re.DOTALL)
+    names = [
+        name
+        for cell in re.findall(r"^\|([^|]*)", section, re.MULTILINE)
+        for name in re.findall(r"`(\w+)`", cell)
+    ]
+    assert names == [*COLUMNS, *(status for status in names if status in set(TruthStatus))]
+    assert set(TruthStatus) <= set(names)
 
 
 def test_the_glossary_is_in_alphabetical_order():
