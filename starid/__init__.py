@@ -1,7 +1,7 @@
 """Star catalogue, camera, detection, identification and attitude: the numerics of a star tracker.
 
-The names of the public interface stand here and are imported from their modules on first use, so that
-``import starid`` costs nothing.
+The public names are listed here and imported from their modules on first use, so that ``import starid``
+is quick.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Stellar aberration: the directions of stars as a moving observer sees them.
+"""Stellar aberration: the apparent directions of stars for a moving observer.
 
 The observer's velocity v relative to the barycentre of the solar system turns every direction towards v, by
 up to 20.5″ for the Earth and 5.2″ more for a low orbit. With β = v/c and γ = 1/√(1 − β²), the direction p of
@@ -6,8 +6,8 @@ a star is seen as
 
     p' = [p/γ + (1 + (p·β)/(1 + 1/γ)) β] / (1 + p·β)
 
-(Urban & Seidelmann 2013, eq. 7.40; the inverse has −β). The deflection of light by the Sun, 4 mas at 90° from it, is
-left out.
+(Urban & Seidelmann 2013, eq. 7.40; the inverse has −β). The deflection of light by the Sun, 4 mas at an
+elongation of 90°, is neglected.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from starid.errors import StaridError
 SPEED_OF_LIGHT_M_S: Final = 299_792_458.0
 
 FASTEST_M_S: Final = 1e6
-"""Largest observer velocity accepted, m/s: 13 times that of a low orbit about the Earth at perihelion."""
+"""Largest observer velocity accepted, m/s: 13 times the speed of a low Earth orbit at perihelion."""
 
 REST: Final[Array] = np.zeros(3)
 """β of an observer at rest."""
@@ -32,12 +32,12 @@ REST.flags.writeable = False
 
 
 def checked_beta(velocity_m_s: ArrayLike | None) -> Array:
-    """β = v/c (3,) of an observer; zeros for None.
+    """Return the velocity of an observer as β = v/c (3,); zeros for None.
 
     Raises
     ------
     StaridError
-        The velocity is not three finite numbers of at most `FASTEST_M_S`.
+        The velocity is not three finite numbers, or is above `FASTEST_M_S`.
     """
     if velocity_m_s is None:
         return REST
@@ -54,7 +54,7 @@ def checked_beta(velocity_m_s: ArrayLike | None) -> Array:
 
 
 def aberrated(directions: ArrayLike, velocity_m_s: ArrayLike) -> Array:
-    """Directions (…, 3) as an observer sees them who moves relative to the barycentre.
+    """Apparent directions (…, 3) for an observer who moves relative to the barycentre.
 
     Parameters
     ----------

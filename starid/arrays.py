@@ -1,4 +1,4 @@
-"""The arrays that most functions of this package take and return."""
+"""Array types used throughout the package."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-"""Numbers in double precision."""
+"""Double-precision numbers."""
 
 Indices = NDArray[np.int64]
-"""Rows, counts and other whole numbers."""
+"""Indices, counts and other integers."""
 
 Mask = NDArray[np.bool_]
-"""Which of several are meant."""
+"""A selection of rows."""
 
 Array32 = NDArray[np.float32]
-"""Numbers in single precision: pixels and what is made of them."""
+"""Single-precision numbers: pixels, and what is computed from them."""
 
 Indices32 = NDArray[np.int32]
-"""Whole numbers in half the room."""
+"""32-bit integers."""
 
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
-"""Counts of an image, (h, w)."""
+"""Pixel values (h, w) of a grey image."""

@@ -30,7 +30,7 @@ ARCSEC_PER_RAD: Final = 180.0 * 3600.0 / math.pi
 """Arcseconds in one radian."""
 
 _POLE_RADIUS: Final = 1e-12
-"""Boresights nearer to a pole than this (radians) are reported as being on it."""
+"""A boresight nearer to a pole than this (radians) is taken to be on it."""
 
 _ROTATION_TOLERANCE: Final = 1e-6
 """Largest deviation from orthonormality that `Attitude.from_matrix` accepts."""
@@ -48,9 +48,9 @@ class AttitudeError:
     cross_boresight_arcsec : float
         Angle between the two boresights, ≥ 0.
     roll_arcsec : float
-        Rotation about the boresight (the twist of the swing-twist split), ≥ 0.
+        Rotation about the boresight (the twist of the swing–twist decomposition), ≥ 0.
     total_arcsec : float
-        Angle of the whole rotation between the two, ≥ 0.
+        Angle of the rotation between the two attitudes, ≥ 0.
     rotation_vector_rad : ndarray (3,)
         Rotation vector e in the sensor frame, radians: ``A_this = exp(−[e]×)·A_truth``, that is, this
         attitude is the truth after the sensor has turned by +e.
@@ -64,7 +64,7 @@ class AttitudeError:
 
 @dataclass(frozen=True, eq=False)
 class Attitude:
-    """The orientation of the sensor against ICRS, held as a unit quaternion.
+    """The orientation of the sensor with respect to ICRS, as a unit quaternion.
 
     Attributes
     ----------
@@ -97,12 +97,12 @@ class Attitude:
 
     @classmethod
     def from_quaternion(cls, quaternion_xyzw: ArrayLike) -> Self:
-        """Attitude of a scalar-last quaternion (4,) of any length and sign."""
+        """Attitude from a scalar-last quaternion (4,) of any length and sign."""
         return cls(np.asarray(quaternion_xyzw, dtype=np.float64))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Self:
-        """Attitude of a rotation matrix.
+        """Attitude from a rotation matrix.
 
         Parameters
         ----------
@@ -112,7 +112,7 @@ class Attitude:
         Raises
         ------
         StaridError
-            The matrix is not a proper rotation to 1e-6.
+            The matrix is not a proper rotation to within 1e-6.
         """
         m = np.asarray(matrix, dtype=np.float64)
         if m.shape != (3, 3):
@@ -126,12 +126,12 @@ class Attitude:
 
     @classmethod
     def from_radec_roll(cls, ra_deg: float, dec_deg: float, roll_deg: float) -> Self:
-        """Attitude of a boresight and a roll.
+        """Attitude from a boresight and a roll.
 
         Parameters
         ----------
         ra_deg, dec_deg : float
-            Boresight, degrees ICRS; right ascension of any turn, declination within ±90°.
+            Boresight, degrees ICRS; any right ascension, declination within ±90°.
         roll_deg : float
             Angle of celestial north, counter-clockwise in the image, from image up, degrees.
 
@@ -142,7 +142,7 @@ class Attitude:
         """
         if not (math.isfinite(ra_deg) and math.isfinite(roll_deg) and -90.0 <= dec_deg <= 90.0):
             raise StaridError(
-                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: must be degrees, Dec within ±90"
+                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: must be finite degrees, Dec within ±90"
             )
         north, east, boresight = _local_frame(math.radians(ra_deg % 360.0), math.radians(dec_deg))
         roll = math.radians(roll_deg % 360.0)
@@ -203,12 +203,12 @@ class Attitude:
         return self._radec_roll[2]
 
     def to_sensor(self, vectors_icrs: Array) -> Array:
-        """Vectors (n, 3) or (3,) in ICRS, expressed in the sensor frame."""
+        """Transform vectors (n, 3) or (3,) from ICRS to the sensor frame."""
         turned: Array = vectors_icrs @ self.matrix.T
         return turned
 
     def to_icrs(self, vectors_sensor: Array) -> Array:
-        """Vectors (n, 3) or (3,) in the sensor frame, expressed in ICRS."""
+        """Transform vectors (n, 3) or (3,) from the sensor frame to ICRS."""
         turned: Array = vectors_sensor @ self.matrix
         return turned
 
@@ -250,12 +250,12 @@ class Attitude:
 
 
 def turn_text(degrees: float, digits: int) -> str:
-    """Format right ascension or roll with a number of decimals; below 360 after rounding too."""
+    """Format a right ascension or a roll; the result is below 360 even after rounding."""
     return f"{round(degrees % 360.0, digits) % 360.0:.{digits}f}"
 
 
 def random_attitude(rng: np.random.Generator) -> Attitude:
-    """Attitude drawn uniformly from all rotations (normalised four-dimensional Gaussian)."""
+    """Draw an attitude uniformly from all rotations (normalised four-dimensional Gaussian)."""
     return Attitude(rng.standard_normal(4))
 
 
@@ -265,17 +265,17 @@ def propagate(attitude: Attitude, rate_rad_s: ArrayLike, dt: float) -> Attitude:
 
 
 def rate_between(first: Attitude, second: Attitude, dt: float) -> Array:
-    """Constant rate (3,) in rad/s, sensor frame, that leads from the first to the second in `dt` seconds."""
+    """Constant rate (3,) in rad/s, sensor frame, that turns the first into the second in `dt` seconds."""
     return second.error_to(first).rotation_vector_rad / dt
 
 
 def interpolate(first: Attitude, second: Attitude, fraction: float) -> Attitude:
-    """Attitude on the shortest turn between two, at `fraction` of it (0 = first, 1 = second)."""
+    """Interpolate along the shortest rotation between two attitudes (fraction 0 = first, 1 = second)."""
     return first.rotated(second.error_to(first).rotation_vector_rad * fraction)
 
 
 def _turn(angle: float) -> float:
-    """Angle in degrees, [0, 360), of radians."""
+    """Convert radians to degrees in [0, 360)."""
     degrees = math.degrees(angle) % 360.0
     return 0.0 if degrees == 360.0 else degrees
 
@@ -302,7 +302,7 @@ def _multiply(left: tuple[float, ...] | list[float], right: tuple[float, ...] | 
 
 
 def quaternion_of(matrix: Array) -> Array:
-    """Scalar-last unit quaternion (4,) of a (nearly) rotation matrix, by its largest component (Shepperd 1978)."""
+    """Scalar-last unit quaternion (4,) of a near-rotation matrix, from its largest component (Shepperd)."""
     (a, b, c), (d, e, f), (g, h, i) = matrix.tolist()
     squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
     rows = (

@@ -1,4 +1,4 @@
-"""Results that are computed once and kept on disk: their folder, its size limit, and cached tables of arrays."""
+"""The cache on disk: its folder, its size limit, and cached tables of arrays."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ _KERNELS: Final = "kernels"
 _OWN_NAME: Final = re.compile(
     rf"(?:hipparcos|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
 )
-"""Paths of cached files and of folders of machine code, in the cache folder: nothing else in it is removed."""
+"""Paths that the cache owns, relative to its folder; nothing else in the folder is ever removed."""
 
 
 def cache_dir() -> Path:
     """Return the folder for cached files; it need not exist yet.
 
     ``STARHIL_CACHE_DIR`` if set, else ``starhil`` under ``XDG_CACHE_HOME``, else under the platform's cache
-    folder, else (no home folder) under the temporary folder.
+    folder, else (without a home folder) under the temporary folder.
     """
     own = os.environ.get("STARHIL_CACHE_DIR")
     if own:
@@ -57,9 +57,9 @@ def cache_dir() -> Path:
 
 
 def kernel_folder(key: str) -> Path | None:
-    """Return the folder for machine code with a key of 16 hexadecimal digits; None where it cannot be made.
+    """Return the folder for the machine code of a key (16 hexadecimal digits); None where it cannot be made.
 
-    It need not exist yet.
+    The folder need not exist yet.
     """
     folder = cache_dir() / _KERNELS / key
     if folder.is_dir():
@@ -70,27 +70,27 @@ def kernel_folder(key: str) -> Path | None:
 
 @dataclass(frozen=True)
 class CachedFile:
-    """A file in the cache folder, or a folder of machine code, which is kept or removed as a whole."""
+    """A cached file, or a folder of machine code, which is kept or removed as a whole."""
 
     path: Path
     size: int
     """Bytes."""
     used_s: float
-    """Time of the last use, seconds since 1970."""
+    """Time of the last use, Unix time in seconds."""
 
     @property
     def name(self) -> str:
-        """Path in the cache folder."""
+        """Path relative to the cache folder."""
         return _name(self.path)
 
 
 def _name(path: Path) -> str:
-    """Name of a file, with the folder before it that of machine code has."""
+    """Path relative to the cache folder: machine code is one level down."""
     return f"{_KERNELS}/{path.name}" if path.parent.name == _KERNELS else path.name
 
 
 def cached_files() -> list[CachedFile]:
-    """Return the cached files, the least recently used first."""
+    """Return the cached files, least recently used first."""
     found = []
     folder = cache_dir()
     for path in (*folder.glob("*"), *folder.glob(f"{_KERNELS}/*")):
@@ -105,9 +105,9 @@ def cached_files() -> list[CachedFile]:
 
 
 def size_limit() -> int:
-    """Return the limit of the total size of the cached files, bytes: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
+    """Return the size limit of the cache in bytes: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
 
-    An invalid value is logged, and the default applies.
+    An invalid value is logged and the default used.
     """
     text = os.environ.get(LIMIT_VARIABLE) or f"{DEFAULT_LIMIT_MB:g}"
     try:
@@ -123,17 +123,17 @@ def size_limit() -> int:
 
 
 def mark_used(path: Path) -> None:
-    """Set the time of the last use of a cached file or folder to now."""
+    """Record that a cached file or folder has just been used."""
     try:
         os.utime(path)
-    except OSError as error:  # a read-only cache, or the file of another user
+    except OSError as error:  # a read-only cache, or another user's file
         _log.debug("cache file %s cannot be marked as used: %s", path, error)
 
 
 def evict(keep: Path) -> None:
-    """Remove the least recently used cached files until the limit holds; `keep`, just written, stays."""
+    """Remove the least recently used cached files until the cache is within its limit, but never `keep`."""
     files = cached_files()
-    if all(each.path != keep for each in files):  # kept in a folder outside the cache
+    if all(each.path != keep for each in files):  # written to a folder outside the cache
         return
     excess = sum(each.size for each in files) - size_limit()
     for each in files:
@@ -144,7 +144,7 @@ def evict(keep: Path) -> None:
 
 
 def remove(file: CachedFile) -> bool:
-    """Remove a cached file; False, with a warning in the log, where that is not allowed."""
+    """Remove a cached file; log a warning and return False where that is not allowed."""
     try:
         if file.path.is_dir():
             shutil.rmtree(file.path)
@@ -159,26 +159,25 @@ def remove(file: CachedFile) -> bool:
 
 
 def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
-    """Load arrays from the cache, or build and keep them.
+    """Load arrays from the cache, or build and cache them.
 
     Parameters
     ----------
     name : str
-        File name without suffix. It must depend on everything that the arrays depend on: a stale file has
-        another name.
+        File name without suffix. It must depend on everything that the arrays depend on, so that a change
+        gives another name.
     build : callable
-        Makes the arrays by name.
+        Returns the arrays by name.
 
     Returns
     -------
     dict of ndarray
-        As built. The file is an uncompressed ``.npz``, whose checksums are verified on loading; a damaged
-        one, or one that cannot be read, is built again. Where the folder cannot be written the arrays are
-        only returned.
+        The arrays. The file is an uncompressed ``.npz``, whose checksums are verified on loading. A file that
+        is damaged or cannot be read is built again; if the folder cannot be written, nothing is cached.
     """
     path = cache_dir() / f"{name}.npz"
     try:
-        if path.is_file():  # which raises where the folder cannot be searched
+        if path.is_file():  # raises if the folder cannot be searched
             with np.load(path, allow_pickle=False) as stored:
                 tables = {key: stored[key] for key in stored.files}
             mark_used(path)

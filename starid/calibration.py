@@ -1,15 +1,15 @@
 """Self-calibration: focal length, centre and distortion from stars matched over several frames.
 
-All frames are adjusted together (a bundle): one camera, one attitude per frame. The residual of a star is its
-measured position minus the projection of its catalogue direction, over its standard deviation. Levenberg–
-Marquardt steps solve for the camera by the Schur complement of the attitudes' 3 × 3 blocks; Huber weights and a
-final rejection exclude false matches. Weak priors at the start values bound parameters that the frames do not determine,
-such as the centre in a narrow field, where its shift is degenerate with a rotation.
+All frames are adjusted together (bundle adjustment): one camera, one attitude per frame. The residual of a
+star is its measured minus its projected position, divided by the standard deviation. Levenberg–Marquardt
+steps eliminate the 3 × 3 blocks of the attitudes by their Schur complement; Huber weights and a final
+rejection exclude false matches. Weak priors at the start values bound parameters that the frames do not
+determine, such as the centre in a narrow field, where a shift is degenerate with a rotation.
 
-`scipy.optimize.least_squares` (trust region, Huber loss, analytic Jacobian) is as accurate but slower, because it does
-not exploit the block structure. Over 8 seeded sets per case, median error of the image in pixels and CPU time, here and
-with scipy: 10 frames of 42°, 0.0115 and 0.0114, 87 ms and 373 ms; 8 fisheye frames with false matches, 0.0050 and
-0.0050, 319 ms and 1165 ms; 3 frames, 0.0226 and 0.0224, 35 ms and 68 ms.
+`scipy.optimize.least_squares` (trust region, Huber loss, analytic Jacobian) is as accurate but slower,
+because it does not exploit the block structure. Median error in pixels and CPU time over 8 seeded sets, here
+and with scipy: 10 frames of 42°, 0.0115 and 0.0114, 87 ms and 373 ms; 8 fisheye frames with false matches,
+0.0050 and 0.0050, 319 ms and 1165 ms; 3 frames, 0.0226 and 0.0224, 35 ms and 68 ms.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ GROUPS: Final = {
     "centre": ("cx", "cy"),
     **{name: (name,) for name in NAMES[4:]},
 }
-"""What can be estimated: "focal" keeps the ratio of fx and fy, "aspect" frees it."""
+"""Groups of parameters to estimate: "focal" keeps the ratio of fx to fy, "aspect" frees it."""
 
 DEFAULT_ESTIMATE: Final = ("focal", "centre", "k1", "k2", "p1", "p2")
 
@@ -68,10 +68,10 @@ class CalibrationFrame:
     reference : ndarray (n, 3)
         Catalogue directions of the same stars, unit vectors, ICRS.
     sigma_px : ndarray (n,) or (n, 2), optional
-        Standard deviation of each position, the same on both axes or along x and y; without it all are
-        equal and the noise is estimated from the residuals.
+        Standard deviation of each position, one for both axes or one each for x and y; by default all are
+        equal, and the noise is estimated from the residuals.
     attitude : Attitude, optional
-        Start value; by default the solution of Wahba's problem with the start camera.
+        Start value; by default from Wahba's problem with the start camera.
     """
 
     xy_px: Array
@@ -87,7 +87,7 @@ class CalibrationFrame:
             object.__setattr__(self, name, table)
         n = len(self.xy_px)
         if len(self.reference) != n:
-            raise StaridError(f"calibration: {n} positions and {len(self.reference)} directions in one frame")
+            raise StaridError(f"calibration: {n} positions but {len(self.reference)} directions in one frame")
         if n < _MIN_STARS:
             raise StaridError(f"calibration: a frame has {n} matched stars, must have at least {_MIN_STARS}")
         if self.sigma_px is not None:
@@ -120,15 +120,15 @@ class Calibration:
     estimated : tuple of str
         Free parameters (keys of `GROUPS`).
     covariance : ndarray (9, 9)
-        Of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; zero rows for fixed parameters. Scaled by
+        Covariance of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3; zero rows for fixed parameters. Scaled by
         the residuals where standard deviations are missing or too small.
     rms_px : float
         Root mean square distance of the used stars from their projection, pixels.
     sigma_px : float
-        Noise of a position on one axis, pixels, from the residuals and the degrees of freedom (of a star
-        with mean weight, where the frames have standard deviations).
+        Standard deviation of a position on one axis, pixels, from the residuals and the degrees of freedom
+        (for a star of mean weight, where the frames have standard deviations).
     used : tuple of ndarray (n,) of bool
-        Stars of each frame that were not rejected.
+        Which stars of each frame were not rejected.
     residual_px : tuple of ndarray (n, 2)
         Measured minus projected position of every star, pixels.
     """
@@ -144,7 +144,7 @@ class Calibration:
 
     @property
     def sigmas(self) -> dict[str, float]:
-        """Standard deviation of each camera parameter by name; 0 for a fixed parameter."""
+        """Standard deviations of the camera parameters by name; 0 for a fixed one."""
         return dict(zip(NAMES, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
@@ -161,7 +161,7 @@ def calibrate(
     Parameters
     ----------
     frames : sequence of CalibrationFrame
-        Accuracy grows with their number and with the spread of the stars over the image.
+        The more frames, and the wider their stars are spread over the image, the better.
     camera : Camera
         Start value; parameters that are not estimated keep its values.
     estimate : sequence of str
@@ -198,7 +198,7 @@ def calibrate(
 
 
 def check_estimate(estimate: Sequence[str]) -> None:
-    """Reject an empty choice, and names that are not keys of `GROUPS`."""
+    """Raise unless there is at least one name and all are keys of `GROUPS`."""
     unknown = sorted(set(estimate) - set(GROUPS))
     if unknown or not estimate:
         what = f"{unknown[0]!r}" if unknown else "nothing"
@@ -207,14 +207,14 @@ def check_estimate(estimate: Sequence[str]) -> None:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """A state of the adjustment: values of the nine camera parameters, and the attitudes."""
+    """A state of the adjustment: the nine camera parameters and the attitudes."""
 
     values: Array
     attitudes: tuple[Attitude, ...]
 
 
 class _Bundle:
-    """The least-squares problem of all frames."""
+    """The least-squares problem over all frames."""
 
     def __init__(self, frames: Sequence[CalibrationFrame], camera: Camera, estimate: Sequence[str]) -> None:
         self.frames = tuple(frames)
@@ -242,7 +242,7 @@ class _Bundle:
         return _State(self.initial, attitudes)
 
     def params(self, values: Array) -> Array:
-        """Kernel parameters of camera values, without a limit to the distortion."""
+        """Convert camera values to kernel parameters, without a limit on the distortion."""
         params = self.camera.params.copy()
         params[list(_SLOTS)] = values
         params[LIMIT2] = math.inf
@@ -258,11 +258,11 @@ class _Bundle:
         ]
 
     def distances(self, residuals: list[Array]) -> list[Array]:
-        """Residuals over standard deviation, lengths (n,)."""
+        """Lengths (n,) of the residuals, in standard deviations."""
         return [np.linalg.norm(r / s, axis=1) for r, s in zip(residuals, self.sigmas, strict=True)]
 
     def scale(self, distances: list[Array]) -> float:
-        """Spread of the residuals on one axis, from the median of their lengths, in standard deviations."""
+        """Spread of the residuals on one axis, in standard deviations, from their median length."""
         kept = np.concatenate([d[u] for d, u in zip(distances, self.used, strict=True)])
         spread = max(float(np.median(kept)) / _RAYLEIGH_MEDIAN, _SMALLEST_SCALE)
         return max(spread, 1.0) if self.has_sigmas else spread
@@ -280,7 +280,7 @@ class _Bundle:
                 )
 
     def cost(self, state: _State, scale: float) -> float:
-        """Huber's loss of the stars used, plus the prior."""
+        """Huber loss of the stars used, plus the prior."""
         t = [d[u] / scale for d, u in zip(self.distances(self.residuals(state)), self.used, strict=True)]
         lengths = np.concatenate(t)
         huber = np.where(lengths <= _HUBER, 0.5 * lengths**2, _HUBER * (lengths - 0.5 * _HUBER))
@@ -294,9 +294,7 @@ class _Bundle:
         scale = self.scale(self.distances(self.residuals(state)))
         cost = self.cost(state, scale)
         if not math.isfinite(cost):
-            raise StaridError(
-                "calibration: matched stars lie outside what the start camera can see; check them"
-            )
+            raise StaridError("calibration: matched stars lie outside the start camera's field; check them")
         for _ in range(_MAX_STEPS):
             system = _System(self, state, scale)
             while damping < _MAX_DAMPING:
@@ -316,7 +314,7 @@ class _Bundle:
         return state
 
     def outcome(self, state: _State, estimated: tuple[str, ...]) -> Calibration:
-        """Make the result of the final state."""
+        """Build the result from the final state."""
         residuals = self.residuals(state)
         distances = [d[u] for d, u in zip(self.distances(residuals), self.used, strict=True)]
         squares = np.concatenate(distances) ** 2
@@ -347,7 +345,7 @@ class _Bundle:
 
 
 class _System:
-    """Normal equations of a bundle at a state, with the blocks of the attitudes separate."""
+    """Normal equations of a bundle at a state, with separate blocks for the attitudes."""
 
     def __init__(self, bundle: _Bundle, state: _State, scale: float, *, robust: bool = True) -> None:
         self.bundle = bundle
@@ -367,8 +365,8 @@ class _System:
             weight = sigma[used] ** -2.0
             if robust:
                 weight = weight * np.minimum(1.0, _HUBER / np.maximum(lengths, _HUBER))[:, None]
-            by_camera = _camera_slopes(params, vectors) @ bundle.freedom
-            by_turn = _turn_slopes(params, vectors)
+            by_camera = _camera_jacobian(params, vectors) @ bundle.freedom
+            by_turn = _rotation_jacobian(params, vectors)
             weighted = by_turn * weight[:, :, None]
             pulled = by_camera * weight[:, :, None]
             self.cc = self.cc + np.einsum("nij,nik->jk", pulled, by_camera)
@@ -393,7 +391,7 @@ class _System:
         )
 
     def camera_covariance(self, variance: float) -> Array:
-        """Covariance of the free parameters for a variance factor, the prior counted once."""
+        """Covariance of the free parameters, scaled by a variance factor; the prior is not scaled."""
         taken = [ca @ np.linalg.solve(aa, ca.T) for ca, aa in zip(self.ca, self.aa, strict=True)]
         data = self.cc - self.scale2 * self.bundle.prior - np.sum(taken, axis=0)
         inverse = np.linalg.inv(data / max(variance, _SMALLEST_SCALE**2) + self.bundle.prior)
@@ -402,7 +400,7 @@ class _System:
 
 
 def _freedom(estimate: Sequence[str], values: Array) -> Array:
-    """Matrix (9, p) from the free parameters to the nine."""
+    """Matrix (9, p) that maps the p free parameters to all nine."""
     columns = []
     for name in dict.fromkeys(estimate):
         if name == "focal" and "aspect" not in estimate:
@@ -412,8 +410,8 @@ def _freedom(estimate: Sequence[str], values: Array) -> Array:
     return np.column_stack(columns)
 
 
-def _turn_slopes(params: Array, vectors: Array) -> Array:
-    """Derivative (n, 2, 3) of the positions by a rotation of the sensor, pixels per radian: J (v × e)."""
+def _rotation_jacobian(params: Array, vectors: Array) -> Array:
+    """Derivative (n, 2, 3) of the positions with respect to a sensor rotation e, px/rad: J (v × e)."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     cross = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]]).transpose(2, 0, 1)
@@ -421,8 +419,8 @@ def _turn_slopes(params: Array, vectors: Array) -> Array:
     return slopes
 
 
-def _camera_slopes(params: Array, vectors: Array) -> Array:
-    """Derivative (n, 2, 9) of the positions by the camera parameters `NAMES`."""
+def _camera_jacobian(params: Array, vectors: Array) -> Array:
+    """Derivative (n, 2, 9) of the positions with respect to the camera parameters `NAMES`."""
     bare = params.copy()
     bare[list(_SLOTS)] = (1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     bare.flags.writeable = False

@@ -1,4 +1,4 @@
-"""The camera: where a direction of the sensor frame falls on the pixel array, and back."""
+"""The camera: projection of directions in the sensor frame to pixels, and back."""
 
 from __future__ import annotations
 
@@ -57,20 +57,20 @@ class Camera:
     width, height : int
         Size of the pixel array, pixels.
     focal_px : (float, float)
-        Focal lengths fx, fy in pixels (pixels per radian at the centre for every model).
+        Focal lengths fx, fy in pixels (for every model: pixels per radian at the centre).
     centre_px : (float, float)
         Position (cx, cy) of the boresight, pixels; pixel centres are integers.
     model : {"pinhole", "equidistant", "flat"}
-        Mapping from direction to plane. "flat" is longitude and latitude about the boresight; `flat_view`
-        maps the thesis's flat RA–Dec plane to it.
+        Mapping from direction to image plane. "flat" is longitude and latitude about the boresight;
+        `flat_view` maps the thesis's flat RA–Dec plane to it.
     distortion : tuple of 5 floats
-        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, acting on the plane; missing
-        terms are zero.
+        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, applied in the image plane;
+        missing terms are zero.
 
     Raises
     ------
     StaridError
-        A value is out of its range, or the distortion folds the image, so that one pixel would see two
+        A value is out of range, or the distortion folds the image, so that one pixel would see two
         directions.
     """
 
@@ -102,22 +102,22 @@ class Camera:
         model: Model = "pinhole",
         distortion: Sequence[float] = (),
     ) -> Self:
-        """Camera centred on its pixel array whose full width sees `fov_deg`.
+        """Camera with a given horizontal field and the boresight at the centre of the pixel array.
 
         Parameters
         ----------
         fov_deg : float
-            Horizontal field through the centre, from the left edge of the first column to the right edge of
-            the last, degrees, distortion included.
+            Horizontal field of view through the centre, from the left edge of the first column to the right
+            edge of the last, degrees, distortion included.
         width, height : int
             Pixels.
         model, distortion
-            As in the class.
+            See the class.
 
         Raises
         ------
         StaridError
-            As the class.
+            See the class.
         """
         width, height = _side("width", width), _side("height", height)
         _check_model(model)
@@ -175,7 +175,7 @@ class Camera:
 
     @cached_property
     def params(self) -> Array:
-        """The camera as the plain array that the kernels of `starid.projection` take, read-only."""
+        """The camera as a read-only array, for the kernels of `starid.projection`."""
         params = np.array(
             [
                 _MODEL_CODES[self.model],
@@ -195,18 +195,18 @@ class Camera:
 
     @cached_property
     def identity(self) -> str:
-        """Short checksum of every value, for names in the cache."""
+        """Short checksum of all values, for the names of cached files."""
         text = repr((self.width, self.height, self.focal_px, self.centre_px, self.model, self.distortion))
         return hashlib.sha256(text.encode()).hexdigest()[:12]
 
     @property
     def pixel_scale_rad(self) -> float:
-        """Angle that one pixel sees at the centre, radians (geometric mean of both axes)."""
+        """Angle subtended by a pixel at the centre, radians (geometric mean of the two axes)."""
         return 1.0 / math.sqrt(self.focal_px[0] * self.focal_px[1])
 
     @cached_property
     def fov_deg(self) -> float:
-        """Horizontal field on the row of the centre, edge to edge of the pixel array, degrees."""
+        """Horizontal field of view on the row of the centre, edge to edge, degrees."""
         row = self.centre_px[1]
         edges = self.back_project(np.array([[-0.5, row], [self.width - 0.5, row]]))
         left, right = np.arctan2(edges[:, 0], edges[:, 2])
@@ -239,8 +239,8 @@ class Camera:
         Returns
         -------
         xy : ndarray (n, 2)
-            Pixels. Directions just outside the field get their true position, those that the lens cannot
-            map get NaN.
+            Pixels. A direction just outside the field gets its true position; one that the lens cannot map
+            gets NaN.
         inside : ndarray (n,) of bool
             The direction falls on the pixel array: [−0.5, width − 0.5) × [−0.5, height − 0.5).
         """
@@ -255,30 +255,31 @@ class Camera:
         return back_project_kernel(self.params, _table("positions", xy, 2))
 
     def jacobian(self, vectors: ArrayLike) -> Array:
-        """Return the derivative (n, 2, 3) of the pixel position by the direction, in pixels per unit.
+        """Return the derivative (n, 2, 3) of pixel positions with respect to direction, pixels per unit.
 
-        It is taken at unit vectors (n, 3) and is zero along the direction itself. When the sensor rotates by a small
-        vector e (radians, sensor frame), the directions move by ``v × e``, so the positions move by ``J (v × e)``.
+        It is evaluated at unit vectors (n, 3) and is zero along the direction itself. When the sensor rotates
+        by a small vector e (radians, sensor frame), the directions move by ``v × e``, so the positions move
+        by ``J (v × e)``.
         """
         return jacobian_kernel(self.params, _table("directions", vectors, 3))
 
 
 def flat_view(camera: Camera, ra_deg: float, dec_deg: float) -> tuple[Camera, Attitude]:
-    """Show the flat RA–Dec plane of the thesis through the common camera interface.
+    """Express the flat RA–Dec plane of the thesis as a camera and an attitude.
 
-    The thesis draws a star at ``x = α − α_c``, ``y = δ − δ_c`` (degrees, no cos δ), whatever the
-    declination of the frame's centre. That is no rotation of the sphere, but it is the "flat" model seen
-    from the celestial equator with the centre of the image moved by δ_c: the returned attitude looks at
-    (α_c, 0°) with roll 0, and the returned camera has ``cy + fy·δ_c``. Through the pair, the point
-    (α_c, δ_c) falls on the centre of the given camera, east is left and north is up, and project and
-    back-project hold as for every camera.
+    The thesis draws a star at ``x = α − α_c``, ``y = δ − δ_c`` (degrees, no cos δ), whatever the declination
+    of the centre. This is not a rotation of the sphere, but it is the "flat" model seen from the celestial
+    equator with the centre of the image moved by δ_c: the returned attitude points at (α_c, 0°) with roll 0,
+    and the returned camera has ``cy + fy·δ_c``. With this pair the point (α_c, δ_c) falls on the centre of
+    the given camera, east is left and north is up, and it can be used to project and back-project like any
+    other.
 
     Parameters
     ----------
     camera : Camera
         A camera with model "flat".
     ra_deg, dec_deg : float
-        Centre of the frame, degrees.
+        Centre of the field, degrees.
     """
     if camera.model != "flat":
         raise StaridError(f"camera model: must be 'flat' for a flat view, not {camera.model!r}")
@@ -288,25 +289,25 @@ def flat_view(camera: Camera, ra_deg: float, dec_deg: float) -> tuple[Camera, At
 
 
 def _is_number(value: object) -> bool:
-    """Whether a value is a number, which text and truth values are not."""
+    """Whether a value is a number (a bool is not)."""
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def _side(name: str, side: Any) -> int:
-    """Return the side of a pixel array, or raise an error that names the field."""
+    """Check a side of the pixel array; the error names the field."""
     if isinstance(side, bool) or not isinstance(side, int | np.integer) or not 1 <= side <= _MAX_SIDE:
         raise StaridError(f"camera {name}: must be a whole number 1…{_MAX_SIDE}, not {side!r}")
     return int(side)
 
 
 def _check_model(model: Any) -> None:
-    """Reject an unknown name of a model."""
+    """Raise if the model is unknown."""
     if not isinstance(model, str) or model not in _MODEL_CODES:
         raise StaridError(f"camera model: must be one of {', '.join(_MODEL_CODES)}, not {model!r}")
 
 
 def _floats(values: Any) -> tuple[float, ...] | None:
-    """Values as floats; None unless they are a sequence of finite numbers."""
+    """Convert values to floats; None unless they are a sequence of finite numbers."""
     if not isinstance(values, Iterable):
         return None
     items = tuple(values)
@@ -314,13 +315,13 @@ def _floats(values: Any) -> tuple[float, ...] | None:
         return None
     try:
         floats = tuple(float(item) for item in items)
-    except OverflowError:  # a whole number with hundreds of digits
+    except OverflowError:  # an integer of hundreds of digits
         return None
     return floats if all(math.isfinite(number) for number in floats) else None
 
 
 def _numbers(name: str, values: Any, count: int) -> tuple[float, ...]:
-    """`count` finite floats, or an error that names the field."""
+    """Check that there are `count` finite numbers; the error names the field."""
     numbers = _floats(values)
     if numbers is None or len(numbers) != count:
         raise StaridError(f"camera {name}: must be {count} finite numbers, not {values!r}")
@@ -328,7 +329,7 @@ def _numbers(name: str, values: Any, count: int) -> tuple[float, ...]:
 
 
 def _terms(values: Any) -> tuple[float, float, float, float, float]:
-    """Distortion terms filled up with zeros."""
+    """Distortion terms, padded with zeros."""
     terms = _floats(values)
     if terms is None or len(terms) > _DISTORTION_TERMS:
         raise StaridError(
@@ -339,15 +340,15 @@ def _terms(values: Any) -> tuple[float, float, float, float, float]:
 
 
 def _fold_error(terms: Sequence[float]) -> StaridError:
-    """Say that a distortion folds the image."""
+    """Make the error for a distortion that folds the image."""
     return StaridError(
-        f"camera distortion {[float(term) for term in terms]}: folds the image inside the frame; "
+        f"camera distortion {[float(term) for term in terms]}: folds the image inside its border; "
         "use smaller terms, a longer focal length or the equidistant model"
     )
 
 
 def _table(name: str, values: ArrayLike, columns: int) -> Array:
-    """Contiguous float array (n, columns), or an error that names it."""
+    """Convert to a contiguous float array (n, columns); the error names it."""
     table = np.ascontiguousarray(values, dtype=np.float64)
     if table.ndim != 2 or table.shape[1] != columns:
         raise StaridError(f"camera: shape of {name} must be (n, {columns}), not {table.shape}")
@@ -355,11 +356,11 @@ def _table(name: str, values: ArrayLike, columns: int) -> Array:
 
 
 def _one_to_one_limit(params: Array, border: Array) -> float:
-    """Radius in the plane of a disc that holds the whole image and on which the distortion is one-to-one.
+    """Radius, in the plane, of a disc that holds the whole image and on which the distortion is one-to-one.
 
     The radial part turns back at the smallest positive root of 1 + 3k₁r² + 5k₂r⁴ + 7k₃r⁶. The disc ends
-    before it, so that no star from beyond is folded into the image; on the disc the determinant of the
-    distortion must stay positive, tangential part included.
+    before this root, so that no star from outside is folded into the image. On the disc the determinant of
+    the whole distortion, tangential part included, must stay positive.
     """
     k1, k2, _, _, k3 = params[K1:WIDTH]
     roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])

@@ -1,8 +1,7 @@
 """Camera profiles: a camera and its calibration in a small TOML file.
 
-The table ``[camera]`` holds the keys of `starid.camera.Camera.to_dict` and is the only one that is read, so a
-device profile with such a table is a camera profile too. The table ``[calibration]`` documents the origin of the
-values.
+The table ``[camera]`` holds the keys of `starid.camera.Camera.to_dict`. Only this table is read, so a device
+profile that has one is also a camera profile. The table ``[calibration]`` records where the values come from.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from starid.files import read_text, write_atomically
 
 
 def save_camera(path: str | Path, camera: Camera, calibration: Calibration | None = None) -> None:
-    """Write a camera profile, whole or not at all.
+    """Write a camera profile atomically.
 
     Parameters
     ----------
@@ -28,7 +27,7 @@ def save_camera(path: str | Path, camera: Camera, calibration: Calibration | Non
     camera : Camera
         The camera.
     calibration : Calibration, optional
-        Its figures and covariance are written too.
+        If given, its figures and covariance are written too.
 
     Raises
     ------
@@ -91,7 +90,7 @@ def load_camera(path: str | Path) -> Camera:
 
 
 def _toml(value: object) -> str:
-    """A value as TOML: numbers, text without special characters, and lists of them."""
+    """Format a value as TOML: a number, text without special characters, or a list of these."""
     if isinstance(value, str):
         return f'"{value}"'
     if isinstance(value, list):

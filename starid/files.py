@@ -1,7 +1,7 @@
-"""Files that a user names.
+"""Reading and writing files named by the user.
 
-Only regular files up to a size limit are read; text may begin with a byte order mark. Output to a device, a pipe or
-the standard output is written into it and does not replace it.
+Only regular files up to a size limit are read; text may begin with a byte order mark. Output to a device, a
+pipe or standard output is written into it, not moved over it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import BinaryIO, Final
 MEGABYTE: Final = 1_000_000
 
 STDOUT: Final = 1
-"""Descriptor of the standard output."""
+"""File descriptor of standard output."""
 
 _NUMBER: Final = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
@@ -30,7 +30,7 @@ TEXT_LIMIT: Final = 10 * MEGABYTE
 
 
 def open_regular(path: str | Path) -> BinaryIO:
-    """Open a regular file for reading; a pipe is rejected without waiting for its writer.
+    """Open a regular file for reading; a pipe is rejected without waiting for a writer.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def open_regular(path: str | Path) -> BinaryIO:
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    except ValueError as error:  # a name that no file can have
+    except ValueError as error:  # not a valid file name
         raise OSError(errno.EINVAL, str(error), str(path)) from None
     mode = os.fstat(descriptor).st_mode
     if stat.S_ISREG(mode):
@@ -63,7 +63,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     Raises
     ------
     OSError
-        As `open_regular`, or the file is larger than `limit`.
+        See `open_regular`; also, the file is larger than `limit`.
     """
     with open_regular(path) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -79,7 +79,7 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
     Raises
     ------
     OSError
-        As `read_bytes`.
+        See `read_bytes`.
     UnicodeDecodeError
         The file is not UTF-8.
     """
@@ -87,12 +87,12 @@ def read_text(path: str | Path, limit: int = TEXT_LIMIT) -> str:
 
 
 def read_number(text: str) -> float:
-    """Parse a finite number in the notation that other programs share.
+    """Parse a finite number in the notation common to most programs.
 
     Raises
     ------
     ValueError
-        The text is not a finite number, or has underscores or digits of another script, which only Python reads.
+        The text is not a finite number, or has underscores or non-ASCII digits, which Python would accept.
     """
     value = float(text) if _NUMBER.fullmatch(text.strip()) else math.inf
     if not math.isfinite(value):
@@ -101,7 +101,7 @@ def read_number(text: str) -> float:
 
 
 def is_stdout(path: str | Path) -> bool:
-    """Whether a path names the file that the standard output of this process goes to."""
+    """Whether a path is the file to which this process's standard output goes."""
     try:
         return os.path.samestat(Path(path).stat(), os.fstat(STDOUT))
     except (OSError, ValueError):
@@ -109,7 +109,7 @@ def is_stdout(path: str | Path) -> bool:
 
 
 def is_stream(path: str | Path) -> bool:
-    """Whether a path names a device, a pipe, a socket or the standard output, which are written to in place."""
+    """Whether a path is a device, a pipe, a socket or standard output, which are written in place."""
     try:
         mode = Path(path).stat().st_mode
     except (OSError, ValueError):
@@ -118,7 +118,7 @@ def is_stream(path: str | Path) -> bool:
 
 
 def open_stream(path: str | Path) -> BinaryIO:
-    """Open a stream (`is_stream`) for writing, after everything that this process has printed.
+    """Open a stream (`is_stream`) for writing, after flushing what this process has printed.
 
     Raises
     ------
@@ -133,17 +133,17 @@ def open_stream(path: str | Path) -> BinaryIO:
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file, then move it onto `path` in one step.
+    """Write a file by filling a temporary one and renaming it.
 
-    Where `path` is a link, its target is replaced. A device, a pipe or the standard output receives the content once it
-    is complete.
+    Where `path` is a link, its target is replaced. A device, a pipe or standard output receives the content
+    once it is complete.
 
     Parameters
     ----------
     path : Path
         Final name; missing folders are created.
     write : callable
-        Gets the temporary path. If it raises, nothing is left behind and `path` is untouched.
+        Called with the temporary path. If it raises, the temporary file is removed and `path` is untouched.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The file of the Hipparcos new reduction (van Leeuwen 2007, CDS I/311, ``hip2.dat``), read and checked."""
+"""Reader for the Hipparcos new reduction (van Leeuwen 2007, CDS I/311, ``hip2.dat``)."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ STAR_COUNT: Final = 117955
 """Number of stars in the complete file."""
 
 EPOCH: Final = 1991.25
-"""Julian year of the catalogue's positions."""
+"""Epoch of the catalogue positions, Julian year."""
 
 FILE_LIMIT: Final = 100 * MEGABYTE
-"""Largest catalogue that is read, unpacked, bytes: three times the complete file."""
+"""Largest uncompressed file that is read, bytes: three times the complete one."""
 
 _RECORD: Final = 276
 
@@ -77,7 +77,7 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, Array]:
     path : Path
         The file.
     expected : int
-        Number of stars it must hold.
+        Number of stars that it must contain.
 
     Returns
     -------
@@ -88,21 +88,25 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, Array]:
     Raises
     ------
     StaridError
-        The file is missing, unreadable, truncated, or a line is malformed; the message names
-        file, line and field.
+        The file is missing, unreadable or truncated, or a line is malformed; the message names the file, line
+        and field.
     """
     lines = _lines(path)
     for number, line in enumerate(lines, start=1):
         if len(line) != _RECORD:
             where = f"star catalogue {path}: line {number}"
             if number == len(lines):
-                raise StaridError(f"{where} breaks off, the file is truncated; fetch it again from CDS I/311")
-            raise StaridError(f"{where} is {len(line)} characters long, must be {_RECORD}; is it a hip2.dat?")
+                raise StaridError(
+                    f"{where} is incomplete, the file is truncated; download it again from CDS I/311"
+                )
+            raise StaridError(
+                f"{where} is {len(line)} characters long, must be {_RECORD}; is this a hip2.dat?"
+            )
     if len(lines) != expected:
         what = "truncated" if len(lines) < expected else "not the Hipparcos new reduction"
         raise StaridError(
             f"star catalogue {path}: {len(lines)} of {expected} stars, the file is {what}; "
-            "fetch it again from CDS I/311"
+            "download it again from CDS I/311"
         )
     table = np.frombuffer(b"".join(lines), dtype=np.uint8).reshape(len(lines), _RECORD)
     columns = {field.name: _column(path, table, field) for field in _FIELDS}
@@ -115,7 +119,7 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, Array]:
 
 
 def _lines(path: Path) -> list[bytes]:
-    """Lines of the file, unpacked if its name ends in .gz."""
+    """Read the lines of the file, decompressed if its name ends in .gz."""
     try:
         with open_regular(path) as stream:
             if path.suffix == ".gz":
@@ -129,7 +133,7 @@ def _lines(path: Path) -> list[bytes]:
         ) from None
     except (OSError, EOFError, zlib.error) as error:
         reason = getattr(error, "strerror", None) or error
-        raise StaridError(f"star catalogue {path}: cannot be read ({reason}); fetch it again") from None
+        raise StaridError(f"star catalogue {path}: cannot be read ({reason}); download it again") from None
     if len(content) > FILE_LIMIT:
         raise StaridError(
             f"star catalogue {path}: larger than {FILE_LIMIT / MEGABYTE:g} MB, not the Hipparcos new reduction; "
@@ -139,7 +143,7 @@ def _lines(path: Path) -> list[bytes]:
 
 
 def _column(path: Path, table: NDArray[np.uint8], field: _Field) -> Array:
-    """One column as floats, or an error that names the first bad line."""
+    """Parse a column as floats; the error names the first bad line."""
     width = field.last - field.first + 1
     texts = np.ascontiguousarray(table[:, field.first - 1 : field.last]).view(f"S{width}").ravel()
     blank = np.char.strip(texts) == b""
@@ -151,7 +155,7 @@ def _column(path: Path, table: NDArray[np.uint8], field: _Field) -> Array:
         number = next(i for i, text in enumerate(texts.tolist(), start=1) if not _is_number(text))
         raise StaridError(
             f"star catalogue {path}: line {number}: {field.name} (columns {field.first}-{field.last}) "
-            f"is {texts[number - 1].decode('latin-1')!r}, not a number; fetch the file again"
+            f"is {texts[number - 1].decode('latin-1')!r}, not a number; download the file again"
         ) from None
     return values
 
@@ -165,15 +169,15 @@ def _is_number(text: bytes) -> bool:
 
 
 def _check(path: Path, columns: dict[str, Array]) -> None:
-    """Reject values out of range, naming the first such line."""
+    """Reject values out of range; the error names the first such line."""
     hip, ra, dec, hp = (columns[name] for name in ("hip", "ra_rad", "dec_rad", "hp"))
     rules = (
         ("hip", (hip >= 1) & (hip == np.floor(hip)) & (hip < 1e6), "a whole number 1…999999"),
         ("ra_rad", (ra >= 0.0) & (ra <= 2.0 * math.pi), "radians 0…2π"),
         ("dec_rad", np.abs(dec) <= 0.5 * math.pi, "radians −π/2…π/2"),
         ("hp", np.abs(hp) < 30.0, "a magnitude"),
-        ("pm_ra_mas_yr", np.abs(columns["pm_ra_mas_yr"]) < 1e5, "less than 1e5 mas a year"),
-        ("pm_dec_mas_yr", np.abs(columns["pm_dec_mas_yr"]) < 1e5, "less than 1e5 mas a year"),
+        ("pm_ra_mas_yr", np.abs(columns["pm_ra_mas_yr"]) < 1e5, "less than 1e5 mas per year"),
+        ("pm_dec_mas_yr", np.abs(columns["pm_dec_mas_yr"]) < 1e5, "less than 1e5 mas per year"),
     )
     for name, good, need in rules:
         if not good.all():

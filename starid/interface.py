@@ -1,4 +1,4 @@
-"""The interface of every star identifier, and the factory that makes one by name."""
+"""The interface of all star identifiers, and a factory that makes one by name."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ ALGORITHMS: Final[dict[str, tuple[str, str]]] = {
     "pole-star": ("starid.classic.pole_star", "PoleStarIdentifier"),
     "radial-cyclic": ("starid.classic.radial_cyclic", "RadialCyclicIdentifier"),
 }
-"""Name of an algorithm → module and class; a module is imported on first use."""
+"""Name of an algorithm → module and class. A module is imported on first use."""
 
 CLASSICS: Final = tuple(
     name for name, (module, _) in ALGORITHMS.items() if module.startswith("starid.classic.")
@@ -47,12 +47,12 @@ class StarIdentifier(Protocol):
 
     @property
     def camera(self) -> Camera:
-        """The camera that the positions belong to."""
+        """The camera of the positions."""
         ...
 
     @property
     def catalog(self) -> StarCatalog:
-        """The catalogue whose rows `Solution.catalog_index` refers to."""
+        """The catalogue to whose rows `Solution.catalog_index` refers."""
         ...
 
     def identify(
@@ -63,21 +63,20 @@ class StarIdentifier(Protocol):
         *,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
-        """Find the attitude without any prior knowledge (lost in space).
+        """Find the attitude without prior knowledge (lost in space).
 
         Parameters
         ----------
         xy_px : array (n, 2)
             Positions, pixels.
         flux : array (n,)
-            Brightness in any linear unit.
+            Flux in any linear unit.
         xy_sigma_px : array (n,) or (n, 2), optional
-            One-sigma error of each position, the same on both axes or along x and y, pixels; estimated from
-            the residuals by default.
+            One-sigma error of each position, one for both axes or one each for x and y, pixels; by default
+            estimated from the residuals.
         observer_velocity : array (3,), optional
-            Velocity of the camera relative to the barycentre of the solar system, ICRS, m/s: the attitude is
-            then free of aberration (`starid.aberration`). By default the directions of the stars are taken as
-            those of the catalogue.
+            Velocity of the camera relative to the barycentre of the solar system, ICRS, m/s. The attitude is
+            then corrected for aberration (`starid.aberration`). By default it is not.
         """
         ...
 
@@ -91,16 +90,16 @@ class StarIdentifier(Protocol):
         window_px: float | None = None,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
-        """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
+        """Find the attitude near a predicted one; invalid, with the reason, if verification fails.
 
         Parameters
         ----------
         xy_px, flux, xy_sigma_px, observer_velocity
-            As in `identify`.
+            See `identify`.
         predicted : Attitude or array (4,)
             Predicted attitude at the time of the exposure, or its scalar-last quaternion.
         window_px : float, optional
-            Largest distance of a star from its predicted position, pixels.
+            Largest distance between a star and its predicted position, pixels.
         """
         ...
 
@@ -122,12 +121,12 @@ def make_identifier(
     catalog : StarCatalog, optional
         By default `load_catalog()`.
     **options
-        Keywords of the algorithm's own class.
+        Keyword arguments of the algorithm's class.
 
     Raises
     ------
     StaridError
-        No such algorithm.
+        There is no such algorithm.
     """
     if algorithm not in ALGORITHMS:
         raise StaridError(f"algorithm: must be one of {', '.join(ALGORITHMS)}, not {algorithm!r}")

@@ -1,9 +1,9 @@
-"""Decorators that compile kernels with numba and keep their machine code on disk.
+"""Decorators that compile kernels with numba and cache their machine code on disk.
 
-The machine code is kept in the cache folder (`starid.cache`), in one folder per state of the sources: that of the
-function's module and of every module of the project that it imports, directly or not. Installations with equal sources
-share it, and a changed source, in a called module too, is compiled again. Each file begins with a checksum of the rest,
-because numba runs whatever it reads; a damaged file is removed.
+The machine code is in the cache folder (`starid.cache`), in one folder per state of the sources: the module
+of the function and every module of the project that it imports, directly or not. Installations with equal
+sources share it; if any of these sources changes, the function is compiled again. Each file begins with a
+checksum of the rest, because numba runs whatever it reads; a damaged file is removed.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ _IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t
 
 
 def _import_numba_arrays() -> None:
-    """Import numba's array support without the whole of ``scipy.linalg``.
+    """Import numba's array support without importing all of ``scipy.linalg``.
 
-    numba imports ``scipy.linalg`` only to check that it exists, which takes a fifth of the time until the first kernel
-    runs, and 12 MB. scipy is a requirement of this package; a kernel that multiplies matrices imports what it needs when
-    it is called.
+    numba imports ``scipy.linalg`` only to check that it exists, which takes a fifth of the time until the
+    first kernel runs, and 12 MB. scipy is a requirement of this package; a kernel that multiplies matrices
+    imports what it needs when it is called.
     """
     linalg: Any = importlib.import_module("numba.np.linalg")
     ensure_blas = linalg.ensure_blas
@@ -58,28 +58,28 @@ _import_numba_arrays()
 
 
 def compiled(function: Kernel) -> Kernel:
-    """Compile a function of numbers and plain arrays: cached on disk, and run without the interpreter's lock."""
+    """Compile a function of numbers and plain arrays, cached on disk and run without the GIL."""
     return cast("Kernel", cached_on_disk(njit(nogil=True)(function)))
 
 
 def compiled_ieee(function: Kernel) -> Kernel:
-    """Compile as `compiled`, with divisions that follow IEEE 754 (x/0 is infinite or NaN, as in numpy arrays).
+    """Compile as `compiled`, with IEEE 754 division (x/0 is infinite or NaN, as in numpy arrays).
 
-    Without numba's test of every divisor a loop over pixels has no branch and becomes vector instructions.
+    Without numba's test of every divisor a loop over pixels has no branch and is vectorised.
     """
     return cast("Kernel", cached_on_disk(njit(nogil=True, error_model="numpy")(function)))
 
 
 def compiled_sums(function: Kernel) -> Kernel:
-    """Compile as `compiled_ieee`, with sums in any order, so that they become vector instructions too."""
+    """Compile as `compiled_ieee`, but allow sums in any order, so that they are vectorised too."""
     reordered = {"reassoc", "nsz", "contract"}
     return cast("Kernel", cached_on_disk(njit(nogil=True, error_model="numpy", fastmath=reordered)(function)))
 
 
 def inner(function: Kernel) -> Kernel:
-    """Compile a function that only other kernels call, with divisions that follow IEEE 754.
+    """Compile a function that only other kernels call, with IEEE 754 division.
 
-    It is cached only as part of the kernels that call it, and has none of the wrappers for callers in Python and C,
+    It is cached only as part of the kernels that call it, and has no wrappers for callers in Python and C,
     which would take longer to compile than the function itself.
     """
     options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
@@ -87,16 +87,16 @@ def inner(function: Kernel) -> Kernel:
 
 
 def cached_on_disk(dispatcher: Any) -> Any:
-    """Let a numba dispatcher keep its machine code on disk; returned unchanged where numba does not compile."""
+    """Cache the machine code of a numba dispatcher on disk; no effect if compilation is disabled."""
     if hasattr(dispatcher, "enable_caching"):
         dispatcher._cache = KernelCache(dispatcher.py_func)  # noqa: SLF001
     return dispatcher
 
 
 class KernelLocator:
-    """Where numba keeps the machine code of one function.
+    """Location of the machine code of one function.
 
-    In the cache folder, or in ``__pycache__`` beside the source where no cache folder can be made.
+    It is in the cache folder, or in ``__pycache__`` beside the source if no cache folder can be made.
     """
 
     def __init__(self, function: Any, source: str) -> None:
@@ -108,7 +108,7 @@ class KernelLocator:
 
     @classmethod
     def from_function(cls, function: Any, source: str) -> KernelLocator:
-        """Return the locator of a function; numba's own way to make one."""
+        """Return the locator of a function (called by numba)."""
         return cls(function, source)
 
     def get_cache_path(self) -> str:
@@ -116,25 +116,25 @@ class KernelLocator:
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
-        """Checksum that the index of the cache must carry."""
+        """Checksum that the index of the cache must have."""
         return self._stamp
 
     def get_disambiguator(self) -> str:
-        """Part of the file names that distinguishes functions of one name."""
+        """Part of the file names that distinguishes functions of the same name."""
         return str(self._line)
 
     def ensure_cache_path(self) -> None:
-        """Do nothing: the folder is made when a file is written."""
+        """Do nothing: the folder is created when a file is written."""
 
 
 class KernelCacheImpl(_NumbaCacheImpl):  # type: ignore[misc]
-    """numba's way to store machine code, with `KernelLocator` as the only place for it."""
+    """numba's storage of machine code, with `KernelLocator` as the only locator."""
 
     _locator_classes = (KernelLocator,)
 
 
 class KernelCache(_NumbaCache):  # type: ignore[misc]
-    """numba's disk cache of one function, in files that are verified."""
+    """numba's disk cache of one function, with verified files."""
 
     _impl_class = KernelCacheImpl
 
@@ -145,13 +145,14 @@ class KernelCache(_NumbaCache):  # type: ignore[misc]
 
 
 class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
-    """numba's cache files of one function, each with a checksum: a damaged one is removed and compiled again.
+    """numba's cache files of one function, each with a checksum.
 
-    Where a file cannot be written, a warning is logged and each process compiles the function.
+    A damaged file is removed and the function compiled again. If a file cannot be written, a warning is
+    logged and each process compiles the function.
     """
 
     def save(self, key: Any, data: Any) -> None:
-        """Keep the machine code of a signature."""
+        """Store the machine code of a signature."""
         folder = Path(self._cache_path)
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -162,7 +163,7 @@ class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
             evict(keep=folder)
 
     def load(self, key: Any) -> Any:
-        """Return the machine code of a signature; None where there is none."""
+        """Return the machine code of a signature, or None."""
         data = super().load(key)
         if data is not None:
             mark_used(Path(self._cache_path))
@@ -173,8 +174,8 @@ class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
             stream = io.BytesIO(self._read(Path(self._index_path)))
         except OSError:
             return {}
-        if pickle.load(stream) != self._version:  # noqa: S301 (of this package's own cache, as all below)
-            return {}  # the rest may not even be readable
+        if pickle.load(stream) != self._version:  # noqa: S301 (this package's own cache, here and below)
+            return {}  # the rest may not be readable
         stamp, overloads = pickle.load(stream)  # noqa: S301
         return overloads if stamp == self._source_stamp else {}
 
@@ -195,7 +196,7 @@ class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
 
     @staticmethod
     def _read(path: Path) -> bytes:
-        """Return the content of a file; one whose checksum is wrong is removed and counts as missing."""
+        """Read a file; if its checksum is wrong, remove it and treat it as missing."""
         data = path.read_bytes()
         size = hashlib.sha256().digest_size
         if hashlib.sha256(data[size:]).digest() != data[:size]:
@@ -207,23 +208,25 @@ class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
 
 @cache
 def _warn_not_kept(folder: Path, reason: str) -> None:
-    """Log, once per folder and reason, that machine code cannot be kept."""
-    _log.warning("%s: machine code cannot be kept (%s): each process compiles it", folder, reason)
+    """Warn, once per folder and reason, that machine code cannot be cached."""
+    _log.warning("%s: machine code cannot be cached (%s): each process compiles it", folder, reason)
 
 
 @cache
 def source_stamp(module: str) -> str:
-    """Checksum of the sources of a module and of all modules of the same top-level package or `starid` that it imports.
+    """Checksum of the sources of a module and of all modules that it imports.
+
+    Only modules of the same top-level package and of `starid` count, and only imports outside functions.
 
     Parameters
     ----------
     module : str
-        Full name of a module that is being imported or has been.
+        Full name of an imported module.
 
     Returns
     -------
     str
-        Hexadecimal; equal exactly when the sources are (imports inside functions are not followed).
+        Hexadecimal; equal exactly if the sources are.
     """
     digest = hashlib.sha256()
     roots = {"starid", module.partition(".")[0]}
@@ -247,7 +250,7 @@ def _closure(module: str, roots: set[str]) -> set[str]:
 
 @cache
 def _imports(module: str) -> tuple[str, ...]:
-    """Names in a module's top-level import statements that may be those of modules."""
+    """Names in a module's top-level import statements that may be modules."""
     names = []
     for package, members in _IMPORT.findall(_source(module)):
         names.append(package.decode())
@@ -257,7 +260,7 @@ def _imports(module: str) -> tuple[str, ...]:
 
 @cache
 def _source(module: str) -> bytes:
-    """Source of a module; empty where there is none (a class or constant, no such module)."""
+    """Source of a module; empty if there is none (a class or constant, not a module)."""
     root, *parts = module.split(".")
     home = getattr(sys.modules.get(root), "__file__", None)
     if home is None:

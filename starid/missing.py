@@ -1,4 +1,4 @@
-"""Catalogue stars that should be visible on an image and have no detection."""
+"""Catalogue stars that should be visible in an image but have no detection."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starid.errors import StaridError
 from starid.solution import Solution
 
 COMPLETE_TO: Final = 0.8
-"""Least share of the predicted stars detected in a magnitude bin for the bin to count as complete."""
+"""Share of the predicted stars that must be detected for a magnitude bin to count as complete."""
 
 _BIN: Final = 0.5
 _EDGE_PX: Final = 3.0
@@ -24,7 +24,7 @@ _EDGE_PX: Final = 3.0
 
 @dataclass(frozen=True, eq=False)
 class MissingStars:
-    """Stars that should be visible and have no detection.
+    """Stars that should be visible but have no detection.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ class MissingStars:
     magnitude : ndarray (k,)
         V magnitudes.
     complete_to : float
-        Faintest V to which nearly all predicted stars are detected: only brighter ones can be missing.
+        Faintest V to which nearly all predicted stars are detected; only brighter stars are reported.
     """
 
     hip: Indices32
@@ -54,13 +54,13 @@ def missing_stars(
     solution : Solution
         A valid solution of the detections.
     camera : Camera
-        The camera; a refined one in the solution takes precedence.
+        The camera; a refined camera in the solution takes precedence.
     stars : StarCatalog
         Stars as the camera resolves them (`Identifier.stars`).
     xy_px : array (n, 2)
         All detections, pixels.
     radius_px : float
-        A star with a detection this near, matched or not, is not missing.
+        A star with a detection within this distance, matched or not, is not missing.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def missing_stars(
 
 
 def _complete_to(magnitude: Array, seen: Mask) -> float:
-    """Faint end of the last half-magnitude bin that is complete; −inf where none is."""
+    """Faint end of the last complete half-magnitude bin; −inf if there is none."""
     limit = -math.inf
     if magnitude.size == 0:
         return limit

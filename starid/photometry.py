@@ -1,4 +1,4 @@
-"""Magnitudes: Johnson V from the Hipparcos magnitude and colour, absolute magnitudes, sums of light."""
+"""Magnitudes: Johnson V from the Hipparcos magnitude and colour, absolute magnitudes, flux ratios."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from starid.arrays import Array
 
 EVEN_PAIR: Final = 0.45
-"""Brightness ratio from which the fit of one spot to two stars lies at their common centre of light."""
+"""Brightness ratio from which a single spot fits two stars at their centre of light."""
 
 _BLUE_TO_RED_B_V: Final = np.array(
     [
@@ -40,16 +40,16 @@ _NO_COLOUR_V_HP: Final = -0.12
 def v_from_hp(hp: ArrayLike, b_v: ArrayLike, v_i: ArrayLike) -> Array:
     """Johnson V of stars from their Hipparcos magnitude and colours.
 
-    Three pieces, each V − Hp read off by linear interpolation:
+    V − Hp is interpolated linearly, in three ranges:
 
-    - V−I < 1.5: from B−V by table 2 of Bessell (2000, PASP 112, 961), its B_T−V_T column turned into B−V
-      by its own difference column;
-    - V−I > 1.7: from V−I, because B−V of M and carbon stars saturates. The knots were fitted here to some
-      thirty red stars with published V (Hipparcos 1997); mixed linearly between 1.5 and 1.7;
+    - V−I < 1.5: from B−V by table 2 of Bessell (2000, PASP 112, 961), whose B_T−V_T column is converted to
+      B−V by its column of differences;
+    - V−I > 1.7: from V−I, because B−V of M and carbon stars saturates. The knots were fitted here to about
+      thirty red stars with published V (Hipparcos 1997). Between 1.5 and 1.7 the two are mixed linearly;
     - no colour: −0.12, the typical value.
 
-    Against published V of well-known constant stars the median error is about 0.01 mag; variable stars and
-    close doubles depart by more (the tests print the figures).
+    Compared with published V of well-known constant stars the median error is about 0.01 mag; variable stars
+    and close doubles differ by more (the tests print the figures).
 
     Parameters
     ----------
@@ -88,23 +88,23 @@ def absolute_magnitude(magnitude: ArrayLike, parallax_mas: ArrayLike) -> Array:
 
 
 def flux_ratio(magnitude: ArrayLike) -> Array:
-    """Flux of magnitudes in units of a star of magnitude zero: 10^(−0.4·m)."""
+    """Flux of a magnitude relative to magnitude zero: 10^(−0.4·m)."""
     ratio: Array = 10.0 ** (-0.4 * np.asarray(magnitude, np.float64))
     return ratio
 
 
 def fitted_share(distance: Array, brightness_ratio: Array) -> Array:
-    """Share of the way to the common centre of light by which an unresolved companion shifts a star's fitted position.
+    """Shift of a fitted position by an unresolved companion, as a share of the centre of light's shift.
 
-    The fit of a single spot gives less weight to light at its rim: the shift by a faint companion falls as a Gaussian of
-    the distance; a companion with about half the star's light or more shifts it all the way. Fitted to rendered pairs,
-    to within 0.1.
+    The fit of a single spot gives less weight to light at its rim: the shift by a faint companion falls as a
+    Gaussian of the distance, but a companion with about half the light of the star or more shifts it fully.
+    The model was fitted to rendered pairs, to within 0.1.
 
     Parameters
     ----------
     distance : ndarray
-        Distance over the least distance at which two stars are resolved (some 2.4 sigma of the spot).
+        Distance relative to the smallest one at which two stars are resolved (about 2.4 sigma of the spot).
     brightness_ratio : ndarray
-        Light of the companion over the star's, at most 1.
+        Ratio of the companion's flux to the star's, at most 1.
     """
     return 1.0 - (1.0 - np.exp(-(distance**2))) * np.maximum(1.0 - (brightness_ratio / EVEN_PAIR) ** 2, 0.0)

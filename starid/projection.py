@@ -1,15 +1,15 @@
-"""Compiled projection between directions and pixels for every camera model, on plain arrays.
+"""Compiled projection between directions and pixels for all camera models, on plain arrays.
 
-A camera is one array of numbers (made by `starid.camera.Camera.params`), so that other
-compiled kernels can call these without a Python object. Each model maps a direction (x, y, z) of the
-sensor frame, of any length, to the plane:
+A camera is one array of numbers (`starid.camera.Camera.params`), so that other compiled kernels can call
+these functions without a Python object. Each model maps a direction (x, y, z) in the sensor frame, of any
+length, to the image plane:
 
 - pinhole: ``(x/z, y/z)``, z > 0;
 - equidistant: ``θ·(x, y)/hypot(x, y)``, θ the angle from the boresight;
 - flat: ``(atan2(x, z), asin(y))``, longitude and latitude about the boresight.
 
-Then come Brown–Conrady distortion (``k1, k2, p1, p2, k3``, the order and signs of OpenCV; Brown 1971),
-focal lengths and centre. Pixel centres are integers, (0, 0) top-left.
+Brown–Conrady distortion (``k1, k2, p1, p2, k3``, in OpenCV's order and with its signs; Brown 1971), the focal
+lengths and the centre are then applied. Pixel centres are integers, (0, 0) top-left.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ K3: Final = 9
 WIDTH: Final = 10
 HEIGHT: Final = 11
 LIMIT2: Final = 12
-"""Squared radius in the plane up to which the distortion is one-to-one."""
+"""Squared radius, in the image plane, up to which the distortion is one-to-one."""
 
 _MAX_ITERATIONS: Final = 60
 _MAX_HALVINGS: Final = 40
@@ -51,7 +51,7 @@ _TINY: Final = 1e-150
 
 @compiled
 def to_plane(model: float, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Plane coordinates of a direction before distortion, and whether the model maps it."""
+    """Image plane coordinates of a direction before distortion, and whether the model maps it."""
     if model == PINHOLE:
         if z <= 0.0:
             return math.nan, math.nan, False
@@ -72,7 +72,7 @@ def to_plane(model: float, x: float, y: float, z: float) -> tuple[float, float, 
 
 @compiled
 def from_plane(model: float, a: float, b: float) -> tuple[float, float, float, bool]:
-    """Return the unit direction of undistorted plane coordinates, and whether there is one."""
+    """Return the unit vector for undistorted image plane coordinates, and whether there is one."""
     if model == PINHOLE:
         k = 1.0 / math.sqrt(1.0 + a * a + b * b)
         return a * k, b * k, k, True
@@ -90,7 +90,7 @@ def from_plane(model: float, a: float, b: float) -> tuple[float, float, float, b
 
 @compiled
 def distort(params: Array, a: float, b: float) -> tuple[float, float]:
-    """Brown–Conrady distortion of plane coordinates."""
+    """Apply Brown–Conrady distortion to image plane coordinates."""
     s = a * a + b * b
     radial = 1.0 + s * (params[K1] + s * (params[K2] + s * params[K3]))
     p1, p2 = params[P1], params[P2]
@@ -117,7 +117,7 @@ def distort_slopes(params: Array, a: float, b: float) -> tuple[float, float, flo
 
 @compiled
 def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
-    """Inverse of `distort` by damped Newton steps inside the one-to-one disc; False where there is none."""
+    """Invert `distort` by damped Newton steps inside the one-to-one disc; False if there is no solution."""
     limit2 = params[LIMIT2]
     u, v = a, b
     s = u * u + v * v
@@ -156,10 +156,10 @@ def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
 
 @compiled
 def project_one(params: Array, x: float, y: float, z: float) -> tuple[float, float, bool]:
-    """Pixel (u, v) of a direction of the sensor frame, and whether it falls on the pixel array.
+    """Project a direction in the sensor frame to pixel (u, v); also return whether it is on the pixel array.
 
-    Directions beyond the field, on the one-to-one part of the lens, still get their true position, which a
-    renderer needs for light that spills in; all others get NaN.
+    A direction outside the field but on the one-to-one part of the lens gets its true position, which a
+    renderer needs for light that spills into the image; any other gets NaN.
     """
     a, b, mapped = to_plane(params[MODEL], x, y, z)
     if not mapped or a * a + b * b > params[LIMIT2]:
@@ -173,7 +173,7 @@ def project_one(params: Array, x: float, y: float, z: float) -> tuple[float, flo
 
 @compiled
 def back_project_one(params: Array, u: float, v: float) -> tuple[float, float, float, bool]:
-    """Return the unit direction (x, y, z) that a pixel position sees; NaN where it sees none."""
+    """Return the unit vector (x, y, z) of a pixel position; NaN if there is none."""
     a, b, solved = undistort(params, (u - params[CX]) / params[FX], (v - params[CY]) / params[FY])
     if not solved:
         return math.nan, math.nan, math.nan, False
@@ -182,7 +182,7 @@ def back_project_one(params: Array, u: float, v: float) -> tuple[float, float, f
 
 @compiled
 def project_kernel(params: Array, vectors: Array) -> tuple[Array, Mask]:
-    """`project_one` over vectors (n, 3): positions (n, 2) in pixels and the mask (n,) of those inside."""
+    """`project_one` for vectors (n, 3): positions (n, 2) in pixels, and the mask (n,) of those inside."""
     n = vectors.shape[0]
     xy = np.empty((n, 2))
     inside = np.empty(n, dtype=np.bool_)
@@ -193,7 +193,7 @@ def project_kernel(params: Array, vectors: Array) -> tuple[Array, Mask]:
 
 @compiled
 def back_project_kernel(params: Array, xy: Array) -> Array:
-    """`back_project_one` over positions (n, 2): unit vectors (n, 3)."""
+    """`back_project_one` for positions (n, 2): unit vectors (n, 3)."""
     n = xy.shape[0]
     vectors = np.empty((n, 3))
     for i in range(n):
@@ -228,7 +228,7 @@ def plane_slopes(
 
 @compiled
 def jacobian_kernel(params: Array, vectors: Array) -> Array:
-    """Return the derivative (n, 2, 3) of the pixel position by the direction at vectors (n, 3)."""
+    """Return the derivative (n, 2, 3) of pixel positions with respect to direction, at vectors (n, 3)."""
     n = vectors.shape[0]
     jacobian = np.empty((n, 2, 3))
     fx, fy = params[FX], params[FY]

@@ -1,4 +1,4 @@
-"""Results of long computations on disk: one file per finished part, written atomically, and a plan that guards them."""
+"""Results of long computations on disk: one file per finished part, and a plan that identifies them."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from starid.files import write_atomically
 PLAN_FILE: Final = "plan.json"
 
 Results = dict[str, NDArray[Any]]
-"""What a part yields: named arrays."""
+"""Results of a part: named arrays."""
 
 
 def write_results(path: Path, results: Mapping[str, NDArray[Any]]) -> None:
-    """Write the results of a part, whole or not at all.
+    """Write the results of a part atomically.
 
     Raises
     ------
@@ -32,7 +32,7 @@ def write_results(path: Path, results: Mapping[str, NDArray[Any]]) -> None:
 
     def write(temporary: Path) -> None:
         with temporary.open("wb") as stream:
-            np.savez_compressed(stream, **results)  # type: ignore[arg-type]  # the names are not allow_pickle
+            np.savez_compressed(stream, **results)  # type: ignore[arg-type]  # no result is named allow_pickle
 
     write_atomically(path, write)
 
@@ -62,21 +62,21 @@ def read_results(path: Path, what: str) -> Results:
 
 
 class ResultStore:
-    """A folder with a plan, and one file for each part that is finished.
+    """A folder with a plan and one file per finished part.
 
     Parameters
     ----------
     folder
         Created if missing.
     plan
-        What the results depend on: plain values, as JSON has them; tables one level deep.
+        What the results depend on: JSON values, and tables one level deep.
     what
         The kind of computation, for messages.
 
     Raises
     ------
     StaridError
-        The folder holds another plan, or cannot be used.
+        The folder contains another plan, or cannot be used.
     """
 
     def __init__(self, folder: Path, plan: Mapping[str, Any], what: str) -> None:
@@ -105,13 +105,13 @@ class ResultStore:
         Raises
         ------
         StaridError
-            Its file is damaged.
+            The file is damaged.
         """
         file = self.file(part)
         return read_results(file, self._what) if file.exists() else None
 
     def save(self, part: str, results: Mapping[str, NDArray[Any]]) -> None:
-        """Keep the results of a finished part.
+        """Save the results of a finished part.
 
         Raises
         ------
@@ -127,7 +127,7 @@ class ResultStore:
             ) from error
 
     def _check_same(self, plan_file: Path, content: dict[str, Any]) -> None:
-        """Reject a plan file with other content, naming the first difference."""
+        """Reject a plan file with other content; the error names the first difference."""
         try:
             kept = json.loads(plan_file.read_text(encoding="utf-8"))
         except ValueError as error:
@@ -146,7 +146,7 @@ class ResultStore:
 
 
 def _flat(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the plan with the keys of its inner tables as TABLE.KEY."""
+    """Flatten a plan: keys of inner tables become TABLE.KEY."""
     flat: dict[str, Any] = {}
     for key, value in content.items():
         if isinstance(value, dict):

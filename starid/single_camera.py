@@ -1,4 +1,4 @@
-"""What the star identifiers of this package share: one camera, one catalogue, checked detections, and the time taken."""
+"""Base class of the star identifiers: one camera, one catalogue, checked detections, and the time taken."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from starid.solver_input import checked_detections
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
+class CheckedDetections:
     """The checked detections of one image.
 
     Attributes
@@ -29,13 +29,13 @@ class Measured:
     xy : ndarray (n, 2)
         Positions, pixels.
     flux : ndarray (n,)
-        Brightness in any linear unit.
+        Flux in any linear unit.
     sigmas : ndarray (n, 2)
-        One-sigma errors of the positions, pixels; ones where none were given.
+        One-sigma errors of the positions, pixels; ones if none were given.
     sigmas_known : bool
-        Whether they were given.
+        Whether errors were given.
     observer_velocity : array (3,), optional
-        As in `starid.interface.StarIdentifier.identify`.
+        See `starid.interface.StarIdentifier.identify`.
     """
 
     xy: Array
@@ -46,7 +46,7 @@ class Measured:
 
     @property
     def given_sigmas(self) -> Array | None:
-        """The errors, None where none were given."""
+        """The errors, or None if none were given."""
         return self.sigmas if self.sigmas_known else None
 
     @classmethod
@@ -56,16 +56,16 @@ class Measured:
         flux: ArrayLike,
         xy_sigma_px: ArrayLike | None = None,
         observer_velocity: ArrayLike | None = None,
-    ) -> Measured:
-        """Check detections as `starid.solver_input.checked_detections` does."""
+    ) -> CheckedDetections:
+        """Check detections with `starid.solver_input.checked_detections`."""
         checked = checked_detections(xy_px, flux, xy_sigma_px)
         return cls(*checked, xy_sigma_px is not None, observer_velocity)
 
 
 class SingleCameraIdentifier(ABC):
-    """A star identifier for one camera and one catalogue, as `starid.interface.StarIdentifier` describes it.
+    """A star identifier for one camera and one catalogue (see `starid.interface.StarIdentifier`).
 
-    A solver derives from this class and finds attitudes in `_identify` and `_track`.
+    Subclasses implement `_identify` and `_track`.
     """
 
     def __init__(self, camera: Camera, catalog: StarCatalog | None) -> None:
@@ -74,12 +74,12 @@ class SingleCameraIdentifier(ABC):
 
     @property
     def camera(self) -> Camera:
-        """The camera that the positions belong to."""
+        """The camera of the positions."""
         return self._camera
 
     @property
     def catalog(self) -> StarCatalog:
-        """The catalogue whose rows `Solution.catalog_index` refers to."""
+        """The catalogue to whose rows `Solution.catalog_index` refers."""
         return self._catalog
 
     def identify(
@@ -90,12 +90,12 @@ class SingleCameraIdentifier(ABC):
         *,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
-        """Find the attitude without any prior knowledge (lost in space).
+        """Find the attitude without prior knowledge (lost in space).
 
         Parameters
         ----------
         xy_px, flux, xy_sigma_px, observer_velocity
-            As in `starid.interface.StarIdentifier.identify`.
+            See `starid.interface.StarIdentifier.identify`.
 
         Raises
         ------
@@ -103,7 +103,7 @@ class SingleCameraIdentifier(ABC):
             The shapes of the arrays disagree, or a value is not finite.
         """
         begin = time.perf_counter()
-        solution = self._identify(Measured.of(xy_px, flux, xy_sigma_px, observer_velocity))
+        solution = self._identify(CheckedDetections.of(xy_px, flux, xy_sigma_px, observer_velocity))
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
 
     def track(
@@ -116,27 +116,27 @@ class SingleCameraIdentifier(ABC):
         window_px: float | None = None,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
-        """Find the attitude near a predicted one; invalid, with the reason, where verification fails.
+        """Find the attitude near a predicted one; invalid, with the reason, if verification fails.
 
         Parameters
         ----------
         xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
-            As in `starid.interface.StarIdentifier.track`.
+            See `starid.interface.StarIdentifier.track`.
 
         Raises
         ------
         StaridError
-            As in `identify`, or the window is not positive.
+            See `identify`; also, the window is not positive.
         """
         return near(xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity, self._track)
 
     @abstractmethod
-    def _identify(self, measured: Measured) -> Solution:
-        """Return the attitude found lost in space; its time is not used."""
+    def _identify(self, measured: CheckedDetections) -> Solution:
+        """Find the attitude lost in space; `elapsed` of the result is ignored."""
 
     @abstractmethod
-    def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
-        """Return the attitude found near a predicted one; its time is not used."""
+    def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
+        """Find the attitude near a predicted one; `elapsed` of the result is ignored."""
 
 
 def near(
@@ -146,11 +146,11 @@ def near(
     xy_sigma_px: ArrayLike | None,
     window_px: float | None,
     observer_velocity: ArrayLike | None,
-    find: Callable[[Measured, Attitude, float | None], Solution],
+    find: Callable[[CheckedDetections, Attitude, float | None], Solution],
 ) -> Solution:
-    """Check detections, attitude and window, find the attitude near the one given, and take the time."""
+    """Check the input, call `find` with it, and time the call."""
     begin = time.perf_counter()
-    measured = Measured.of(xy_px, flux, xy_sigma_px, observer_velocity)
+    measured = CheckedDetections.of(xy_px, flux, xy_sigma_px, observer_velocity)
     if window_px is not None and not 0.0 < window_px < math.inf:
         raise StaridError(f"tracking window_px: must be a positive number of pixels, not {window_px}")
     known = attitude if isinstance(attitude, Attitude) else Attitude.from_quaternion(attitude)

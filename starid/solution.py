@@ -22,7 +22,7 @@ _NO_HIP: Final = np.empty(0, dtype=np.int32)
 
 
 class Reason(StrEnum):
-    """Why a solution is invalid; `OK` if and only if it is valid."""
+    """Why a solution is invalid; `OK` if it is valid."""
 
     OK = "ok"
     TOO_FEW_STARS = "too_few_stars"
@@ -44,33 +44,34 @@ class Solution:
     Attributes
     ----------
     valid : bool
-        The attitude passed its verification. When False, no other field may be used for control.
+        Whether the attitude passed verification. If False, no other field may be used for control.
     reason : Reason
         `ok`, or why there is no attitude.
     quaternion_xyzw : ndarray (4,)
-        Scalar-last, rotates ICRS into the sensor frame; NaN when invalid.
+        Scalar-last quaternion that rotates ICRS into the sensor frame; NaN if invalid.
     detection_index, catalog_index : ndarray (m,) int64
         Matched pairs: row of the detections, row of the identifier's `StarCatalog` (the brightest
         member of a group of unresolved catalogue stars).
     hip : ndarray (m,) int32
         Hipparcos numbers of the matched catalogue stars.
     covariance : ndarray (3, 3)
-        Of the rotation vector e in the sensor frame, rad²: measured attitude = ``truth.rotated(e)``.
+        Covariance of the rotation vector e in the sensor frame, rad²: measured attitude =
+        ``truth.rotated(e)``.
     rms_px : float
         Root mean square distance between matched detections and their predicted positions, pixels.
     sigma_px : float
-        Centroid noise per axis that the covariance is based on, pixels: estimated, or the scaled mean of
-        the caller's.
+        Centroid noise per axis on which the covariance is based, pixels: estimated, or the scaled mean of the
+        errors given.
     probability_false : float
-        Upper bound on the probability that chance produced an agreement as good anywhere in the search.
+        Upper bound on the probability that an agreement this good occurs by chance anywhere in the search.
     elapsed : float
-        Seconds spent.
+        Time taken, seconds.
     mode : {"lost_in_space", "tracking"}
-        The search that found it.
+        The mode in which it was found.
     rate_rad_s : ndarray (3,) or None
-        Body rate in the sensor frame, where a tracker has estimated it.
+        Body rate in the sensor frame, if estimated by a tracker.
     camera : Camera or None
-        The camera refined on the matched stars, where the field of view was uncertain.
+        The camera refined with the matched stars, if the field of view was uncertain.
     """
 
     valid: bool
@@ -107,7 +108,7 @@ class Solution:
             The solution is invalid.
         """
         if not self.valid:
-            raise StaridError(f"solution: no attitude, since it is invalid ({self.reason.value})")
+            raise StaridError(f"solution: no attitude, because it is invalid ({self.reason.value})")
         return Attitude(self.quaternion_xyzw)
 
     @property

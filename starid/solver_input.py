@@ -1,4 +1,4 @@
-"""Validation of the detections that a star identifier receives."""
+"""Validation of the input of star identifiers."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from starid.arrays import Array
 from starid.errors import StaridError
 
 FARTHEST_PX: Final = 1e9
-"""Largest coordinate accepted: no image is as large, and squares of positions must not overflow."""
+"""Largest coordinate accepted: no image is that large, and squares of positions must not overflow."""
 
 
 def _numbers(values: ArrayLike, name: str) -> Array:
-    """Contiguous copy of an array of numbers."""
+    """Make a contiguous copy of an array of numbers."""
     try:
         return np.array(values, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
@@ -24,7 +24,7 @@ def _numbers(values: ArrayLike, name: str) -> Array:
 
 
 def _all_finite(array: Array) -> bool:
-    """Whether no value is infinite or NaN; fast where the sum of the squares does not overflow."""
+    """Whether all values are finite; fast if the sum of the squares does not overflow."""
     flat = array.ravel()
     with np.errstate(over="ignore"):
         return math.isfinite(float(flat @ flat)) or bool(np.isfinite(flat).all())
@@ -33,12 +33,12 @@ def _all_finite(array: Array) -> bool:
 def checked_detections(
     xy_px: ArrayLike, flux: ArrayLike, xy_sigma_px: ArrayLike | None = None
 ) -> tuple[Array, Array, Array]:
-    """Positions (n, 2), flux (n,) and errors (n, 2), ones by default, as contiguous copies.
+    """Check detections; return contiguous positions (n, 2), flux (n,) and errors (n, 2), by default ones.
 
     Parameters
     ----------
     xy_px, flux, xy_sigma_px
-        As in `starid.interface.StarIdentifier.identify`.
+        See `starid.interface.StarIdentifier.identify`.
 
     Raises
     ------

@@ -15,20 +15,20 @@ from starid.interface import StarIdentifier
 from starid.solution import Solution
 
 LONGEST_GAP_S: Final = 10.0
-"""Longest time without a valid attitude over which a prediction is made, seconds."""
+"""Longest time without a valid attitude that a prediction bridges, seconds."""
 
 
 class Tracker:
-    """Attitude from frame to frame: predict, match near the prediction, fall back to lost in space.
+    """Track the attitude from frame to frame: predict, match nearby, or fall back to lost in space.
 
     Parameters
     ----------
     identifier : StarIdentifier
         The star identifier.
     longest_gap_s : float
-        Age of the last valid attitude beyond which the next frame is identified lost in space, seconds.
+        Largest age of the last valid attitude, seconds; beyond it the next frame is identified lost in space.
     window_px : float, optional
-        As in `StarIdentifier.track`.
+        See `StarIdentifier.track`.
 
     Attributes
     ----------
@@ -55,12 +55,12 @@ class Tracker:
         self._window_px = window_px
 
     def reset(self) -> None:
-        """Forget attitude and rate: the next frame is identified lost in space."""
+        """Forget attitude and rate, so that the next frame is identified lost in space."""
         self.attitude = None
         self.rate_rad_s = None
 
     def predict(self, time_s: float) -> Attitude | None:
-        """Predicted attitude at a time; None without a recent valid attitude."""
+        """Predict the attitude at a time; None without a recent valid attitude."""
         gap = time_s - self._time_s
         if self.attitude is None or not 0.0 <= gap <= self._longest_gap_s:
             return None
@@ -83,17 +83,18 @@ class Tracker:
         Parameters
         ----------
         xy_px, flux, xy_sigma_px, observer_velocity
-            As in `StarIdentifier.identify`.
+            See `StarIdentifier.identify`.
         time_s : float
             Time of the exposure, seconds on any monotonic clock.
         rate_hint_rad_s : array (3,), optional
-            Body rate from another source such as a gyro, sensor frame; it replaces the tracker's estimate.
+            Body rate in the sensor frame from another source, such as a gyro; it replaces the tracker's
+            estimate.
 
         Returns
         -------
         Solution
-            With `rate_rad_s` after two valid solutions. After an invalid solution the last valid attitude
-            serves predictions until `longest_gap_s` has passed.
+            With `rate_rad_s` after two valid solutions. After an invalid solution, predictions start from the
+            last valid attitude until `longest_gap_s` has passed.
         """
         if rate_hint_rad_s is not None:
             self.rate_rad_s = np.asarray(rate_hint_rad_s, dtype=np.float64)

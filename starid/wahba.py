@@ -1,7 +1,7 @@
-"""Wahba's problem: the attitude that best turns reference directions into observed ones.
+"""Wahba's problem: the attitude that best rotates reference directions into observed ones.
 
 Wahba (1965) asks for the rotation A that minimises ``½ Σ wᵢ |bᵢ − A rᵢ|²`` over the stars. The five
-estimators that the thesis names (section 1.1, its references 28–35) are here behind one function:
+estimators named in the thesis (section 1.1, its references 28–35) are available through one function:
 
 - ``davenport``: the eigenvector of the 4×4 matrix K to its largest eigenvalue (Davenport's q-method);
 - ``quest``: Shuster & Oh 1981, *Three-axis attitude determination from vector observations*;
@@ -10,9 +10,9 @@ estimators that the thesis names (section 1.1, its references 28–35) are here 
 - ``svd``: Markley 1988, *Attitude determination using vector observations and the singular value
   decomposition*.
 
-The notation is that of the survey Markley & Mortari 2000, *Quaternion attitude estimation using vector
-observations*, J. Astronautical Sciences 48, 359. Inside, quaternions are those of that literature: vector part
-of opposite sign to `starid.attitude`.
+The notation follows the survey Markley & Mortari 2000, *Quaternion attitude estimation using vector
+observations*, J. Astronautical Sciences 48, 359 (M&M). Internally, quaternions follow that literature: the
+vector part has the opposite sign to `starid.attitude`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ METHODS: Final[tuple[Method, ...]] = get_args(Method)
 """Names of the estimators."""
 
 _MIN_GAP: Final = 1e-12
-"""Distance of the two largest eigenvalues of K, for weights that sum to 1, below which roll is undetermined."""
+"""Smallest gap between the two largest eigenvalues of K (weights of sum 1) that determines roll."""
 
 _CONJUGATE: Final = np.array([-1.0, -1.0, -1.0, 1.0])
 _NEWTON_STEPS: Final = 60
@@ -42,19 +42,19 @@ _POLISHING_PASSES: Final = 2
 def solve_wahba(
     body: ArrayLike, reference: ArrayLike, weights: ArrayLike | None = None, method: Method = "davenport"
 ) -> Attitude:
-    """Attitude that minimises Wahba's loss.
+    """Find the attitude that minimises Wahba's loss.
 
     Parameters
     ----------
     body : array (n, 3)
-        Observed directions in the sensor frame; any length, normalised here. n ≥ 2.
+        Observed directions in the sensor frame, of any length; n ≥ 2.
     reference : array (n, 3)
-        The same stars' directions in ICRS.
+        Directions of the same stars in ICRS.
     weights : array (n,), optional
-        Positive weights; the best are 1/σᵢ². Equal by default.
+        Positive weights, ideally 1/σᵢ²; equal by default.
     method : {"davenport", "quest", "esoq2", "foam", "svd"}
-        The estimator. All give the same attitude to round-off, about 1e-16 over the square of the stars'
-        rms angular spread (radians), at any rotation, half turns included.
+        The estimator. All give the same attitude to rounding error, about 1e-16 over the square of the stars'
+        RMS angular spread (radians), at any rotation including half turns.
 
     Returns
     -------
@@ -64,8 +64,8 @@ def solve_wahba(
     Raises
     ------
     StaridError
-        Fewer than two stars, arrays that do not fit each other, bad weights, an unknown method, or
-        directions that leave the attitude undetermined (all collinear).
+        Fewer than two stars, arrays of different length, bad weights, an unknown method, or directions that
+        leave the attitude undetermined (all collinear).
     """
     if method not in _SOLVERS:
         raise StaridError(f"wahba: method must be one of {', '.join(METHODS)}, not {method!r}")
@@ -86,9 +86,9 @@ def solve_wahba(
 
 
 def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Array:
-    """Covariance (3, 3), rad², of the attitude's error as a rotation vector in the sensor frame.
+    """Covariance (3, 3), rad², of the attitude error as a rotation vector in the sensor frame.
 
-    For directions whose error is isotropic about the line of sight with σᵢ per axis, and weights 1/σᵢ²:
+    For directions with an isotropic error of σᵢ per axis about the line of sight, and weights 1/σᵢ²:
     ``P = [Σ σᵢ⁻² (I − bᵢ bᵢᵀ)]⁻¹`` (Shuster & Oh 1981).
 
     Parameters
@@ -96,12 +96,12 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Array:
     body : array (n, 3)
         Observed directions in the sensor frame.
     sigma_rad : array (n,) or float
-        Standard deviation of each direction on each of its two axes, radians.
+        Standard deviation of each direction per axis, radians.
 
     Raises
     ------
     StaridError
-        The arrays do not fit, a sigma is not positive, or the attitude is undetermined.
+        The arrays differ in length, a sigma is not positive, or the attitude is undetermined.
     """
     b = _directions("body", body)
     sigma = np.asarray(sigma_rad, dtype=np.float64)
@@ -118,7 +118,7 @@ def covariance(body: ArrayLike, sigma_rad: ArrayLike) -> Array:
 
 
 def _directions(name: str, values: ArrayLike) -> Array:
-    """Unit vectors (n, 3), or an error that names the array."""
+    """Normalise directions (n, 3); the error names the array."""
     try:
         table = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError):
@@ -133,7 +133,7 @@ def _directions(name: str, values: ArrayLike) -> Array:
 
 
 def _davenport_matrix(profile: Array) -> Array:
-    """K (4, 4) of the attitude profile matrix B = Σ w b rᵀ."""
+    """Davenport's matrix K (4, 4) of the attitude profile matrix B = Σ w b rᵀ."""
     (a, b, c), (d, e, f), (g, h, i) = profile.tolist()
     x, y, z = f - h, g - c, b - d
     return np.array(
@@ -147,15 +147,15 @@ def _davenport_matrix(profile: Array) -> Array:
 
 
 def _attitude(quaternion: Array) -> Attitude:
-    """Attitude of a quaternion in the convention of the literature."""
+    """Attitude from a quaternion in the convention of the literature."""
     return Attitude(quaternion * _CONJUGATE)
 
 
 def _largest_eigenvalue(profile: Array) -> float:
     """λ_max of K by Newton's method from its upper bound 1 on the quartic of FOAM (M&M eq. 40).
 
-    ψ(λ) = (λ² − ‖B‖²)² − 8λ det B − 4‖adj B‖². All roots are real, so from above the steps shrink
-    monotonically; they end when they no longer do.
+    ψ(λ) = (λ² − ‖B‖²)² − 8λ det B − 4‖adj B‖². All roots are real, so the steps from above shrink
+    monotonically; the iteration ends when they no longer do.
     """
     norm2 = float(np.vdot(profile, profile))
     determinant = _determinant(profile)
@@ -195,8 +195,8 @@ def _determinant(m: Array) -> float:
 def _polished(profile: Array, quaternion_at: Callable[[float], Array]) -> Array:
     """Quaternion at λ_max, with λ improved by the Rayleigh quotient.
 
-    The quartic loses digits of λ when two eigenvalues are close (stars close together, two stars). The
-    Rayleigh quotient qᵀKq of the first answer is right to second order and restores them.
+    The quartic loses digits of λ if two eigenvalues are close (stars close together, two stars). The Rayleigh
+    quotient qᵀKq of the first answer is accurate to second order and restores them.
     """
     k = _davenport_matrix(profile)
     quaternion = quaternion_at(_largest_eigenvalue(profile))
@@ -206,7 +206,7 @@ def _polished(profile: Array, quaternion_at: Callable[[float], Array]) -> Array:
 
 
 def _with_reference_turned(profile: Array, axis: int) -> Array:
-    """Profile matrix after the reference frame has made half a turn about an axis; 3 means none."""
+    """Profile matrix after rotating the reference frame by half a turn about an axis (3: none)."""
     if axis == 3:
         return profile
     signs = np.full(3, -1.0)
@@ -254,9 +254,9 @@ def _foam(profile: Array) -> Attitude:
 def _quest(profile: Array) -> Attitude:
     """QUEST with sequential rotations.
 
-    The Gibbs vector of the answer is singular at half a turn, so the reference frame is turned by half a
-    turn about x, y or z first where that is better. The length of the vector ((αI + βS + S²) z, γ) is the
-    scalar part of the answer times what is common to all four cases, so the longest one is the safest.
+    The Gibbs vector of the answer is singular at half a turn, so the reference frame is first rotated by half
+    a turn about x, y or z if that is better. The length of the vector ((αI + βS + S²) z, γ) is the scalar
+    part of the answer times a factor common to all four cases, so the longest is the safest.
     """
     value = _largest_eigenvalue(profile)
     cases = [_quest_vector(_with_reference_turned(profile, axis)) for axis in range(4)]
@@ -286,8 +286,8 @@ def _quest_vector(profile: Array) -> Callable[[float], Array]:
 def _esoq2(profile: Array) -> Attitude:
     """ESOQ2: the axis e is the null vector of M = (λ − σ)[(λ + σ)I − S] − z zᵀ.
 
-    It is the largest cross product of two rows. M vanishes at zero rotation, so the reference frame is
-    turned first such that σ = tr B becomes least; then λ − σ ≥ λ.
+    It is the largest cross product of two rows. M vanishes at zero rotation, so the reference frame is first
+    rotated so that σ = tr B is smallest; then λ − σ ≥ λ.
     """
     axis = int(np.argmin(np.diag(_davenport_matrix(profile))))
     turned = _with_reference_turned(profile, axis)
@@ -305,7 +305,7 @@ def _esoq2(profile: Array) -> Attitude:
 
 
 def _unit(vector: Array) -> Array:
-    """Vector of length 1."""
+    """Scale a vector to length 1."""
     scaled: Array = vector / np.linalg.norm(vector)
     return scaled
 

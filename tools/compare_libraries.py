@@ -1,6 +1,6 @@
-"""Compare kernels of starid with the libraries that could stand in their place: `pip install sep`, then run this file.
+"""Compare kernels of starid with libraries that could replace them: `pip install sep`, then run this file.
 
-Each comparison gives both the same input and times one thread. The figures are in docs/design-decisions.md.
+Both get the same input and are timed on one thread. The figures are in docs/design-decisions.md.
 """
 
 from __future__ import annotations
@@ -25,17 +25,17 @@ from starid.thesis.fsf import density_clusters
 from starid.thesis.lasso import LAMBDAS, lasso_path
 
 Array = np.ndarray[Any, np.dtype[Any]]
-Measured = tuple[str, float, str]
+Measurement = tuple[str, float, str]
 
 ISOLATION_PX = 12.0
-"""Least distance of a star that is compared from every other star."""
+"""Only stars at least this far from any other are compared."""
 
 MATCH_PX = 1.5
 FAINTEST_MAGNITUDE = 5.5
 
 
 def median_ms(work: Callable[[], object], repetitions: int) -> float:
-    """Median processor time of a call, milliseconds, after one that does not count."""
+    """Median processor time of a call, milliseconds, after a warm-up call."""
     work()
     times = []
     for _ in range(repetitions):
@@ -45,8 +45,8 @@ def median_ms(work: Callable[[], object], repetitions: int) -> float:
     return 1e3 * float(np.median(times))
 
 
-def detection(frames: int, seed: int) -> list[Measured]:
-    """Stars of rendered frames: time of a frame, and error of a position on each axis."""
+def detection(frames: int, seed: int) -> list[Measurement]:
+    """Detect stars in rendered images: time per image, and position error per axis."""
     import sep
 
     camera, sensor = Camera.from_fov(), SensorModel()
@@ -83,7 +83,7 @@ def detection(frames: int, seed: int) -> list[Measured]:
             errors[name].append(found[name][row[both]] - stars[wanted][both])
     return [
         (
-            f"{name}, {sum(map(len, errors[name]))} stars on {frames} frames",
+            f"{name}, {sum(map(len, errors[name]))} stars in {frames} images",
             float(np.median(times[name])),
             f"{float(np.sqrt(np.mean(np.concatenate(errors[name]) ** 2))):.4f} px rms per axis",
         )
@@ -91,8 +91,8 @@ def detection(frames: int, seed: int) -> list[Measured]:
     ]
 
 
-def lasso(problems: int, seed: int) -> list[Measured]:
-    """LASSO of five features and nine cells that look alike, at the thesis's hundred λ."""
+def lasso(problems: int, seed: int) -> list[Measurement]:
+    """LASSO of five features and nine similar cells, at the thesis's hundred values of λ."""
     from sklearn.linear_model import lasso_path as sklearn_path
 
     rng = np.random.default_rng(seed)
@@ -128,12 +128,12 @@ def lasso(problems: int, seed: int) -> list[Measured]:
     ]
 
 
-def clusters(seed: int) -> list[Measured]:
-    """Disparities of a frame of the thesis's filter, with 7 and with 12 objects."""
+def clusters(seed: int) -> list[Measurement]:
+    """Cluster the disparities of the thesis's filter, for 7 and for 12 objects."""
     from sklearn.cluster import DBSCAN
 
     rng = np.random.default_rng(seed)
-    rows: list[Measured] = []
+    rows: list[Measurement] = []
     for objects in (7, 12):
         pairs = objects * (objects - 1) // 2
         points = rng.uniform([-4.0, -20.0, -20.0], [4.0, 20.0, 20.0], (pairs**2, 3))
@@ -151,7 +151,7 @@ def clusters(seed: int) -> list[Measured]:
 def main() -> None:
     """Print one line for each program and input."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--frames", type=int, default=40, help="frames for detection (default 40)")
+    parser.add_argument("--frames", type=int, default=40, help="images for detection (default 40)")
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     for rows in (

@@ -1,4 +1,4 @@
-"""Compile the pipeline's kernels once, before several test processes need them at the same time."""
+"""Compile the kernels of the pipeline once, before several test processes need them at the same time."""
 
 from __future__ import annotations
 

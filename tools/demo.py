@@ -31,7 +31,7 @@ READY_WITHIN_S = 300.0
 
 @dataclass(frozen=True, slots=True)
 class Leg:
-    """One session of the demo: the script, the link that it uses, which names the folder of its logs, and the channel."""
+    """One session of the demo: script, link (also the name of the folder for its logs) and channel."""
 
     script: str
     link: str
@@ -40,7 +40,7 @@ class Leg:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Errors of the measured attitude over one leg; arrays have one entry per frame."""
+    """Errors of the measured attitude in one session; arrays have one entry per frame."""
 
     time_s: np.ndarray[Any, np.dtype[np.float64]]
     cross_arcsec: np.ndarray[Any, np.dtype[np.float64]]
@@ -89,7 +89,7 @@ def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Compa
 
 
 def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
-    """Run the OBC's session as a separate process; return whether every step passed."""
+    """Run a session of the OBC as a separate process; return whether every step passed."""
     folder = out / leg.link
     command = [
         str(Path(sys.executable).with_name("starhil")), "session", leg.script, f"--{leg.link}", leg.channel,
@@ -99,7 +99,7 @@ def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
 
 
 def plot(comparisons: dict[str, Comparison], path: Path) -> None:
-    """Plot the attitude error over time for each leg."""
+    """Plot the attitude error over time for each session."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -114,7 +114,7 @@ def plot(comparisons: dict[str, Comparison], path: Path) -> None:
             f"{name}: median body rate {np.median(found.rate_deg_s):.2f}°/s, {len(found.time_s)} frames"
         )
         axis.set_xlabel("time of exposure, s")
-        axis.set_ylabel("error to the truth, arcsec")
+        axis.set_ylabel("attitude error, arcsec")
         axis.set_yscale("log")
         axis.grid(visible=True, which="both", alpha=0.3)
         axis.legend()
@@ -122,7 +122,7 @@ def plot(comparisons: dict[str, Comparison], path: Path) -> None:
 
 
 def within_limits(found: Comparison) -> bool:
-    """Whether every sample of a leg was valid and within the error limits."""
+    """Whether every sample of a session was valid and within the error limits."""
     return (
         len(found.time_s) > 0
         and found.invalid == 0
@@ -136,7 +136,7 @@ def report(comparisons: dict[str, Comparison], console: Console) -> bool:
     table = Table(
         "figure",
         *comparisons,
-        title="Measured attitude of the ideal sensor against the truth, as the OBC read it",
+        title="Errors of the attitude of the ideal sensor, as read by the OBC",
     )
     figures: dict[str, Callable[[Comparison], str]] = {
         "frames": lambda found: str(len(found.time_s)),

@@ -1,6 +1,6 @@
-"""Write the tables of docs/ that mirror the code: `python tools/make_reference.py`, after a change of what they show.
+"""Write the tables in docs/ that are generated from the code: `python tools/make_reference.py`.
 
-A page holds its own text, and between two comments that name it a table that is written here::
+A page contains its own text and, between two comments with the name of a table, the table written here::
 
     <!-- begin: profile -->
     …
@@ -41,7 +41,7 @@ UNITS: Final = {
     "start_unix_s": "Unix time, s",
     "width": "px",
 }
-"""Units of keys whose names do not end in one."""
+"""Units of keys whose names do not end in a unit."""
 
 SUFFIXES: Final = {
     "_deg_s2": "°/s²",
@@ -53,13 +53,13 @@ SUFFIXES: Final = {
     "_px": "px",
     "_s": "s",
 }
-"""End of a key → unit, longest first."""
+"""Suffix of a key → unit, longest first."""
 
 OF_PARAMETERS: Final = ("exposure_s", "gain")
-"""Fields of the sensor model that are parameters of the device, and so no keys of `[sensor]`."""
+"""Fields of the sensor model that are parameters of the device, not keys of `[sensor]`."""
 
 LARGE: Final = 1e6
-"""Numbers from here on are shown with an exponent where that loses nothing."""
+"""Numbers from here on are shown with an exponent if no digits are lost."""
 
 Row = tuple[str, ...]
 HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
@@ -69,7 +69,7 @@ HEAD: Final[Row] = ("key", "unit", "range", "default", "meaning")
 
 
 def table(rows: list[Row], head: Row = HEAD) -> str:
-    """Return a Markdown table, without the columns in which no row has anything."""
+    """Return a Markdown table without its empty columns."""
     shown = [column for column in range(len(head)) if any(row[column] for row in rows)]
     lines = [
         "| " + " | ".join(row[column].replace("|", "\\|") for column in shown) + " |" for row in (head, *rows)
@@ -83,7 +83,7 @@ def unit(key: str) -> str:
 
 
 def literal(value: object) -> str:
-    """Return a value as a TOML file has it."""
+    """Format a value as in a TOML file."""
     if isinstance(value, BaseModel):
         items = value.model_dump(exclude_none=True).items()
         return "`{ " + ", ".join(f"{key} = {json.dumps(item)}" for key, item in items) + " }`"
@@ -106,7 +106,7 @@ def attribute_docstrings(model: type) -> dict[str, str]:
     Raises
     ------
     SystemExit
-        A field has none; the text names it.
+        A field has no docstring; the message names it.
     """
     module = ast.parse(textwrap.dedent(inspect.getsource(model)))
     body = next(node.body for node in module.body if isinstance(node, ast.ClassDef))
@@ -145,7 +145,7 @@ def documented_names(item: Any) -> dict[str, str]:
 
 
 def limits(schema: Mapping[str, Any]) -> str:
-    """Return what a JSON schema allows, in words."""
+    """Describe the values that a JSON schema allows."""
     alternatives = [inner for inner in schema.get("anyOf", ()) if inner.get("type") != "null"]
     if alternatives:
         return limits(alternatives[0]) if len(alternatives) == 1 else ""
@@ -170,7 +170,7 @@ def limits(schema: Mapping[str, Any]) -> str:
 
 
 def number(value: float) -> str:
-    """Return a number as short as it can be."""
+    """Format a number as short as possible."""
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
@@ -193,7 +193,7 @@ def default(field: FieldInfo, schema: Mapping[str, Any] | None = None) -> str:
 
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Return the models that an annotation names."""
+    """Return the models in an annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for inner in get_args(annotation) for model in models_in(inner)]
@@ -203,14 +203,14 @@ def models_in(annotation: Any) -> list[type[BaseModel]]:
 
 
 def profile() -> str:
-    """Every section of a profile whose keys are those of a model, but for the truth."""
+    """Sections of a profile whose keys come from a model, except the truth."""
     from starhil.emulator.profile import Profile
 
     return "\n\n".join(section(name, text, field) for name, text, field in plain_sections(Profile))
 
 
 def plain_sections(model: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, str, type[BaseModel]]]:
-    """Yield name, description and model of each section of a profile, sections of sections too."""
+    """Yield name, description and model of each section of a profile, including nested ones."""
     texts = attribute_docstrings(model)
     for name, field in model.model_fields.items():
         models = models_in(field.annotation)
@@ -249,7 +249,7 @@ def orbit() -> str:
 
 
 def alternatives(annotation: Any, key: str) -> Iterator[str]:
-    """Yield the section of each model of a union; its first key distinguishes it, and stands in the heading."""
+    """Yield the section of each model of a union, with its distinguishing first key in the heading."""
     for model in models_in(annotation):
         yield described(f'{key} = "{kind_of(model)}"`', model, skipped=1)
 
@@ -260,7 +260,7 @@ def described(title: str, model: type[BaseModel], skipped: int = 0) -> str:
 
 
 def kind_of(model: type[BaseModel]) -> str:
-    """Return the value of a model's first key, which distinguishes it from its alternatives."""
+    """Return the value of a model's first key, which distinguishes it from the alternatives."""
     field = next(iter(model.model_fields.values()))
     return str(get_args(field.annotation)[0])
 
@@ -301,7 +301,7 @@ def sky() -> str:
 
 
 def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> list[Row]:
-    """Return a row for each field of one of the sky's classes."""
+    """Return a row for each field of a dataclass of the sky."""
     from starhil.emulator.sky.objects import _RANGES
 
     texts = documented_names(kind)
@@ -338,7 +338,7 @@ def identifier() -> str:
 
 
 def accepted_options(algorithm: str) -> list[str]:
-    """Return the options that the emulator names when it rejects another."""
+    """Return the options that the emulator lists when it rejects an unknown one."""
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.pipeline.star_identifiers import StarIdentifierSetup
     from starid.camera import DEFAULT_CAMERA
@@ -352,7 +352,7 @@ def accepted_options(algorithm: str) -> list[str]:
 
 
 def faults() -> str:
-    """Keys of the tables of a `fault` request, but for the optical ones, which are those of `[sky]`."""
+    """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
     from starhil.emulator.control.faults import DeviceFault, WireFault
     from starhil.protocol.icd import load_unit
 
@@ -495,7 +495,7 @@ def commands() -> str:
 
 
 def command_parts(name: str, command: Any) -> Iterator[str]:
-    """Yield the section of a command, or those of the commands of a group."""
+    """Yield the section of a command, or of each command in a group."""
     if hasattr(command, "commands"):
         for inner, item in command.commands.items():
             yield from command_parts(f"{name} {inner}", item)
@@ -509,13 +509,13 @@ def command_parts(name: str, command: Any) -> Iterator[str]:
 
 
 def argument_usage(parameter: Any) -> str:
-    """Return an argument as a usage line has it."""
+    """Format an argument for a usage line."""
     name = argument_name(parameter) + ("…" if parameter.nargs == -1 else "")
     return name if parameter.required else f"[{name}]"
 
 
 def argument_name(parameter: Any) -> str:
-    """Return the name of an argument; one that would hide a Python name ends in an underscore there."""
+    """Return the name of an argument, without the underscore that avoids hiding a Python name."""
     return str(parameter.name).rstrip("_").upper()
 
 
@@ -531,7 +531,7 @@ def option_row(parameter: Any) -> str:
 
 
 def shown_default(value: Any) -> str:
-    """Return the default of an option; flags that are off and options that are not given have none."""
+    """Format the default of an option; empty for flags that are off and options without a default."""
     if value is None or value is False or value in ("", (), []) or callable(value):
         return ""
     return f"`{' '.join(str(item) for item in value)}`" if isinstance(value, tuple | list) else f"`{value}`"
@@ -552,18 +552,18 @@ TABLES: Final[dict[str, Callable[[], str]]] = {
     "truth": truth,
     "unit_definition": unit_definition,
 }
-"""Name of a table in a page → what writes it."""
+"""Name of a table in a page → function that writes it."""
 
 _BLOCK: Final = re.compile(r"(<!-- begin: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
 
 
 def with_tables(page: str) -> str:
-    """Return a page with its tables as the code is now."""
+    """Return a page with its tables updated from the code."""
     return _BLOCK.sub(lambda found: f"{found[1]}\n{TABLES[found[2]]()}\n\n{found[3]}", page)
 
 
 def pages() -> list[Path]:
-    """Pages that hold tables of the code."""
+    """Return the pages that contain generated tables."""
     return [path for path in sorted(DOCS.glob("*.md")) if _BLOCK.search(path.read_text(encoding="utf-8"))]
 
 

@@ -71,7 +71,7 @@ def main() -> int:
 
 
 def _solve(seed: int, defects: dict[str, Any]) -> tuple[float | None, float]:
-    """Error of the image's centre, arcseconds (None without an answer), and processor time, seconds."""
+    """Error of the image centre, arcseconds (None without an answer), and processor time, seconds."""
     from starid.attitude import ARCSEC_PER_RAD
     from starid.camera import Camera
     from starid.catalog import load_catalog

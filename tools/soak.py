@@ -67,7 +67,7 @@ FAULTS: tuple[dict[str, Any], ...] = (
 
 @dataclass(frozen=True)
 class Sample:
-    """Measurements after a round: elapsed time (s), memory (MB), descriptors, p99 latency of each link (ms)."""
+    """Measurements after a round: elapsed time, memory, open descriptors, p99 latency of each link."""
 
     time_s: float
     memory_mb: float
@@ -122,7 +122,7 @@ def compare(samples: Sequence[Sample]) -> list[Figure]:
 
 
 def processes(pid: int) -> Iterator[int]:
-    """A process and all that descend from it."""
+    """Yield a process and all its descendants."""
     yield pid
     children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii")
     for child in children.split():
@@ -130,12 +130,12 @@ def processes(pid: int) -> Iterator[int]:
 
 
 def descriptors(pids: Sequence[int]) -> int:
-    """Open descriptors of processes."""
+    """Count the open descriptors of processes."""
     return sum(len(list(Path(f"/proc/{pid}/fd").iterdir())) for pid in pids)
 
 
 def settled_descriptors(pids: Sequence[int]) -> int:
-    """Open descriptors when the ends of closed connections have been closed too."""
+    """Count open descriptors once both ends of closed connections are closed."""
     deadline = time.monotonic() + SETTLE_S
     count = descriptors(pids)
     while time.monotonic() < deadline:
@@ -159,12 +159,12 @@ class Control:
         self._lines = self._socket.makefile("rw", encoding="utf-8")
 
     def do(self, action: str, **values: Any) -> dict[str, Any]:
-        """Send a request and return its answer.
+        """Send a request and return the answer.
 
         Raises
         ------
         BenchError
-            The emulator rejects it, or is gone.
+            The emulator rejects it, or has ended.
         """
         self._lines.write(json.dumps({"do": action, **values}) + "\n")
         self._lines.flush()
@@ -186,7 +186,7 @@ class Soak:
     def __init__(self, emulator: EmulatorProcess, hub: EmulatorProcess, folder: Path) -> None:
         self._emulator, self._hub, self._folder = emulator, hub, folder
         self._links = {"serial": emulator.ready["serial"], "can": emulator.ready["can"]}
-        self._rng = random.Random(1)  # noqa: S311 (rows to ask for, not secrets)
+        self._rng = random.Random(1)  # noqa: S311 (rows to request, not secrets)
         self._begin = time.monotonic()
 
     @property
@@ -195,7 +195,7 @@ class Soak:
         return time.monotonic() - self._begin
 
     def round(self, number: int) -> Sample:
-        """Run a session, put faults in and out, and measure.
+        """Run a session, inject and clear faults, and measure.
 
         Raises
         ------
@@ -227,7 +227,7 @@ class Soak:
         return ObcClient.open(can=self._links[link], timeout_s=timeout_s)
 
     def _ask_in_vain(self, link: str) -> None:
-        """Send requests while faults are in; that some are not answered is what faults do."""
+        """Send requests while faults are active; some are not answered."""
         with self._client(link, FAULTY_TIMEOUT_S) as obc:
             for _ in range(FAULTY_REQUESTS):
                 with contextlib.suppress(DeviceError):
@@ -235,7 +235,7 @@ class Soak:
 
     def _latency_p99_ms(self, link: str) -> float:
         with self._client(link, SETTLE_S) as obc:
-            obc.telemetry("identification")  # the connection warms up
+            obc.telemetry("identification")  # warm up the connection
             taken = []
             for _ in range(REQUESTS):
                 begin = time.perf_counter()
@@ -245,7 +245,7 @@ class Soak:
 
 
 def soak(seconds: float) -> list[Sample]:
-    """Run rounds for some time and return their samples; prints each."""
+    """Run rounds for a time, print each, and return the samples."""
     samples: list[Sample] = []
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="starhil-soak-")))
@@ -273,7 +273,7 @@ def soak(seconds: float) -> list[Sample]:
 
 
 def main() -> int:
-    """Soak and print; 0 if nothing grew."""
+    """Run the soak test and print the result; return 0 if nothing grew."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=15.0, help="how long")
     minutes = parser.parse_args().minutes

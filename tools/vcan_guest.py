@@ -78,12 +78,12 @@ class GuestError(Exception):
 
 
 def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, memory: str) -> int:
-    """Run `command` in a fresh guest and return its exit status.
+    """Run a command in a new guest and return its exit status.
 
     Raises
     ------
     GuestError
-        A program is missing, the time is over, or the guest did not come up.
+        A program is missing, the command timed out, or the guest did not boot.
     """
     missing = {name: NEEDED[name] for name in NEEDED if shutil.which(name, path=SYSTEM_PATH) is None}
     if missing:
@@ -125,10 +125,10 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
 
 
 def source_times(folder: Path) -> dict[str, int]:
-    """Return the times of change (ns) of the Python files below a folder, hidden folders left out.
+    """Return the modification times (ns) of the Python files below a folder, except in hidden folders.
 
-    The host file system shows a guest whole seconds only. Caches of compiled code compare the full time, so
-    that the guest must set it again; otherwise everything would be compiled again.
+    A guest sees only whole seconds on the host file system. Caches of compiled code compare the full time, so
+    the guest must restore it; otherwise everything would be compiled again.
     """
     times = {}
     for directory, names, files in os.walk(folder):
@@ -141,9 +141,9 @@ def source_times(folder: Path) -> dict[str, int]:
 
 
 def boot(init: Path, folder: Path, console: BinaryIO, *, memory: str, time_out_s: float) -> bool:
-    """Boot the guest and wait for its end; true if it had to be ended because its time was over."""
+    """Boot the guest and wait for its end; return True if it had to be ended after the timeout."""
     with contextlib.ExitStack() as stack:
-        # each guest console needs a descriptor of its own, also when the two streams are one file
+        # each guest console needs a separate descriptor, even if both streams are the same file
         streams = [os.dup(sys.stdout.fileno()), os.dup(sys.stderr.fileno())]
         for descriptor in streams:
             stack.callback(os.close, descriptor)
@@ -178,7 +178,7 @@ def boot(init: Path, folder: Path, console: BinaryIO, *, memory: str, time_out_s
 
 
 def end_group(process: subprocess.Popen[bytes]) -> None:
-    """End the guest's kernel and every process of its own, if any is left."""
+    """End the kernel of the guest and any remaining process of it."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         with contextlib.suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -190,7 +190,7 @@ def end_group(process: subprocess.Popen[bytes]) -> None:
 
 
 def guest_main(job_file: Path) -> None:
-    """Be the guest's first process: set the machine up, run the command, hand out its status, power off."""
+    """Run as the guest's first process: set up the machine, run the command, report its status, power off."""
     libc = ctypes.CDLL(None, use_errno=True)
     try:
         job = json.loads(job_file.read_text(encoding="utf-8"))
@@ -211,7 +211,7 @@ def guest_main(job_file: Path) -> None:
 def mount(
     libc: ctypes.CDLL, kind: str, target: str | Path, *, source: str = "none", data: str | None = None
 ) -> None:
-    """Mount a file system; an error names the target."""
+    """Mount a file system; the error names the target."""
     options = None if data is None else os.fsencode(data)
     if libc.mount(os.fsencode(source), os.fsencode(str(target)), kind.encode("ascii"), 0, options) != 0:
         number = ctypes.get_errno()
@@ -219,14 +219,14 @@ def mount(
 
 
 def insert_modules(names: tuple[str, ...]) -> None:
-    """Load kernel modules of the running guest kernel."""
+    """Load modules of the running guest kernel."""
     root = f"/usr/lib/uml/modules/{os.uname().release}/kernel"
     for name in names:
         subprocess.run(["insmod", f"{root}/{name}.ko"], check=True)
 
 
 def prepare_root(libc: ctypes.CDLL, job: dict[str, Any]) -> Path:
-    """Put a writable layer in memory over the host's root and enter it; return the folder for the status."""
+    """Mount a writable in-memory layer over the host's root and enter it; return the folder for the status."""
     mount(libc, "proc", "/proc")
     insert_modules((OVERLAY_MODULE,))
     mount(libc, "tmpfs", "/mnt", data="mode=755,size=80%")
@@ -249,7 +249,7 @@ def prepare_root(libc: ctypes.CDLL, job: dict[str, Any]) -> Path:
     os.chroot(root)
     os.chdir(job["folder"])
     for path, time_ns in job["times_ns"].items():
-        with contextlib.suppress(OSError):  # below a shared folder, or gone since
+        with contextlib.suppress(OSError):  # below a shared folder, or removed since
             os.utime(path, ns=(time_ns, time_ns))
     return Path("/run/vcan-guest")
 
@@ -286,14 +286,14 @@ def run_command(job: dict[str, Any]) -> int:
             thread.start()
         status = process.wait()
         for thread in pumps:
-            thread.join(timeout=KILL_GRACE_S)  # a grandchild left behind may hold the stream open
+            thread.join(timeout=KILL_GRACE_S)  # a remaining grandchild may hold the stream open
     for console in consoles:
         termios.tcdrain(console)
     return status if status >= 0 else 128 - status
 
 
 def pump(source: BinaryIO, sink: int) -> None:
-    """Copy a stream until its end, piece by piece as it comes."""
+    """Copy a stream to its end as data arrive."""
     while piece := os.read(source.fileno(), 65536):
         view = memoryview(piece)
         while view:

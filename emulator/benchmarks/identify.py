@@ -27,7 +27,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
-from starid.geometric.pattern_index import seen_stars
+from starid.geometric.pattern_index import resolved_stars
 
 Array = NDArray[np.float64]
 
@@ -260,7 +260,7 @@ class _Field:
     """
 
     def __init__(self, camera: Camera, limit: float) -> None:
-        stars = seen_stars(load_catalog(), limit + _DEEPER_V, _BLEND_PX * camera.pixel_scale_rad)
+        stars = resolved_stars(load_catalog(), limit + _DEEPER_V, _BLEND_PX * camera.pixel_scale_rad)
         self.maker = SceneMaker(camera, stars)
         self.known = stars.brighter_than(limit)
         self.solvers: dict[str, Solver] = {}

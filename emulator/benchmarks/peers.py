@@ -29,7 +29,7 @@ from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.geometric.pattern_index import field_solid_angle
-from starid.geometric.pattern_stars import pick_pattern_stars
+from starid.geometric.pattern_stars import select_pattern_stars
 from starid.interface import CLASSICS, make_identifier
 from starid.solution import Solution
 
@@ -236,7 +236,7 @@ def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> 
     if name.endswith(EVEN):
         if verify:
             raise UnsuitedError("verification needs all guide stars; use evenly spread ones with --raw")
-        picked = pick_pattern_stars(stars.vectors, field_solid_angle(camera), EVEN_PER_FIELD)
+        picked = select_pattern_stars(stars.vectors, field_solid_angle(camera), EVEN_PER_FIELD)
         guide = stars.subset(picked)
     identifier: Any = make_identifier(
         name.removesuffix(EVEN),

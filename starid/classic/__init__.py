@@ -1,1 +1,1 @@
-"""Published star identification algorithms, each in its own module, behind the interface of all identifiers."""
+"""Published star identification algorithms, one per module, behind a common interface."""

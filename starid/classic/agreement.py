@@ -1,7 +1,8 @@
 """The largest group of proposed matches whose mutual distances agree with the catalogue.
 
-Most published algorithms end with matched stars and a last check that they belong together: all in one field, or all at
-the right distances from each other. The latter holds for every sensor and is done here once for all.
+Most published algorithms end by checking that the matched stars belong together: that they lie in one field,
+or that they are the right distances apart. The second check works for every sensor and is implemented here
+for all.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from starid.jit import compiled_ieee, inner
 from starid.wahba import solve_wahba
 
 MIN_GROUP: Final = 3
-"""Matches that an attitude needs: of two, chance finds as many as one likes."""
+"""Smallest group that is accepted: chance produces any number of pairs."""
 
 
 @inner
 def compatible(directions: Array, vectors: Array, pairs: Indices, a: int, b: int, tolerance: float) -> bool:
-    """Whether two matches name different stars, seen as far apart as the catalogue has them."""
+    """Whether two matches are of different stars, at the distance that the catalogue has."""
     if pairs[a, 0] == pairs[b, 0] or pairs[a, 1] == pairs[b, 1]:
         return False
     seen = chord_between(directions, pairs[a, 0], directions, pairs[b, 0])
@@ -33,9 +34,9 @@ def compatible(directions: Array, vectors: Array, pairs: Indices, a: int, b: int
 def group_around(
     directions: Array, vectors: Array, pairs: Indices, seed: int, tolerance: float, members: Indices
 ) -> int:
-    """Collect matches that agree with one of them, and with all that were collected before; return how many.
+    """Collect the matches that agree with `seed` and with each other; return their number.
 
-    Those that agree with most others come first (`members` (m,) receives the rows).
+    Those that agree with the most others come first; their rows are written to `members` (m,).
     """
     n = pairs.shape[0]
     support = np.zeros(n, dtype=np.int64)
@@ -65,7 +66,7 @@ def group_around(
 
 @compiled_ieee
 def _largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance: float) -> Indices:
-    """Rows of the largest group over all seeds; the first of those equally large."""
+    """Rows of the largest group over all seeds; of equal ones, the first."""
     members, best = np.empty(pairs.shape[0], dtype=np.int64), np.empty(0, dtype=np.int64)
     for seed in range(pairs.shape[0]):
         count = group_around(directions, vectors, pairs, seed, tolerance, members)
@@ -75,7 +76,7 @@ def _largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance:
 
 
 def largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance: float) -> Indices:
-    """Matches that agree with each other in every distance, as many as can be found from each of them.
+    """Find the largest group of matches that all agree with each other in distance.
 
     Parameters
     ----------
@@ -84,30 +85,30 @@ def largest_group(directions: Array, vectors: Array, pairs: Indices, tolerance: 
     vectors : ndarray (N, 3)
         Unit vectors of the guide stars.
     pairs : ndarray (m, 2)
-        Proposed matches: row of an observed star, row of a guide star; a star may stand in several.
+        Proposed matches: row of an observed star, row of a guide star; a star may occur in several.
     tolerance : float
         Largest difference of two chords.
 
     Returns
     -------
     ndarray (k, 2)
-        The group, empty where it has fewer than `MIN_GROUP` members or is the mirror image of the sky.
+        The group; empty if it has fewer than `MIN_GROUP` members or is a mirror image of the sky.
     """
     none = np.empty((0, 2), dtype=np.int64)
     if len(pairs) < MIN_GROUP:
         return none
     unique = np.unique(pairs, axis=0)
     group = unique[_largest_group(directions, vectors, unique, tolerance)]
-    if len(group) < MIN_GROUP or not _same_hand(directions, vectors, group, tolerance):
+    if len(group) < MIN_GROUP or not _is_not_mirrored(directions, vectors, group, tolerance):
         return none
     return group[np.argsort(group[:, 0])]
 
 
-def _same_hand(directions: Array, vectors: Array, group: Indices, tolerance: float) -> bool:
-    """Whether a turn brings the stars of the group onto the observed ones; distances alone fit the mirror image too."""
+def _is_not_mirrored(directions: Array, vectors: Array, group: Indices, tolerance: float) -> bool:
+    """Whether the group is not a mirror image: a rotation brings its stars onto the observed ones."""
     seen, stars = directions[group[:, 0]], vectors[group[:, 1]]
     try:
         residual = solve_wahba(seen, stars).to_sensor(stars) - seen
-    except StaridError:  # stars on one line
+    except StaridError:  # collinear stars
         return False
     return bool(np.median(np.linalg.norm(residual, axis=1)) <= tolerance)

@@ -1,17 +1,17 @@
 """GV, geometric voting.
 
-M. Kolomenkin, S. Pollak, I. Shimshoni, M. Lindenbaum, "Geometric voting algorithm for star trackers", IEEE Transactions on
-Aerospace and Electronic Systems 44(2), 441–456, 2008.
+M. Kolomenkin, S. Pollak, I. Shimshoni, M. Lindenbaum, "Geometric voting algorithm for star trackers", IEEE
+Transactions on Aerospace and Electronic Systems 44(2), 441–456, 2008.
 
 Every pair of observed stars votes: each of its two stars gets a vote for both stars of every catalogue pair
-that is as far apart, within a tolerance. Each observed star takes the catalogue star with the most votes. In a second
-vote two such matches vote for each other if their catalogue stars are as far apart as the observed ones; those
-whose votes are near the highest are kept.
+of the same separation, within a tolerance. Each observed star is matched to the catalogue star with the most
+votes. In a second vote two matches vote for each other if their catalogue stars are as far apart as the
+observed ones, and the matches whose votes are near the highest are kept.
 
-own choice: "near the highest" is at least half of it, the share that a star must have if it agrees with more than
-half of those that the best one agrees with.
-own choice: a tolerance of 1.5 standard deviations. Chance votes grow with it, and most in the crowded parts of the sky, true ones
-hardly: tried on random fields of 42° and 12°, 1.5 identified more than 0.75 and 3 at every noise from 0.5 px.
+own choice: "near the highest" is at least half of the highest, which a star reaches if it agrees with more
+than half of the stars that the best one agrees with. own choice: a tolerance of 1.5 standard deviations. A
+larger one adds many chance votes, most of them in crowded parts of the sky, and hardly any true ones: on
+random fields of 42° and 12°, 1.5 identified more than 0.75 and 3 at every noise from 0.5 px upwards.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
 
 KEPT_SHARE: Final = 0.5
-"""Share of the highest number of votes that a match needs in the second vote."""
+"""Votes that a match needs in the second vote, as a share of the highest."""
 
 
 @compiled_ieee
 def votes_of(table: PairTable, stars: int, seen: Array, tolerance: float) -> Indices32:
-    """Votes (n, stars) of all pairs of observed stars for the catalogue stars of both ends."""
+    """Votes (n, stars) that the pairs of observed stars cast for catalogue stars."""
     n = seen.shape[0]
     votes = np.zeros((n, stars), dtype=np.int32)
     for i in range(n):
@@ -49,7 +49,7 @@ def votes_of(table: PairTable, stars: int, seen: Array, tolerance: float) -> Ind
 
 @compiled_ieee
 def _second_vote(vectors: Array, seen: Array, matched: Indices, tolerance: float) -> Indices:
-    """Number of other matches that each match agrees with in its distance."""
+    """Count, for each match, the other matches that agree with it in distance."""
     n = seen.shape[0]
     votes = np.zeros(n, dtype=np.int64)
     for i in range(n):
@@ -64,7 +64,7 @@ def _second_vote(vectors: Array, seen: Array, matched: Indices, tolerance: float
 
 
 class GeometricVotingIdentifier(ClassicIdentifier):
-    """Geometric voting behind the interface of all identifiers."""
+    """Geometric voting behind the common interface of all identifiers."""
 
     tolerance_px: ClassVar[float] = 1.5
     sigmas: ClassVar[float] = 1.5

@@ -1,16 +1,18 @@
 """GA, the grid algorithm.
 
-C. Padgett, K. Kreutz-Delgado, "A grid algorithm for autonomous star identification", IEEE Transactions on Aerospace and
-Electronic Systems 33(1), 202–213, 1997.
+C. Padgett, K. Kreutz-Delgado, "A grid algorithm for autonomous star identification", IEEE Transactions on
+Aerospace and Electronic Systems 33(1), 202–213, 1997.
 
-A pivot star is put in the middle, its nearest neighbour beyond a buffer radius is turned onto the +x axis, and a g × g
-grid is laid over the pattern radius: the cells that hold a star are the pattern. A look-up table leads from each cell to
-the guide stars whose pattern has it; the one that collects most votes is the pivot, if it has enough and no other has as
-many. Every observed star is tried as the pivot; the largest group of matches that fits into one field stands.
+A pivot star is put at the origin, its nearest neighbour beyond a buffer radius is turned onto the +x axis,
+and a g × g grid is laid over the pattern radius: the cells that hold a star are the pattern. A lookup table
+leads from each cell to the guide stars whose pattern has that cell. The guide star that collects the most
+votes is the pivot, if it has enough and no other has as many. Every observed star is tried as the pivot, and
+the largest group of matches that fits into one field is the result.
 
-own choice: pattern radius 0.65 of the width of the field, buffer 0.15 of it (a nearer neighbour turns the grid by more than a cell at its
-rim), g = 40 as in the paper, and at least 4 votes. Guide stars that are equal in votes, four at most, are all left to the last step.
-own choice: "fits into one field" is tested as agreement of all distances, as for all algorithms here.
+own choice: pattern radius 0.65 of the width of the field, buffer 0.15 of the pattern radius (a nearer
+neighbour turns the grid by more than a cell at its rim), g = 40 as in the paper, and at least 4 votes. Up to
+four guide stars with equal votes are all passed to the last step. own choice: "fits into one field" is tested
+as agreement of all distances, as for all algorithms here.
 """
 
 from __future__ import annotations
@@ -34,16 +36,16 @@ from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
 Table: TypeAlias = tuple[Indices32, NDArray[np.uint16]]
-"""First entry of each cell in the second array, and the guide stars whose pattern has it."""
+"""First entry of each cell in the second array; the guide stars whose pattern has the cell."""
 
 GRID: Final = 40
 """Cells along each side of the grid."""
 
 RADIUS_SHARE: Final = 0.65
-"""Pattern radius over the width of the field."""
+"""Pattern radius as a share of the width of the field."""
 
 BUFFER_SHARE: Final = 0.15
-"""Buffer radius over the pattern radius."""
+"""Buffer radius as a share of the pattern radius."""
 
 MIN_VOTES: Final = 4
 MAX_NEIGHBOURS: Final = 400
@@ -51,7 +53,7 @@ MAX_NEIGHBOURS: Final = 400
 
 @inner
 def place_on_grid(polar: Array, i: int, reference: float, radius: float, cells: int) -> tuple[float, float]:
-    """Position of a neighbour in units of cells, the grid turned to a reference azimuth."""
+    """Position of a neighbour, in cells, on a grid turned to a reference azimuth."""
     angle = turned(polar[i, 1], reference)
     half = 0.5 * cells
     x = half + half * polar[i, 0] / radius * np.cos(angle)
@@ -61,7 +63,7 @@ def place_on_grid(polar: Array, i: int, reference: float, radius: float, cells: 
 
 @inner
 def occupied_cells(polar: Array, count: int, aligned: int, radius: float, cells: int, out: Indices) -> int:
-    """Fill in the cells that hold a star, each once, the grid turned to a neighbour; return how many."""
+    """Collect the occupied cells of a grid turned to a neighbour; return their number."""
     filled = 0
     for i in range(count):
         x, y = place_on_grid(polar, i, polar[aligned, 1], radius, cells)
@@ -76,8 +78,8 @@ def occupied_cells(polar: Array, count: int, aligned: int, radius: float, cells:
 
 
 @compiled_ieee
-def look_up_table(vectors: Array, magnitude: Array, radius: float, buffer: float) -> Table:
-    """First entry of each cell, and the stars whose pattern has it.
+def lookup_table(vectors: Array, magnitude: Array, radius: float, buffer: float) -> Table:
+    """Build the table from cells to guide stars.
 
     Each pattern is aligned with its nearest star beyond the buffer in the brighter half (`bright_neighbour`).
     """
@@ -101,7 +103,7 @@ def look_up_table(vectors: Array, magnitude: Array, radius: float, buffer: float
 def count_votes(
     table: Table, polar: Array, count: int, aligned: int, radius: float, found: Indices, votes: Indices32
 ) -> int:
-    """Add a vote for each star whose pattern has a cell of the observed one; return the cells of that."""
+    """Vote for the stars whose patterns share cells with the observed one; return its number of cells."""
     start, owner = table
     cells = occupied_cells(polar, count, aligned, radius, GRID, found)
     for k in range(cells):
@@ -112,7 +114,7 @@ def count_votes(
 
 @compiled_ieee
 def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -> Indices:
-    """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
+    """Match (m, 2) each observed star, as the pivot, with the guide stars that have the most votes."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
@@ -129,16 +131,16 @@ def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -
 
 
 class GridIdentifier(ClassicIdentifier):
-    """The grid algorithm behind the interface of all identifiers."""
+    """The grid algorithm behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
 
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad
         self._buffer = BUFFER_SHARE * self._radius
-        # magnitudes that are all alike: the nearest neighbour, bright or faint
+        # equal magnitudes, so that the nearest neighbour counts, bright or faint
         alike = np.zeros(len(self.guide))
-        self.table = look_up_table(self.guide.vectors, alike, self._radius, self._buffer)
+        self.table = lookup_table(self.guide.vectors, alike, self._radius, self._buffer)
         return self.table
 
     def _match(self, observed: Observed) -> Indices:

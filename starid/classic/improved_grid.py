@@ -1,21 +1,23 @@
 """IG, the improved grid algorithm.
 
-M. Aghaei, H. A. Moghaddam, "Grid star identification improvement using optimization approaches", IEEE Transactions on Aerospace
-and Electronic Systems 52(5), 2080–2090, 2016.
+M. Aghaei, H. A. Moghaddam, "Grid star identification improvement using optimization approaches", IEEE
+Transactions on Aerospace and Electronic Systems 52(5), 2080–2090, 2016.
 
-The thesis's IG, its reference [94], may be another: J. Li, X. Wei, G. Wang, S. Zhou, "Improved Grid Algorithm Based on Star Pair Pattern and
-Two-dimensional Angular Distances for Full-Sky Star Identification", IEEE Access 8, 1010–1020, 2020, of which only the abstract was available.
-It compares itself with the grid and the pyramid algorithms, whose rates the thesis quotes from the same place.
+The thesis's IG, its reference [94], may be another: J. Li, X. Wei, G. Wang, S. Zhou, "Improved Grid Algorithm
+Based on Star Pair Pattern and Two-dimensional Angular Distances for Full-Sky Star Identification", IEEE
+Access 8, 1010–1020, 2020, of which only the abstract was available. That paper compares itself with the grid
+and the pyramid algorithms, and the thesis quotes their rates from the same place.
 
-Three changes to the grid algorithm. Neighbours are clustered by brightness and the grid is aligned with a bright one, and with
-several in turn, since a bright star is seldom missing and its place in the order of distance seldom wrong. Of every look-up the
-two best matches are kept. The threshold on the votes is that of Bayes' decision between a true and a chance match.
+The grid algorithm is changed in three ways. Neighbours are clustered by brightness, and the grid is aligned
+with several bright ones in turn, since a bright star is seldom missing or out of order. The two best matches
+of every lookup are kept. The threshold on the votes is the Bayesian decision between a true and a chance
+match.
 
-own choice: the bright cluster is the brighter half of a pattern; guide patterns are aligned with its nearest star beyond the buffer,
-observed ones with its three nearest in turn.
-own choice: votes are binomial. An observed cell is in the true pattern with probability 0.5 (noise, rim of the field, stars that come and
-go) and in another's with the share of cells that patterns fill on the average. A match stands when its odds
-outweigh the prior, one guide star among all.
+own choice: the bright cluster is the brighter half of a pattern; guide patterns are aligned with its nearest
+star beyond the buffer, observed ones with its three nearest in turn. own choice: votes are binomial. An
+observed cell is in the true pattern with probability 0.5 (noise, the rim of the field, missing and false
+stars), and in any other with the mean share of cells that a pattern fills. A match is accepted when its odds
+outweigh the prior of one guide star among all.
 """
 
 from __future__ import annotations
@@ -33,27 +35,27 @@ from starid.classic.grid import (
     RADIUS_SHARE,
     Table,
     count_votes,
-    look_up_table,
+    lookup_table,
 )
 from starid.classic.neighbours import bright_neighbour, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
 
 ALIGNMENTS: Final = 3
-"""Neighbours that an observed pattern is aligned with in turn."""
+"""Number of neighbours with which an observed pattern is aligned in turn."""
 
 KEPT: Final = 2
-"""Best matches of each look-up that are kept."""
+"""Number of matches kept of each lookup."""
 
 HIT_RATE: Final = 0.5
 """Probability that an observed cell is in the true pattern."""
 
 
 @compiled_ieee
-def _look_up(
+def _lookup(
     table: Table, stars: int, seen: tuple[Array, Array], radius: float, buffer: float, fill: float
 ) -> Indices:
-    """Matches (m, 2) whose votes pass the Bayesian threshold, the best two of each pivot and alignment."""
+    """Find, for each pivot and alignment, the two best matches (m, 2) above the Bayesian threshold."""
     directions, magnitude = seen
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     found = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
@@ -79,7 +81,7 @@ def _look_up(
 
 
 class ImprovedGridIdentifier(ClassicIdentifier):
-    """The improved grid algorithm behind the interface of all identifiers."""
+    """The improved grid algorithm behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
 
@@ -87,12 +89,12 @@ class ImprovedGridIdentifier(ClassicIdentifier):
         self._radius = RADIUS_SHARE * self.width_rad
         self._buffer = BUFFER_SHARE * self._radius
         guide = self.guide
-        self.table = look_up_table(guide.vectors, guide.magnitude, self._radius, self._buffer)
-        # a pattern's own cell for its alignment star aside, cells are filled evenly over the circle
+        self.table = lookup_table(guide.vectors, guide.magnitude, self._radius, self._buffer)
+        # apart from the cell of the alignment star, cells are filled evenly over the circle
         inside = 0.25 * math.pi * GRID**2
         self._fill = min(self.table[1].size / (len(guide) * inside), HIT_RATE / 2.0)
         return self.table
 
     def _match(self, observed: Observed) -> Indices:
         seen = (observed.directions, observed.magnitude)
-        return _look_up(self.table, len(self.guide), seen, self._radius, self._buffer, self._fill)
+        return _lookup(self.table, len(self.guide), seen, self._radius, self._buffer, self._fill)

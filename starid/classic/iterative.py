@@ -1,15 +1,16 @@
 """IA, the iterative algorithm.
 
-J. Li, X. Wei, G. Zhang, "Iterative algorithm for autonomous star identification", IEEE Transactions on Aerospace and Electronic
-Systems 51(1), 536–547, 2015.
+J. Li, X. Wei, G. Zhang, "Iterative algorithm for autonomous star identification", IEEE Transactions on
+Aerospace and Electronic Systems 51(1), 536–547, 2015.
 
-The first round is that of geometric voting: every observed pair votes for the catalogue pairs of its length. Catalogue stars with
-enough votes remain candidates of an observed star. In the next round only pairs of such candidates vote, each end for the
-candidates of its own star, and the threshold is raised; and so on until each star has one candidate or none. At
-least five stars must be identified with distances that agree.
+The first round is geometric voting: every observed pair votes for the catalogue pairs of its length.
+Catalogue stars with enough votes remain candidates of an observed star. In the next round only pairs of
+candidates vote, each end for the candidates of its own star, with a higher threshold, and so on until each
+star has one candidate or none. At least five stars must be identified with distances that agree.
 
-own choice: a candidate needs 0.4 of the highest votes of its star in the first round, and 0.15 more in each of four further rounds.
-own choice: a tolerance of two standard deviations, for the reason given in `starid.classic.geometric_voting`; the iteration bears more.
+own choice: a candidate needs 0.4 of the highest votes of its star in the first round, and 0.15 more in each
+of four further rounds. own choice: a tolerance of two standard deviations, for the reason given in
+`starid.classic.geometric_voting`; the iteration copes with more chance votes.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ ROUNDS: Final = 4
 
 @compiled_ieee
 def _vote_of_candidates(table: PairTable, candidate: Mask, seen: Array, tolerance: float) -> Indices32:
-    """Votes (n, N) of pairs whose two stars are candidates of the two observed ones, either way round."""
+    """Votes (n, N) of catalogue pairs whose stars are candidates of an observed pair, in either order."""
     n = seen.shape[0]
     votes = np.zeros(candidate.shape, dtype=np.int32)
     for i in range(n):
@@ -50,12 +51,12 @@ def _vote_of_candidates(table: PairTable, candidate: Mask, seen: Array, toleranc
 
 
 class IterativeIdentifier(ClassicIdentifier):
-    """The iterative algorithm behind the interface of all identifiers."""
+    """The iterative algorithm behind the common interface of all identifiers."""
 
     tolerance_px: ClassVar[float] = 2.0
     sigmas: ClassVar[float] = 2.0
-    least_group: ClassVar[int] = 5
-    least_stars: ClassVar[int] = 5
+    min_group: ClassVar[int] = 5
+    min_stars: ClassVar[int] = 5
 
     def _build(self) -> Database:
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
@@ -76,5 +77,5 @@ class IterativeIdentifier(ClassicIdentifier):
 
 
 def _above(votes: Indices32, share: float) -> Mask:
-    """Candidates (n, N) with at least a share of the highest votes of their star."""
+    """Candidates (n, N) with at least a given share of the highest votes for their star."""
     return np.asarray((votes > 0) & (votes >= share * votes.max(axis=1, keepdims=True)))

@@ -1,17 +1,18 @@
 """LPT, the log-polar transform.
 
-X. Wei, G. Zhang, J. Jiang, "Star Identification Algorithm Based on Log-Polar Transform", Journal of Aerospace Computing,
-Information, and Communication 6(8), 483–490, 2009 (98 % at a position noise of 2 px, field 12° × 12°, stars to V 6).
+X. Wei, G. Zhang, J. Jiang, "Star Identification Algorithm Based on Log-Polar Transform", Journal of Aerospace
+Computing, Information, and Communication 6(8), 483–490, 2009 (98 % at a position noise of 2 px, field 12° ×
+12°, stars to V 6).
 
-The neighbours of a guide star are mapped to (ln r, θ) and binned; projected on the angle they give a string with the radial bin
-of the star in each sector. A turn of the image shifts the string circularly, so two patterns are compared at every shift, and
-the number of sectors that agree at the best one is their likeness.
+The neighbours of a guide star are mapped to (ln r, θ) and binned. Projected onto the angle they form a string
+with the radial bin of the star in each sector. Rotating the image shifts the string circularly, so two
+patterns are compared at every shift; their similarity is the number of sectors that agree at the best one.
 
-own choice: 120 sectors of 3° and 48 radial bins between 0.1 and 1 times the pattern radius, which is 0.65 of the width of the
-field: at the rim a bin is 29 px wide of 937, at the inner end 3 px. A bin more or less counts as agreement.
-own choice: the paper finds the shift by a string search (Knuth, Morris, Pratt) that bears with misses. Here a histogram
-of the shifts that bring equal codes together gives the number of agreements of all shifts at once, and an index of the strings by radial
-bin leads to those codes.
+own choice: 120 sectors of 3° and 48 radial bins between 0.1 and 1 times the pattern radius, which is 0.65 of
+the width of the field: for 937 pixels a bin is 29 px wide at the rim and 3 px at the inner end. Neighbouring
+bins count as equal. own choice: the paper finds the shift by a string search (Knuth, Morris, Pratt) that
+tolerates mismatches. Here an index of the strings by radial bin finds equal codes, and a histogram of the
+shifts that align them counts the agreements at all shifts at once.
 """
 
 from __future__ import annotations
@@ -30,10 +31,10 @@ from starid.jit import compiled_ieee, inner
 SECTORS: Final = 120
 RINGS: Final = 48
 INNER: Final = 0.1
-"""Inner end of the radial bins over the pattern radius."""
+"""Inner end of the radial bins as a share of the pattern radius."""
 
 RADIUS_SHARE: Final = 0.65
-"""Pattern radius over the width of the field."""
+"""Pattern radius as a share of the width of the field."""
 
 MIN_AGREEING: Final = 5
 MAX_NEIGHBOURS: Final = SECTORS
@@ -43,7 +44,7 @@ MAX_NEIGHBOURS: Final = SECTORS
 def log_polar_string(
     vectors: Array, star: int, radius: float, polar: Array, rows: Indices, code: NDArray[np.uint8]
 ) -> None:
-    """Fill in the string of a star: 1 + radial bin of the nearest neighbour in each sector, 0 where there is none."""
+    """Fill in the string of a star: 1 + radial bin of the nearest neighbour in each sector, 0 if empty."""
     code[:] = 0
     for i in range(neighbours_of(vectors, star, radius, polar, rows)):
         ratio = polar[i, 0] / radius
@@ -67,7 +68,7 @@ def _strings(vectors: Array, radius: float) -> NDArray[np.uint8]:
 
 @compiled_ieee
 def _ring_index(codes: NDArray[np.uint8]) -> tuple[Indices32, NDArray[np.uint16], NDArray[np.uint8]]:
-    """Entries of all strings by ring: first entry of each ring, star and sector of each entry."""
+    """Index of the strings by ring: first entry of each ring; star and sector of each entry."""
     count = np.count_nonzero(codes)
     rings, stars = np.empty(count, dtype=np.int64), np.empty(count, dtype=np.uint16)
     sectors = np.empty(count, dtype=np.uint8)
@@ -83,7 +84,7 @@ def _ring_index(codes: NDArray[np.uint8]) -> tuple[Indices32, NDArray[np.uint16]
 
 @inner
 def _most_agreeing(shifts: NDArray[np.int16], agreeing: Indices32) -> None:
-    """Fill in, for each star, the most sectors that agree at any shift, a sector more or less allowed."""
+    """Fill in the number of sectors that agree, to within one, at the best shift of each star."""
     for star in range(shifts.shape[0]):
         agreeing[star] = 0
         for shift in range(SECTORS):
@@ -95,7 +96,7 @@ def _most_agreeing(shifts: NDArray[np.int16], agreeing: Indices32) -> None:
 def _compare(
     index: tuple[Indices32, NDArray[np.uint16], NDArray[np.uint8]], stars: int, seen: Array, radius: float
 ) -> Indices:
-    """Matches (m, 2) of each observed star with the guide stars most like it."""
+    """Match (m, 2) each observed star with the guide stars most similar to it."""
     start, owner, sectors = index
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     code, shifts = np.empty(SECTORS, dtype=np.uint8), np.empty((stars, SECTORS), dtype=np.int16)
@@ -117,7 +118,7 @@ def _compare(
 
 
 class LogPolarIdentifier(ClassicIdentifier):
-    """The log-polar transform behind the interface of all identifiers."""
+    """The log-polar transform behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
 

@@ -2,13 +2,13 @@
 
 R. W. H. van Bezooijen, "Automated star pattern recognition", Ph.D. thesis, Stanford University, 1989.
 
-For a pole star the pairs with all its neighbours are looked up in the catalogue by distance and magnitudes. Catalogue pairs that
-share a star make a match group: that star is the candidate for the pole, the others for the neighbours. The largest group
-whose members also keep the distances among each other identifies the field.
+Each pair of a pole star and a neighbour is looked up in the catalogue by distance and magnitudes. Catalogue
+pairs that share a star form a match group: that star is the candidate for the pole, the others for the
+neighbours. The largest group whose members also agree in their mutual distances identifies the field.
 
-own choice: magnitudes are compared as differences within the pair, which need no calibration, with a gate of 0.6 mag.
-own choice: the five largest groups of each of the ten brightest stars as poles are tested for mutual distances; where several
-neighbours fit one, the one that is nearest in distance is taken.
+own choice: magnitudes are compared as differences within the pair, which need no calibration, with a gate of
+0.6 mag. own choice: each of the ten brightest stars is tried as a pole, and the mutual distances are tested
+for its five largest groups; where several neighbours fit one star, the nearest in distance is taken.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee, inner
 
 MAGNITUDE_GATE: Final = 0.6
-"""Largest deviation of the difference of two magnitudes."""
+"""Largest error of a difference of two magnitudes."""
 
 POLES: Final = 10
-"""Brightest observed stars that are tried as poles."""
+"""Number of observed stars, brightest first, that are tried as poles."""
 
 GROUPS: Final = 5
-"""Largest groups of each pole that are tested."""
+"""Number of groups tested per pole, largest first."""
 
 
 @inner
@@ -43,7 +43,7 @@ def match_groups(
     partner: Indices32,
     size: Indices,
 ) -> None:
-    """Fill in the match groups of a pole: partner (N, n) of each candidate for each neighbour, −1 without; size (N,)."""
+    """Fill in a pole's match groups: partner (N, n) of each candidate for each neighbour or −1; size (N,)."""
     vectors, magnitudes = guide
     directions, instrumental = seen
     partner[:] = -1
@@ -72,7 +72,7 @@ def match_groups(
 
 @inner
 def group_pairs(partner: Indices32, pole: int, candidate: int) -> Indices:
-    """Matches (m, 2) of a match group, the pole's first."""
+    """Matches (m, 2) of a match group, the pole first."""
     n = partner.shape[1]
     pairs = np.empty((n, 2), dtype=np.int64)
     pairs[0, 0], pairs[0, 1] = pole, candidate
@@ -88,7 +88,7 @@ def group_pairs(partner: Indices32, pole: int, candidate: int) -> Indices:
 def _largest_match_group(
     table: PairTable, guide: tuple[Array, Array], seen: tuple[Array, Array], tolerance: float
 ) -> Indices:
-    """Matches (m, 2) of the largest group whose members keep all distances."""
+    """Find the matches (m, 2) of the largest group that agrees in all distances."""
     vectors, directions = guide[0], seen[0]
     n = directions.shape[0]
     partner, size = (
@@ -112,7 +112,7 @@ def _largest_match_group(
 
 
 class MatchGroupIdentifier(ClassicIdentifier):
-    """The match group algorithm behind the interface of all identifiers."""
+    """The match group algorithm behind the common interface of all identifiers."""
 
     def _build(self) -> Database:
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)

@@ -1,18 +1,20 @@
 """MGA, the modified grid algorithm.
 
-M. Na, D. Zheng, P. Jia, "Modified Grid Algorithm for Noisy All-Sky Autonomous Star Identification", IEEE Transactions on
-Aerospace and Electronic Systems 45(2), 516–522, 2009; the cost instead of bit matches also in H. Lee, H. Bang, "Star Pattern
-Identification Technique by Modified Grid Algorithm", IEEE TAES 43(3), 1112–1116, 2007.
+M. Na, D. Zheng, P. Jia, "Modified Grid Algorithm for Noisy All-Sky Autonomous Star Identification", IEEE
+Transactions on Aerospace and Electronic Systems 45(2), 516–522, 2009; a cost instead of bit matches also in
+H. Lee, H. Bang, "Star Pattern Identification Technique by Modified Grid Algorithm", IEEE TAES 43(3),
+1112–1116, 2007.
 
-As in the grid algorithm a pivot is centred and its nearest neighbour beyond a buffer turned onto +x. A star of a
-guide pattern then makes more than its own cell grey: cells around it are the less so the farther they are, so that noise
-which carries a star over the border of a cell costs a little instead of everything. The cost of a guide pattern is the
-grey that the observed stars miss, weighted by their brightness, and the pattern of least cost wins.
+As in the grid algorithm a pivot is centred and its nearest neighbour beyond a buffer turned onto +x. A star
+of a guide pattern shades not only its own cell but, more lightly, the cells around it, so that a star that
+noise carries across the border of a cell costs a little instead of everything. The cost of a guide pattern is
+the shading that the observed stars miss, weighted by their brightness. The pattern of least cost wins.
 
-own choice: the grey is a Gaussian of the distance from the star to the middle of the cell, 0.7 cells wide and cut off beyond the
-eight cells around; it is held in 8 bits (40 × 40 bytes a star, which with 4 612 stars are the published 7 380 kB).
-own choice: the weight falls from 2 for the brightest neighbour to 1 for the faintest, linearly in magnitude: bright stars are seldom
-false or missing. The best pattern must cost less than 0.65 of the whole weight, and less than any other.
+own choice: the shading is a Gaussian of the distance from the star to the centre of the cell, 0.7 cells wide
+and cut off beyond the eight surrounding cells. It is stored in 8 bits (40 × 40 bytes per star; for 4 612
+stars these are the published 7 380 kB). own choice: the weight falls from 2 for the brightest neighbour to 1
+for the faintest, linearly in magnitude, because bright stars are seldom false or missing. The best pattern
+must cost less than 0.65 of the total weight, and less than any other.
 """
 
 from __future__ import annotations
@@ -29,16 +31,16 @@ from starid.classic.neighbours import nearest_beyond, neighbours_of
 from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
 
-GREY_WIDTH: Final = 0.7
-"""Standard deviation of the grey around a star, cells."""
+SHADING_WIDTH: Final = 0.7
+"""Standard deviation of the shading around a star, cells."""
 
-GREATEST_COST: Final = 0.65
+MAX_COST: Final = 0.65
 MIN_NEIGHBOURS: Final = 4
 
 
 @compiled_ieee
-def _grey_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np.uint8]:
-    """Grey grids (n, `GRID`²) of all stars; empty for one that has no neighbour to be aligned with."""
+def _shaded_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np.uint8]:
+    """Shaded grids (n, `GRID`²) of all stars; empty for a star without a neighbour to align with."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     grey = np.zeros((vectors.shape[0], GRID * GRID), dtype=np.uint8)
     for star in range(vectors.shape[0]):
@@ -51,7 +53,7 @@ def _grey_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np.u
             for row in range(max(int(y) - 1, 0), min(int(y) + 2, GRID)):
                 for column in range(max(int(x) - 1, 0), min(int(x) + 2, GRID)):
                     dx, dy = column + 0.5 - x, row + 0.5 - y
-                    value = 255.0 * math.exp(-0.5 * (dx * dx + dy * dy) / GREY_WIDTH**2)
+                    value = 255.0 * math.exp(-0.5 * (dx * dx + dy * dy) / SHADING_WIDTH**2)
                     cell = row * GRID + column
                     grey[star, cell] = max(grey[star, cell], np.uint8(value))
     return grey
@@ -61,7 +63,7 @@ def _grey_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np.u
 def _least_cost(
     grey: NDArray[np.uint8], seen: Array, magnitude: Array, radius: float, buffer: float
 ) -> Indices:
-    """Guide star of each observed star, −1 without a clear winner."""
+    """Find the guide star of each observed star; −1 without a clear winner."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     cells, weights = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.empty(MAX_NEIGHBOURS)
     matched = np.full(seen.shape[0], -1, dtype=np.int64)
@@ -86,20 +88,20 @@ def _least_cost(
                 best, second, least = star, least, cost
             elif cost < second:
                 second = cost
-        if least <= GREATEST_COST * whole and least < second:
+        if least <= MAX_COST * whole and least < second:
             matched[pivot] = best
     return matched
 
 
 class ModifiedGridIdentifier(ClassicIdentifier):
-    """The modified grid algorithm behind the interface of all identifiers."""
+    """The modified grid algorithm behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
 
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad
         self._buffer = BUFFER_SHARE * self._radius
-        self.grey = _grey_patterns(self.guide.vectors, self._radius, self._buffer)
+        self.grey = _shaded_patterns(self.guide.vectors, self._radius, self._buffer)
         return (self.grey,)
 
     def _match(self, observed: Observed) -> Indices:

@@ -1,10 +1,10 @@
-"""A star's neighbours in polar coordinates about it: what every pattern of a pivot star is made of.
+"""The neighbours of a star in polar coordinates, from which the patterns of a pivot star are made.
 
-The published patterns shift the image until the pivot is in its middle, which holds in narrow fields only.
+The published patterns shift the image until the pivot is at its centre, which is valid in narrow fields only.
 
-own choice: the sphere is turned instead of the image shifted, so that a pattern is the same wherever its pivot
-stands in the field, at any width of field: the radius is the chord, the azimuth is counted in the tangential plane
-of the pivot from an axis that each call is free to choose. Sensor and sky have the same sense of rotation.
+own choice: the sphere is rotated instead, so that a pattern does not depend on where its pivot is in the
+field, at any width of field. The radius is the chord; the azimuth is measured in the tangent plane of the
+pivot from an arbitrary axis, which each call chooses. It has the same sense for sensor and sky.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from starid.arrays import Array, Indices, Indices32
 from starid.jit import compiled_ieee, inner
 
 MAX_TIED: Final = 4
-"""Guide stars with equally many votes that a pivot may leave to the last step; more of them say nothing."""
+"""Most guide stars with equal votes that a pivot may pass to the last step; more are not significant."""
 
 
 @inner
 def neighbours_of(vectors: Array, pivot: int, radius: float, polar: Array, rows: Indices) -> int:
-    """List the neighbours of a star by rising distance.
+    """List the neighbours of a star in order of distance.
 
     Parameters
     ----------
@@ -41,10 +41,10 @@ def neighbours_of(vectors: Array, pivot: int, radius: float, polar: Array, rows:
     Returns
     -------
     int
-        How many there are; those beyond m, in the order of the rows, are left out.
+        Number of neighbours; if there are more than m, the later rows are left out.
     """
     px, py, pz = vectors[pivot, 0], vectors[pivot, 1], vectors[pivot, 2]
-    # an axis across: that of the least component, made perpendicular
+    # a perpendicular axis, from the coordinate axis of the smallest component
     ax, ay, az = 0.0, 0.0, 1.0
     if abs(px) <= abs(py) and abs(px) <= abs(pz):
         ax, az = 1.0, 0.0
@@ -76,7 +76,7 @@ def neighbours_of(vectors: Array, pivot: int, radius: float, polar: Array, rows:
 
 @inner
 def turned(azimuth: float, reference: float) -> float:
-    """Azimuth counted from a reference, in [0, 2π)."""
+    """Azimuth relative to a reference, in [0, 2π)."""
     angle = azimuth - reference
     if angle < 0.0:
         angle += 2.0 * math.pi
@@ -85,7 +85,7 @@ def turned(azimuth: float, reference: float) -> float:
 
 @inner
 def nearest_beyond(polar: Array, count: int, buffer: float) -> int:
-    """First of the neighbours, by rising distance, that is farther than a buffer; −1 if there is none."""
+    """Find the nearest neighbour beyond a buffer; −1 if there is none."""
     for i in range(count):
         if polar[i, 0] > buffer:
             return i
@@ -96,9 +96,9 @@ def nearest_beyond(polar: Array, count: int, buffer: float) -> int:
 def bright_neighbour(
     polar: Array, rows: Indices, count: int, magnitude: Array, buffer: float, rank: int
 ) -> int:
-    """Place of the neighbour beyond a buffer of given rank, by distance, in the brighter half; −1 if there is none.
+    """Find the bright neighbour beyond a buffer that is `rank`-th in distance; −1 if there is none.
 
-    Where all magnitudes are equal every neighbour is in the brighter half.
+    Bright means in the brighter half; if all magnitudes are equal, every neighbour is.
     """
     values = np.empty(count)
     for i in range(count):
@@ -114,7 +114,7 @@ def bright_neighbour(
 
 @compiled_ieee
 def neighbour_list(vectors: Array, pivot: int, radius: float) -> tuple[Array, Indices]:
-    """Chords and azimuths (m, 2) of a star's neighbours by rising distance, and their rows (m,)."""
+    """Chords and azimuths (m, 2) of a star's neighbours in order of distance, and their rows (m,)."""
     polar = np.empty((vectors.shape[0], 2))
     rows = np.empty(vectors.shape[0], dtype=np.int64)
     count = neighbours_of(vectors, pivot, radius, polar, rows)
@@ -123,7 +123,7 @@ def neighbour_list(vectors: Array, pivot: int, radius: float) -> tuple[Array, In
 
 @inner
 def grouped(keys: Indices, groups: int) -> tuple[Indices32, Indices]:
-    """Sort rows by key: first row of each group (groups + 1,), and the rows (n,) in that order."""
+    """Sort rows by key: start of each group (groups + 1,), and the sorted rows (n,)."""
     start = np.zeros(groups + 1, dtype=np.int32)
     for key in keys:
         start[key + 1] += 1
@@ -139,9 +139,10 @@ def grouped(keys: Indices, groups: int) -> tuple[Indices32, Indices]:
 
 @inner
 def add_winners(votes: Indices32, least: int, pivot: int, matches: Indices, filled: int) -> int:
-    """Append the guide stars with most votes, if they are enough and not too many are tied; return the new number of matches.
+    """Append the guide stars with the most votes, if significant; return the new number of matches.
 
-    `matches` (n·`MAX_TIED`, 2) receives the pivot and the guide star.
+    They need at least `least` votes, and no more than `MAX_TIED` may be tied. `matches` (n·`MAX_TIED`, 2)
+    receives the pivot and the guide star.
     """
     most = votes.max()
     if most < least:

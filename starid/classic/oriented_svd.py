@@ -1,18 +1,19 @@
 """OSV, oriented singular values.
 
-X. Wei, D. Wen and others, "Star Identification Algorithm Based on Oriented Singular Value Feature and Reliability Evaluation Method",
-Transactions of the Japan Society for Aeronautical and Space Sciences 62(5), 265–274, 2019 (97.0 % at a position noise
-of 2 px and a magnitude noise of 0.3).
+X. Wei, D. Wen and others, "Star Identification Algorithm Based on Oriented Singular Value Feature and
+Reliability Evaluation Method", Transactions of the Japan Society for Aeronautical and Space Sciences 62(5),
+265–274, 2019 (97.0 % at a position noise of 2 px and a magnitude noise of 0.3).
 
-The three directions of a triangle, put in a fixed order, make a 3 × 3 matrix. Its singular values do not depend on how the sensor is
-turned; the order says which corner is which. Triangles of the database are sorted by one singular value and found by
-binary search in it; every one that fits votes for its corners. What the votes say of each observed star is kept if it is
-reliable: enough votes, and clearly more than for any other guide star.
+The three directions of a triangle, in a fixed order, form a 3 × 3 matrix. Its singular values do not depend
+on the orientation of the sensor; the order identifies the corners. Triangles of the database are sorted by
+one singular value and found by binary search; each that fits votes for its corners. The match of an observed
+star is kept if it is reliable: if it has enough votes, and clearly more than any other guide star.
 
-own choice: a triangle is a star with two of its five nearest neighbours beyond a buffer (0.05 of the field's width). Its corners are ordered
-by the sides opposite to them; the way round that the corners then run is the orientation, and must be equal. Search is by the second
-singular value, with the third checked: the squares of all three add up to three.
-own choice: reliable is a star with at least three votes and 1.3 times those of the next guide star.
+own choice: a triangle is a star with two of its five nearest neighbours beyond a buffer (0.05 of the width of
+the field). Its corners are ordered by the opposite sides; the sense in which they then run is the
+orientation, and must be equal. The search is by the second singular value, and the third is checked: the
+squares of all three add up to three. own choice: a match is reliable with at least three votes and 1.3 times
+the votes of the next guide star.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ MARGIN: Final = 1.3
 
 @compiled_ieee
 def _triangle_rows(vectors: Array, radius: float, buffer: float) -> Indices:
-    """Corners (m, 3) of the triangles of every star with two of its nearest neighbours, in no order, some twice."""
+    """Corners (m, 3) of the triangles of each star and two of its neighbours, unordered, with repeats."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
     found = np.empty((n * (NEIGHBOURS * (NEIGHBOURS - 1) // 2), 3), dtype=np.int64)
@@ -56,7 +57,10 @@ def _triangle_rows(vectors: Array, radius: float, buffer: float) -> Indices:
 
 
 def oriented_triangles(vectors: Array, corners: Indices) -> tuple[Indices, Array, NDArray[np.int8]]:
-    """Triangles in the fixed order, each once: corners (m, 3), second and third singular value (m, 2), orientation (m,) of ±1."""
+    """Order the corners of triangles and drop repeats.
+
+    Returns the corners (m, 3), the second and third singular values (m, 2) and the orientation (m,), ±1.
+    """
     corners = np.unique(np.sort(corners, axis=1), axis=0).reshape(-1, 3)
     places = vectors[corners]
     opposite = np.linalg.norm(np.roll(places, -1, axis=1) - np.roll(places, -2, axis=1), axis=2)
@@ -77,7 +81,7 @@ def _vote(
     votes: Indices32,
     reach: float,
 ) -> None:
-    """Let every guide triangle that fits an observed one vote for its corners; votes (n, N)."""
+    """Add a vote for each corner of every guide triangle that fits an observed one; votes (n, N)."""
     corners, values, hand = database
     for t in range(triangles[0].shape[0]):
         second, third = triangles[1][t, 0], triangles[1][t, 1]
@@ -91,7 +95,7 @@ def _vote(
 
 
 class OrientedSvdIdentifier(ClassicIdentifier):
-    """Oriented singular values behind the interface of all identifiers."""
+    """Oriented singular values behind the common interface of all identifiers."""
 
     sigmas: ClassVar[float] = 2.0
     tolerance_px: ClassVar[float] = 2.0

@@ -1,8 +1,9 @@
 """Pairs of catalogue stars by distance, found through a k-vector.
 
-Distances are chords, 2·sin(angle/2): they order like angles, keep all their digits at small ones, and cost no
-trigonometry. The k-vector (Mortari 1996, Search-less algorithm) counts the pairs below each of as many evenly
-spaced values as there are pairs, so that a range of distances is found by two reads instead of a search.
+Distances are chords, 2·sin(angle/2): their order is that of the angles, they keep their precision at small
+angles, and need no trigonometry. The k-vector (Mortari 1996, Search-less algorithm) counts the pairs below
+each of as many evenly spaced values as there are pairs, so that a range of distances takes two reads instead
+of a search.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from starid.errors import StaridError
 from starid.jit import compiled_ieee, inner
 
 MAX_STARS: Final = 65_535
-"""Stars that 16-bit numbers can name."""
+"""Largest number of stars: their rows are stored in 16 bits."""
 
 
 class PairTable(NamedTuple):
-    """Pairs of stars by rising distance.
+    """Pairs of stars in order of distance.
 
     Attributes
     ----------
@@ -31,7 +32,7 @@ class PairTable(NamedTuple):
     first, second : ndarray (m,) uint16
         Their stars, ``first < second``.
     below : ndarray (m + 1,) int32
-        k-vector: pairs whose distance is at most ``lowest + j·step``.
+        k-vector: number of pairs whose distance is at most ``lowest + j·step``.
     line : ndarray (2,)
         ``lowest`` and ``step``.
     """
@@ -50,14 +51,14 @@ class PairTable(NamedTuple):
 
 @inner
 def chord_between(ones: Array, i: int, others: Array, j: int) -> float:
-    """Distance of two unit vectors, rows of two tables."""
+    """Distance between row i of one table of unit vectors and row j of another."""
     x, y, z = ones[i, 0] - others[j, 0], ones[i, 1] - others[j, 1], ones[i, 2] - others[j, 2]
     return math.sqrt(x * x + y * y + z * z)
 
 
 @compiled_ieee
 def _close_pairs(vectors: Array, longest: float) -> tuple[Array32, NDArray[np.uint16], NDArray[np.uint16]]:
-    """All pairs at most so far apart; the stars are sorted by rising z."""
+    """Find all pairs up to a distance; the stars must be sorted by z."""
     n = vectors.shape[0]
     count = 0
     chord = np.empty(0, dtype=np.float32)
@@ -80,7 +81,7 @@ def _close_pairs(vectors: Array, longest: float) -> tuple[Array32, NDArray[np.ui
 
 
 def pair_table(vectors: Array, longest: float) -> PairTable:
-    """All pairs of unit vectors (n, 3) that are at most a chord apart.
+    """Tabulate all pairs of unit vectors (n, 3) that are at most a chord apart.
 
     Raises
     ------
@@ -108,7 +109,7 @@ def pair_table(vectors: Array, longest: float) -> PairTable:
 
 @inner
 def pair_range(table: PairTable, low: float, high: float) -> tuple[int, int]:
-    """First pair, and one past the last, whose distance lies within [low, high]."""
+    """Range of the pairs whose distance is within [low, high]: the first, and one past the last."""
     chord, below = table.chord, table.below
     pairs = chord.shape[0]
     if pairs == 0 or high < chord[0] or low > chord[pairs - 1]:
@@ -127,5 +128,5 @@ def pair_range(table: PairTable, low: float, high: float) -> tuple[int, int]:
 
 @compiled_ieee
 def pairs_within(table: PairTable, low: float, high: float) -> tuple[int, int]:
-    """As `pair_range`, for callers in Python."""
+    """The same as `pair_range`, callable from Python."""
     return pair_range(table, low, high)

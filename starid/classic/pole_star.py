@@ -1,15 +1,15 @@
 """PS, the pole star algorithm.
 
-E. Silani, M. Lovera, "Star identification algorithms: novel approach & comparison study", IEEE Transactions on Aerospace and
-Electronic Systems 42(4), 1275–1288, 2006.
+E. Silani, M. Lovera, "Star identification algorithms: novel approach & comparison study", IEEE Transactions
+on Aerospace and Electronic Systems 42(4), 1275–1288, 2006.
 
-The radial pattern of a pole star (`starid.classic.rings`) picks its candidates: guide stars that share enough rings with it. From
-the candidates of several pole stars pairs, triangles and polygons are built whose sides have the lengths observed, until
-one set is left.
+The radial pattern of a pole star (`starid.classic.rings`) selects its candidates: guide stars that share
+enough rings with it. From the candidates of several pole stars, pairs, triangles and polygons with sides of
+the observed lengths are built until one set is left.
 
-own choice: every observed star is a pole, its eight best guide stars with at least four rings in common are candidates; the polygon is the
-largest set that agrees in all its sides, which the shared last step finds. It must have five corners: of so many candidates chance
-makes squares.
+own choice: every observed star is a pole, and its candidates are the eight best guide stars with at least
+four rings in common. The polygon is the largest set that agrees in all its sides, which the shared last step
+finds. It must have five corners: among so many candidates, quadrilaterals occur by chance.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ CANDIDATES: Final = 8
 def _candidates(
     table: tuple[Indices32, NDArray[np.uint16]], stars: int, seen: Array, radius: float
 ) -> Indices:
-    """Candidates (m, 2): row of an observed star, guide star with as many rings in common."""
+    """Candidates (m, 2): row of an observed star, and a guide star with enough rings in common."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(stars, dtype=np.int32)
     found = np.empty((seen.shape[0] * CANDIDATES, 2), dtype=np.int64)
@@ -51,10 +51,10 @@ def _candidates(
 
 
 class PoleStarIdentifier(ClassicIdentifier):
-    """The pole star algorithm behind the interface of all identifiers."""
+    """The pole star algorithm behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
-    least_group: ClassVar[int] = 5
+    min_group: ClassVar[int] = 5
 
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad

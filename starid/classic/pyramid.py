@@ -1,17 +1,18 @@
 """PA, the pyramid algorithm.
 
-D. Mortari, M. A. Samaan, C. Bruccoleri, J. L. Junkins, "The Pyramid Star Identification Technique", Navigation
-51(3), 171–183, 2004.
+D. Mortari, M. A. Samaan, C. Bruccoleri, J. L. Junkins, "The Pyramid Star Identification Technique",
+Navigation 51(3), 171–183, 2004.
 
-Triads of observed stars are tried in an order that spreads their indices, so that one false star spoils few in a
-row. The k-vector gives the catalogue pairs of each side; a triad that fits exactly one catalogue triangle is confirmed
-by a fourth star, whose three angles to it must fit one catalogue star: the pyramid. The remaining stars are identified
-by their angles to the pyramid.
+Triads of observed stars are tried in an order that spreads their indices, so that one false star spoils few
+in succession. The k-vector lists the catalogue pairs for each side. A triad that fits exactly one catalogue
+triangle is confirmed by a fourth star, whose three angles to the triad must fit one catalogue star: the
+pyramid. The remaining stars are identified by their angles to the pyramid.
 
-own choice: a field of just three stars has no fourth; its triad stands if it is unique, as the paper allows.
-own choice: 15 guide stars a field. A wide field of coarse pixels has many triangles that look alike, the more the deeper
-the catalogue is; with 15 stars and a tolerance of 4 px in 937 a triad fits 0.2 wrong triangles on the average. For the same reason the tolerance is two standard
-deviations of a distance, not three: a triad that falls outside is followed by another.
+own choice: a field of just three stars has no fourth; its triad is accepted if it is unique, as the paper
+allows. own choice: 15 guide stars per field. A wide field of coarse pixels has many similar triangles, the
+more the deeper the catalogue; with 15 stars and a tolerance of 4 px in 937 a triad fits 0.2 wrong triangles
+on average. For the same reason the tolerance is two standard deviations of a distance, not three: a triad
+that falls outside is followed by another.
 """
 
 from __future__ import annotations
@@ -27,8 +28,8 @@ from starid.jit import compiled_ieee, inner
 
 
 @inner
-def _hand(ones: Array, i: int, j: int, k: int) -> float:
-    """Triple product of three rows: its sign says which way round a triangle runs."""
+def _triple_product(ones: Array, i: int, j: int, k: int) -> float:
+    """Triple product of three rows; its sign is the orientation of the triangle."""
     x = ones[i, 1] * ones[j, 2] - ones[i, 2] * ones[j, 1]
     y = ones[i, 2] * ones[j, 0] - ones[i, 0] * ones[j, 2]
     z = ones[i, 0] * ones[j, 1] - ones[i, 1] * ones[j, 0]
@@ -39,7 +40,10 @@ def _hand(ones: Array, i: int, j: int, k: int) -> float:
 def _link_partners(
     table: PairTable, low: float, high: float, head: Indices, link: Indices
 ) -> tuple[int, int]:
-    """Chain the pairs of a range at each of their stars; link 2·e is that of the first star of pair e, 2·e + 1 of the second."""
+    """Link the pairs of a range into one chain per star.
+
+    Link 2·e belongs to the first star of pair e, link 2·e + 1 to the second.
+    """
     start, end = pair_range(table, low, high)
     for pair in range(start, end):
         a, b = table.first[pair], table.second[pair]
@@ -58,7 +62,7 @@ def _unique_triangle(
     tolerance: float,
     work: tuple[Indices, Indices],
 ) -> tuple[int, int, int, int]:
-    """Catalogue stars of a triad and the number of triangles that fit it, counted up to two."""
+    """Catalogue stars of a triad, and the number of triangles that fit it (counted up to two)."""
     i, j, k = triad
     head, link = work
     ij, ik, jk = (
@@ -66,7 +70,7 @@ def _unique_triangle(
         chord_between(seen, i, seen, k),
         chord_between(seen, j, seen, k),
     )
-    hand = _hand(seen, i, j, k)
+    hand = _triple_product(seen, i, j, k)
     start, end = _link_partners(table, ik - tolerance, ik + tolerance, head, link)
     found, fa, fb, fc = 0, -1, -1, -1
     first, last = pair_range(table, ij - tolerance, ij + tolerance)
@@ -81,7 +85,7 @@ def _unique_triangle(
                 if (
                     c != b
                     and abs(chord_between(vectors, b, vectors, c) - jk) <= tolerance
-                    and _hand(vectors, a, b, c) * hand > 0.0
+                    and _triple_product(vectors, a, b, c) * hand > 0.0
                 ):
                     found, fa, fb, fc = found + 1, a, b, c
                 place = link[place]
@@ -104,7 +108,7 @@ def _fourth_star(
     r: int,
     tolerance: float,
 ) -> int:
-    """The one catalogue star whose distances to the triangle are those of observed star r; −1 if none or several."""
+    """Find the catalogue star whose distances to the triangle fit observed star r; −1 unless unique."""
     d0, d1, d2 = (
         chord_between(seen, triad[0], seen, r),
         chord_between(seen, triad[1], seen, r),
@@ -133,7 +137,7 @@ def _complete(
     tolerance: float,
     matched: Indices,
 ) -> int:
-    """Fill in the star of every observed star that fits the triangle; return how many fit beside its own three."""
+    """Match the remaining observed stars by their distances to the triangle; return how many fit."""
     matched[:] = -1
     for corner in range(3):
         matched[triad[corner]] = stars[corner]
@@ -147,7 +151,7 @@ def _complete(
 
 @compiled_ieee
 def _pyramid(table: PairTable, vectors: Array, seen: Array, tolerance: float) -> Indices:
-    """Guide star of every observed star, −1 where it has none: the first triad that is unique and confirmed."""
+    """Guide star of each observed star or −1, from the first triad that is unique and confirmed."""
     n = seen.shape[0]
     matched = np.full(n, -1, dtype=np.int64)
     head = np.full(vectors.shape[0], -1, dtype=np.int64)
@@ -165,7 +169,7 @@ def _pyramid(table: PairTable, vectors: Array, seen: Array, tolerance: float) ->
 
 
 class PyramidIdentifier(ClassicIdentifier):
-    """The pyramid algorithm behind the interface of all identifiers."""
+    """The pyramid algorithm behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 15.0
     sigmas: ClassVar[float] = 2.0

@@ -1,14 +1,15 @@
 """RC, radial and cyclic features.
 
-G. Zhang, X. Wei, J. Jiang, "Full-sky autonomous star identification based on radial and cyclic features of star pattern", Image and
-Vision Computing 26(7), 891–897, 2008.
+G. Zhang, X. Wei, J. Jiang, "Full-sky autonomous star identification based on radial and cyclic features of
+star pattern", Image and Vision Computing 26(7), 891–897, 2008.
 
-The radial feature (`starid.classic.rings`) makes the first match: the guide stars that share most rings with an observed star. The
-cyclic feature decides among them: the directions to the neighbours, quantised into sectors, as a word of bits that is
-compared at its best circular shift.
+The radial feature (`starid.classic.rings`) gives the first match: the guide stars that share the most rings
+with an observed star. The cyclic feature decides among them: the directions to the neighbours, quantised into
+sectors, form a bit string that is compared at its best circular shift.
 
-own choice: 60 sectors of 6°; the ten guide stars with most rings in common, at least four, are compared, and the one whose word has the most
-bits in common at one shift, a sector more or less, is taken unless two are equal.
+own choice: 60 sectors of 6°. The ten guide stars with the most rings in common, at least four, are compared.
+The one whose string has the most bits in common at one shift, to within one sector, is taken unless two are
+equal.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ CANDIDATES: Final = 10
 
 @inner
 def cyclic_word(polar: Array, count: int, radius: float) -> int:
-    """Bits of the sectors that hold a neighbour, counted from the axis that the azimuths have."""
+    """Bits of the sectors that hold a neighbour, counted from azimuth zero."""
     word = 0
     for i in range(count):
         if ring_of(polar[i, 0], radius) >= 0:
@@ -43,14 +44,14 @@ def cyclic_word(polar: Array, count: int, radius: float) -> int:
 
 @inner
 def rotated(word: int, shift: int) -> int:
-    """Word shifted circularly towards the higher sectors."""
+    """Shift a word circularly towards higher sectors."""
     full = (1 << SECTORS) - 1
     return ((word << shift) & full) | (word >> (SECTORS - shift))
 
 
 @inner
 def bits(word: int) -> int:
-    """Number of bits that are set."""
+    """Count the bits that are set."""
     count = 0
     while word:
         word &= word - 1
@@ -60,7 +61,7 @@ def bits(word: int) -> int:
 
 @inner
 def common_sectors(seen: int, other: int) -> int:
-    """Most sectors of a word that another has, or has next to it, at any shift."""
+    """Number of sectors that two words have in common, to within one sector, at the best shift."""
     wide = other | rotated(other, 1) | rotated(other, SECTORS - 1)
     best = 0
     for shift in range(SECTORS):
@@ -82,7 +83,7 @@ def _cyclic_words(vectors: Array, radius: float) -> Indices:
 def _identify(
     table: tuple[Indices32, NDArray[np.uint16]], words: Indices, seen: Array, radius: float
 ) -> Indices:
-    """Guide star of each observed star, −1 without a clear winner."""
+    """Find the guide star of each observed star; −1 without a clear winner."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     votes = np.empty(words.shape[0], dtype=np.int32)
     matched = np.full(seen.shape[0], -1, dtype=np.int64)
@@ -108,7 +109,7 @@ def _identify(
 
 
 class RadialCyclicIdentifier(ClassicIdentifier):
-    """Radial and cyclic features behind the interface of all identifiers."""
+    """Radial and cyclic features behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
 

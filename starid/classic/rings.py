@@ -1,7 +1,8 @@
-"""The radial pattern of the pole star and the radial and cyclic algorithm: rings that hold a neighbour.
+"""The radial pattern of the pole star and the radial and cyclic algorithms: rings that hold a neighbour.
 
-The distances from a star to its neighbours, quantised into rings, make a binary vector that no rotation changes. A look-up table
-leads from each ring to the guide stars that have a neighbour in it; every ring of an observed star is a vote for them.
+The distances from a star to its neighbours, quantised into rings, form a binary vector that does not change
+under rotation. A lookup table leads from each ring to the guide stars with a neighbour in it; each ring of an
+observed star is a vote for them.
 
 own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.2 px of 937 each).
 """
@@ -19,10 +20,10 @@ from starid.jit import compiled_ieee, inner
 
 RINGS: Final = 200
 INNER: Final = 0.05
-"""Inner end of the rings over the pattern radius."""
+"""Inner end of the rings as a share of the pattern radius."""
 
 RADIUS_SHARE: Final = 0.5
-"""Pattern radius over the width of the field."""
+"""Pattern radius as a share of the width of the field."""
 
 MAX_NEIGHBOURS: Final = 400
 
@@ -36,7 +37,7 @@ def ring_of(chord: float, radius: float) -> int:
 
 @compiled_ieee
 def ring_table(vectors: Array, radius: float) -> tuple[Indices32, NDArray[np.uint16]]:
-    """Look-up table: first entry of each ring, and the stars that have a neighbour in it, each once."""
+    """Lookup table: first entry of each ring, and the stars that have a neighbour in it, each once."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     rings, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     for star in range(vectors.shape[0]):

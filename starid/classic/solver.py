@@ -1,17 +1,19 @@
-"""What the published algorithms share: guide stars, detections, an attitude from the matches, its verification.
+"""Base of the published algorithms: guide stars, detections, attitude from the matches, verification.
 
-An algorithm derives from `ClassicIdentifier`, builds its database from the guide stars (`_build`) and says which
-observed star may be which guide star (`_match`). Everything before and after stands here.
+An algorithm derives from `ClassicIdentifier`, builds its database from the guide stars (`_build`) and
+proposes which observed star may be which guide star (`_match`). Everything before and after is done here.
 
 own choices for all of them:
 
-- Guide stars are the brightest of the sky, as many as give a field `stars_per_field` of them on the average, and
-  none fainter than the sensor sees. The papers thin them out to be evenly spread as well; here the sky is left as it is.
-- The papers assume a calibrated detection threshold. Where the magnitude of one unit of flux is known
-  (`zero_point`) it is used; where it is not, as many of the brightest detections are taken as a field has guide stars.
-- One tolerance, for the difference of two distances, is given in pixels (of the coarsest scale in the field), or
-  follows from the errors given with the positions: so many standard deviations of a distance as the algorithm asks for.
-- The attitude is that of the largest group of matches that agree in all their distances (`starid.classic.agreement`).
+- Guide stars are the brightest stars of the sky: as many as put `stars_per_field` into a field on average,
+  and none fainter than the sensor sees. The papers also thin them out to be evenly spread; here they are not.
+- The papers assume a calibrated detection threshold. Where the magnitude of unit flux is known (`zero_point`)
+  it is used; otherwise as many of the brightest detections are taken as a field has guide stars.
+- There is one tolerance, for the difference of two distances. It is given in pixels (at the coarsest scale in
+  the field), or follows from the errors given with the positions, as the algorithm's number of standard
+  deviations of a distance.
+- The attitude is computed from the largest group of matches that agree in all distances
+  (`starid.classic.agreement`).
 """
 
 from __future__ import annotations
@@ -35,19 +37,19 @@ from starid.classic.agreement import MIN_GROUP, largest_group
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.index_choice import pixels_per_radian
-from starid.geometric.pattern_index import field_solid_angle, seen_stars
+from starid.geometric.pattern_index import field_solid_angle, resolved_stars
 from starid.geometric.verified import VerifiedIdentifier
-from starid.single_camera import Measured
+from starid.single_camera import CheckedDetections
 from starid.solution import Reason, Solution
 from starid.wahba import covariance, solve_wahba
 
 Database = tuple[NDArray[np.generic], ...]
 
 BLEND_PX: Final = 2.0
-"""Stars closer than this are seen as one."""
+"""Stars closer than this are merged."""
 
 MIN_GUIDE_STARS: Final = 20
-"""Guide stars of the whole sky without which there is nothing to identify."""
+"""Smallest number of guide stars in the whole sky."""
 
 _VERIFY_WINDOW_PX: Final = 20.0
 _MIN_TOLERANCE_PX: Final = 0.5
@@ -55,23 +57,25 @@ _MIN_TOLERANCE_PX: Final = 0.5
 
 @dataclass(frozen=True)
 class ClassicOptions:
-    """What a published algorithm can be given.
+    """Options of a published algorithm.
 
     Attributes
     ----------
     stars_per_field : float or None
-        Guide stars in a field on the average; by default the algorithm's own.
+        Mean number of guide stars per field; the default depends on the algorithm.
     limiting_magnitude : float or None
         Faintest V that the sensor sees.
     zero_point : float or None
-        Magnitude V of one unit of flux, where it is known.
+        V magnitude of unit flux, where it is known.
     tolerance_px : float or None
-        Largest difference of two distances, pixels, where no position errors are given; by default the algorithm's own.
+        Largest difference of two distances, pixels, where no position errors are given; the default depends
+        on the algorithm.
     verify : bool
-        Hold the answer to what the geometric identifier demands of its own (True), or return the algorithm's raw
-        answer, right or wrong: valid then means no more than that there is one, and aberration is not corrected.
+        Verify the answer as strictly as the geometric identifier does its own (True), or return it as the
+        algorithm finds it, right or wrong: then "valid" only means that there is an answer, and aberration is
+        not corrected.
     cache : bool
-        Keep the index of the verification in the cache folder. (Databases are made in memory: each takes less
+        Keep the verification's index in the cache folder. (Databases are built in memory: each takes less
         than ten seconds.)
     """
 
@@ -100,7 +104,7 @@ class GuideStars:
     magnitude : ndarray (N,)
         V.
     row : ndarray (N,) int64
-        Row of each in the identifier's catalogue.
+        Row of each star in the identifier's catalogue.
     """
 
     vectors: Array
@@ -113,7 +117,7 @@ class GuideStars:
 
 @dataclass(frozen=True, eq=False)
 class Observed:
-    """Detections that take part, brightest first.
+    """The detections used, brightest first.
 
     Attributes
     ----------
@@ -122,7 +126,7 @@ class Observed:
     magnitude : ndarray (n,)
         Magnitude, or instrumental magnitude where the zero point is unknown.
     row : ndarray (n,) int64
-        Row of each among the detections given.
+        Row of each star in the detections given.
     tolerance : float
         Largest difference of two chords.
     """
@@ -139,34 +143,34 @@ class ClassicIdentifier(VerifiedIdentifier):
     Parameters
     ----------
     camera : Camera
-        What the detections were taken with.
+        The camera that took the image.
     catalog : StarCatalog, optional
-        Default: the whole of Hipparcos at its default epoch.
+        By default all of Hipparcos at its default epoch.
     options : ClassicOptions, optional
-        Default: those of `ClassicOptions`.
+        By default those of `ClassicOptions`.
     **changes
-        Fields of `ClassicOptions` that differ from it.
+        Fields of `ClassicOptions` to change.
 
     Raises
     ------
     StaridError
-        A value is out of its range, or there are too few guide stars.
+        A value is out of range, or there are too few guide stars.
     """
 
     stars_per_field: ClassVar[float] = 25.0
-    """Guide stars in a field on the average."""
+    """Mean number of guide stars per field."""
 
     tolerance_px: ClassVar[float] = 3.0
     """Largest difference of two distances, pixels, where no position errors are given."""
 
     sigmas: ClassVar[float] = 3.0
-    """The same in standard deviations of a distance, where they are."""
+    """The same in standard deviations of a distance, where position errors are given."""
 
-    least_group: ClassVar[int] = MIN_GROUP
-    """Matches with agreeing distances that an answer needs."""
+    min_group: ClassVar[int] = MIN_GROUP
+    """Smallest number of matches, agreeing in distance, for an answer."""
 
-    least_stars: ClassVar[int] = MIN_GROUP
-    """Observed stars without which the algorithm has nothing to work with."""
+    min_stars: ClassVar[int] = MIN_GROUP
+    """Smallest number of observed stars that the algorithm can use."""
 
     def __init__(
         self,
@@ -188,7 +192,7 @@ class ClassicIdentifier(VerifiedIdentifier):
 
     @abstractmethod
     def _build(self) -> Database:
-        """Return the arrays that the search reads, made from the guide stars."""
+        """Build the arrays that the search reads from the guide stars."""
 
     @abstractmethod
     def _match(self, observed: Observed) -> Indices:
@@ -196,26 +200,26 @@ class ClassicIdentifier(VerifiedIdentifier):
 
     @property
     def database_bytes(self) -> int:
-        """Size of the database with the directions of the guide stars, bytes."""
+        """Size in bytes of the database, including the directions of the guide stars."""
         return self.guide.vectors.nbytes + sum(part.nbytes for part in self._database)
 
     @property
     def width_rad(self) -> float:
-        """Width of the field: the square root of its solid angle."""
+        """Width of the field, radians: the square root of its solid angle."""
         return math.sqrt(self._area_sr)
 
     @property
     def longest_chord(self) -> float:
-        """Largest distance of two stars in the field, as a chord."""
+        """Largest distance between two stars in the field, as a chord."""
         return 2.0 * math.sin(min(self._camera.field_radius_rad, 0.5 * math.pi))
 
     @cached_property
     def verifier(self) -> Identifier:
-        """What verifies and tracks."""
+        """The geometric identifier that verifies answers and tracks."""
         return Identifier(self._camera, self._catalog, cache=self.options.cache)
 
     def _guide_stars(self, per_field: float) -> GuideStars:
-        """Brightest stars as seen, so many a field."""
+        """Choose the brightest stars, as the camera resolves them, with a mean number per field."""
         wanted = math.ceil(per_field * 4.0 * math.pi / self._area_sr)
         magnitudes = np.sort(self._catalog.v)
         if magnitudes.size < MIN_GUIDE_STARS:
@@ -223,7 +227,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         limit = float(magnitudes[min(wanted, magnitudes.size) - 1])
         if self.options.limiting_magnitude is not None:
             limit = min(limit, self.options.limiting_magnitude)
-        stars = seen_stars(self._catalog, limit, BLEND_PX / self._px_per_rad)
+        stars = resolved_stars(self._catalog, limit, BLEND_PX / self._px_per_rad)
         if len(stars) < MIN_GUIDE_STARS:
             raise StaridError(
                 f"classic limiting_magnitude: {limit:g} leaves {len(stars)} guide stars, at least {MIN_GUIDE_STARS} needed"
@@ -231,13 +235,13 @@ class ClassicIdentifier(VerifiedIdentifier):
         row = self._catalog.index_of(stars.hip).astype(np.int64)
         return GuideStars(np.ascontiguousarray(stars.vectors), stars.v.copy(), row)
 
-    def _identify(self, measured: Measured) -> Solution:
+    def _identify(self, measured: CheckedDetections) -> Solution:
         observed = self._observed(measured.xy, measured.flux, measured.given_sigmas)
-        if len(observed.row) < self.least_stars:
+        if len(observed.row) < self.min_stars:
             return Solution.invalid(Reason.TOO_FEW_STARS)
         proposed = self._match(observed)
         pairs = largest_group(observed.directions, self.guide.vectors, proposed, observed.tolerance)
-        if len(pairs) < self.least_group:
+        if len(pairs) < self.min_group:
             return Solution.invalid(Reason.NO_MATCH)
         solution = self._raw(measured.xy, observed, pairs)
         if self.options.verify:
@@ -245,7 +249,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         return dataclasses.replace(solution, mode="lost_in_space")
 
     def warm_up(self) -> None:
-        """Compile, or load, the kernels, so that the first real frame is not late."""
+        """Compile or load the kernels, so that the first frame is not late."""
         xy, _ = self._camera.project(Attitude.identity().to_sensor(self.guide.vectors))
         inside = np.flatnonzero(np.isfinite(xy[:, 0]))[: self._detections]
         self._match(self._observed(xy[inside], 10.0 ** (-0.4 * self.guide.magnitude[inside]), None))
@@ -253,7 +257,7 @@ class ClassicIdentifier(VerifiedIdentifier):
             self.verifier.warm_up()
 
     def _observed(self, xy: Array, flux: Array, sigmas: Array | None) -> Observed:
-        """Detections that take part: no fainter than the guide stars, or as many as a field has of them."""
+        """Choose the detections no fainter than the guide stars, or as many as a field has of them."""
         directions = self._camera.back_project(xy)
         usable = np.flatnonzero((flux > 0.0) & np.isfinite(directions).all(axis=1))
         usable = usable[np.argsort(-flux[usable], kind="stable")]
@@ -263,7 +267,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         else:
             magnitude = magnitude + self.options.zero_point
             seen = int(np.searchsorted(magnitude, self.guide.magnitude[-1], side="right"))
-            count = min(max(seen, self.least_stars), 2 * self._detections)
+            count = min(max(seen, self.min_stars), 2 * self._detections)
         rows = usable[:count]
         tolerance_px = self.options.tolerance_px or self.tolerance_px
         if sigmas is not None and rows.size:
@@ -274,7 +278,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         )
 
     def _raw(self, xy: Array, observed: Observed, pairs: Indices) -> Solution:
-        """Attitude by least squares of the matched stars, unverified."""
+        """Fit the attitude to the matched stars by least squares, without verification."""
         seen, stars = observed.directions[pairs[:, 0]], self.guide.vectors[pairs[:, 1]]
         attitude = solve_wahba(seen, stars)
         expected, _ = self._camera.project(attitude.to_sensor(stars))

@@ -1,18 +1,18 @@
 """SGS, the simplest general subgraph.
 
-H. Liu, X. Wei, J. Li, G. Wang, "A star identification algorithm based on simplest general subgraph", Acta Astronautica 183, 11–22,
-2021.
+H. Liu, X. Wei, J. Li, G. Wang, "A star identification algorithm based on simplest general subgraph", Acta
+Astronautica 183, 11–22, 2021.
 
 A star is first identified by voting: the match groups of its pairs with all neighbours. Within a group the
-simplest subgraph is built, of as few stars as make a chance match unlikely by a model of how many sets of catalogue stars
-have given distances: its stars must agree in all distances. A reprojection of the catalogue with the attitude of that subgraph
-verifies it.
+simplest subgraph is built. It has as few stars as make a chance match unlikely, by a model of how many sets
+of catalogue stars have given distances, and its stars must agree in all distances. A reprojection of the
+catalogue with the attitude of the subgraph verifies it.
 
-own choice: a set of v stars has N·λ₂·λ₃·λ₄…λᵥ chance matches. λ₂ is the number of stars in a ring about the first, λ₃ that in two
-crossings of rings, λ₄ and further in one crossing, with the mean density of guide stars; typical distance is a quarter of
-the field's width. The least v, of 3 at least, that leaves fewer than 0.01 expected matches is taken.
-own choice: the reprojection must put a guide star on at least half of the observed stars; poles and groups are tried as in
-`starid.classic.match_group`, and without magnitudes.
+own choice: a set of v stars has N·λ₂·λ₃·λ₄…λᵥ chance matches. λ₂ is the number of stars in a ring about the
+first, λ₃ in two crossings of rings, λ₄ and further in one crossing, at the mean density of guide stars; the
+typical distance is a quarter of the width of the field. v is the least number, at least 3, with fewer than
+0.01 expected matches. own choice: the reprojection must put a guide star on at least half of the observed
+stars. Poles and groups are tried as in `starid.classic.match_group`, but without magnitudes.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from starid.wahba import solve_wahba
 POLES: Final = 10
 GROUPS: Final = 8
 CHANCE: Final = 0.01
-"""Expected chance matches of a subgraph that is simple enough."""
+"""Largest number of chance matches expected of a subgraph."""
 
 REPROJECTED_SHARE: Final = 0.5
 
 
 def simplest_size(stars: int, width_rad: float, tolerance: float) -> int:
-    """Stars of the smallest subgraph that is unlikely to match by chance, at least 3.
+    """Number of stars, at least 3, of the smallest subgraph that is unlikely to match by chance.
 
     Parameters
     ----------
@@ -68,7 +68,11 @@ def _groups(
     partners: list[tuple[int, int, int]],
     size: Indices,
 ) -> None:
-    """List (candidate, neighbour, its star) of the catalogue pairs that fit the pole's, and count each candidate's neighbours."""
+    """Collect the match groups of a pole.
+
+    `partners` receives (candidate, neighbour, its star) of the catalogue pairs that fit, and `size` the
+    number of neighbours of each candidate.
+    """
     partners.clear()
     size[:] = 0
     last = np.full(size.shape[0], -1, dtype=np.int64)
@@ -89,7 +93,7 @@ def _groups(
 
 @compiled_ieee
 def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, least: int) -> list[Indices]:
-    """Subgraphs (m, 2) of at least so many stars that agree in all distances, as the poles give them."""
+    """List the subgraphs (m, 2), of at least `least` stars, that agree in all distances."""
     found = [np.empty((0, 2), dtype=np.int64)]
     partners = [(0, 0, 0)]
     size = np.empty(vectors.shape[0], dtype=np.int64)
@@ -115,7 +119,7 @@ def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, 
 
 
 class SubgraphIdentifier(ClassicIdentifier):
-    """The simplest general subgraph behind the interface of all identifiers."""
+    """The simplest general subgraph behind the common interface of all identifiers."""
 
     def _build(self) -> Database:
         self.pairs = pair_table(self.guide.vectors, self.longest_chord)
@@ -131,13 +135,13 @@ class SubgraphIdentifier(ClassicIdentifier):
         return subgraphs[0]
 
     def _reprojected(self, observed: Observed, subgraph: Indices) -> Indices:
-        """All matches that the attitude of a subgraph makes; none where they are too few."""
+        """Match stars with the attitude of a subgraph; none if too few fit."""
         none = np.empty((0, 2), dtype=np.int64)
         if len(subgraph) == 0:
             return none
         try:
             attitude = solve_wahba(observed.directions[subgraph[:, 0]], self.guide.vectors[subgraph[:, 1]])
-        except StaridError:  # stars on one line
+        except StaridError:  # collinear stars
             return none
         cosines = attitude.to_icrs(observed.directions) @ self.guide.vectors.T
         nearest = cosines.argmax(axis=1)

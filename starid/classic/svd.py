@@ -1,18 +1,19 @@
 """SVD, the singular value method.
 
-J.-N. Juang, H. Y. Kim, J. L. Junkins, "An Efficient and Robust Singular Value Method for Star Pattern Recognition and Attitude
-Determination", NASA/TM-2003-212142, 2003.
+J.-N. Juang, H. Y. Kim, J. L. Junkins, "An Efficient and Robust Singular Value Method for Star Pattern
+Recognition and Attitude Determination", NASA/TM-2003-212142, 2003.
 
-The directions of a star and of four others make a 3 × 5 matrix. If the sensor is turned by A against the sky, the observed matrix
-is W = A·V: the singular values of both are the same whatever A is, and serve as the key. With W = U·S·Qᵀ and V = P·S·Qᵀ
-the attitude is A = U·Pᵀ, the signs of whose columns follow from the two Q. The brightest star is tried first as the reference; where
-nothing in the database has its key, another one is.
+The directions of a star and of four others form a 3 × 5 matrix. If the sensor has attitude A, the observed
+matrix is W = A·V: the singular values of both are the same whatever A is, and serve as the key. With W =
+U·S·Qᵀ and V = P·S·Qᵀ the attitude is A = U·Pᵀ, where the signs of the columns follow from the two Q. The
+brightest star is tried first as the reference; if nothing in the database has its key, another is tried.
 
-own choice: the four are the nearest beyond a buffer (0.05 of the field's width), by rising distance: a choice that does not
-depend on where in the field the reference stands. The first singular value follows from the other two (their squares add up
-to the number of stars), so the keys are sorted by the second and compared in the second and third.
-own choice: a key is confirmed by its attitude, which must bring all five stars within the tolerance; references are tried until
-`CONFIRMED` of them agree, and the shared step makes the attitude from all their stars.
+own choice: the four are the nearest beyond a buffer (0.05 of the width of the field), in order of distance, a
+choice that does not depend on where in the field the reference is. The first singular value follows from the
+other two (their squares add up to the number of stars), so the keys are sorted by the second and compared in
+the second and third. own choice: a key is confirmed by its attitude, which must bring all five stars within
+the tolerance. References are tried until `CONFIRMED` of them agree, and the shared step computes the attitude
+from all their stars.
 """
 
 from __future__ import annotations
@@ -28,17 +29,17 @@ from starid.classic.solver import ClassicIdentifier, Database, Observed
 from starid.jit import compiled_ieee
 
 PATTERN: Final = 5
-"""Stars of a pattern, the reference with them."""
+"""Number of stars in a pattern, including the reference."""
 
 BUFFER_SHARE: Final = 0.05
 RADIUS_SHARE: Final = 0.5
 CONFIRMED: Final = 4
-"""References after which no more are tried."""
+"""Number of confirmed references after which the search stops."""
 
 
 @compiled_ieee
 def _pattern_rows(vectors: Array, radius: float, buffer: float) -> Indices:
-    """Rows (n, `PATTERN`) of each star and its nearest neighbours beyond a buffer; −1 where it has too few."""
+    """Rows (n, `PATTERN`) of each star and its nearest neighbours beyond a buffer; −1 if too few."""
     n = vectors.shape[0]
     polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
     found = np.full((n, PATTERN), -1, dtype=np.int64)
@@ -52,7 +53,7 @@ def _pattern_rows(vectors: Array, radius: float, buffer: float) -> Indices:
 
 
 def singular_attitude(seen: Array, stars: Array) -> Array:
-    """Matrix (3, 3) ICRS→sensor from the singular vectors of observed and catalogue directions, (3, m) each."""
+    """Matrix (3, 3) ICRS→sensor from the singular vectors of observed and catalogue directions (3, m)."""
     u, _, q_seen = np.linalg.svd(seen, full_matrices=False)
     p, _, q_star = np.linalg.svd(stars, full_matrices=False)
     signs = np.where(np.sum(q_seen * q_star, axis=1) < 0.0, -1.0, 1.0)
@@ -61,10 +62,10 @@ def singular_attitude(seen: Array, stars: Array) -> Array:
 
 
 class SvdIdentifier(ClassicIdentifier):
-    """The singular value method behind the interface of all identifiers."""
+    """The singular value method behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 20.0
-    least_stars: ClassVar[int] = PATTERN
+    min_stars: ClassVar[int] = PATTERN
 
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad
@@ -88,10 +89,11 @@ class SvdIdentifier(ClassicIdentifier):
         return np.concatenate(found) if found else np.empty((0, 2), dtype=np.int64)
 
     def _confirmed(self, observed: Observed, pattern: Indices) -> Indices | None:
-        """Guide stars of an observed pattern: those of the one key whose attitude brings all stars to their places."""
+        """Guide stars of an observed pattern, from the one key whose attitude fits all its stars."""
         seen = observed.directions[pattern].T
         key = np.linalg.svd(seen, compute_uv=False)[1:]
-        # a singular value moves by at most the norm of the errors (Weyl), five stars' at one sigma's worth of tolerance each
+        # a singular value moves by at most the norm of the errors (Weyl): five stars, one sigma of the
+        # tolerance each
         reach = observed.tolerance / math.sqrt(2.0) * math.sqrt(PATTERN) / 2.0
         first, last = np.searchsorted(self.keys[:, 0], [key[0] - reach, key[0] + reach])
         near = first + np.flatnonzero(np.abs(self.keys[first:last, 1] - key[1]) <= reach)

@@ -1,16 +1,18 @@
 """VP, the one-dimensional vector pattern.
 
-L. Luo, L. Xu, H. Zhang, "An Autonomous Star Identification Algorithm Based on One-Dimensional Vector Pattern for Star Sensors",
-Sensors 15(7), 16412–16429, 2015.
+L. Luo, L. Xu, H. Zhang, "An Autonomous Star Identification Algorithm Based on One-Dimensional Vector Pattern
+for Star Sensors", Sensors 15(7), 16412–16429, 2015.
 
-The neighbours of a star are turned until its alignment star lies on the x' axis. Their positions along x', sorted into the elements
-of one vector, with the plane angle that each makes with the alignment star, are the pattern; it does not change as the image
-rotates, so no circular shift is needed. Patterns are found by an index over the elements of the vector.
+The neighbours of a star are rotated until its alignment star lies on the x' axis. The pattern is their
+positions along x', sorted into the elements of one vector, and the plane angle between each and the alignment
+star. It does not change as the image rotates, so no circular shift is needed. Patterns are found by an index
+over the elements of the vector.
 
-own choice: 200 elements over the diameter, pattern radius and buffer those of `starid.classic.grid`; an observed neighbour votes for a
-guide star that has one in the same element or the next, whose angle differs by at most 4°. (Position and angle together fix a neighbour's
-place, up to its mirror image at equal x', which the sign of the angle distinguishes.)
-own choice: the angle of a near neighbour is uncertain, so the allowed difference grows inversely with its distance from the pivot.
+own choice: 200 elements over the diameter; pattern radius and buffer as in `starid.classic.grid`. An observed
+neighbour votes for a guide star with a neighbour in the same or an adjacent element whose angle differs by at
+most 4°. (Position and angle together determine where a neighbour is; the sign of the angle separates the two
+mirror images at equal x'.) own choice: the angle of a near neighbour is uncertain, so the allowed difference
+grows inversely with its distance from the pivot.
 """
 
 from __future__ import annotations
@@ -29,21 +31,21 @@ from starid.jit import compiled_ieee, inner
 
 ELEMENTS: Final = 200
 ANGLE_TOLERANCE: Final = math.radians(4.0)
-"""Largest difference of the angle of a neighbour at half the pattern radius."""
+"""Largest difference in angle for a neighbour at half the pattern radius."""
 
 MIN_VOTES: Final = 4
 
 
 @inner
 def _element(polar: Array, i: int, reference: float, radius: float) -> int:
-    """Element of the vector that a neighbour's x' falls into."""
+    """Element of the vector for the x' of a neighbour."""
     x = polar[i, 0] / radius * math.cos(turned(polar[i, 1], reference))
     return min(max(int(0.5 * (1.0 + x) * ELEMENTS), 0), ELEMENTS - 1)
 
 
 @compiled_ieee
 def _patterns(vectors: Array, radius: float, buffer: float) -> tuple[Indices32, NDArray[np.uint16], Array32]:
-    """Index: first entry of each element, the stars that have a neighbour there, and its angle."""
+    """Index: first entry of each element, the stars with a neighbour there, and its angle."""
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     elements, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     angles = [0.0 for _ in range(0)]
@@ -70,7 +72,7 @@ def _vote(
     radius: float,
     buffer: float,
 ) -> Indices:
-    """Matches (m, 2) of each observed star as the pivot with the guide stars that have most votes."""
+    """Match (m, 2) each observed star, as the pivot, with the guide stars that have the most votes."""
     start, owner, angles = index
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
@@ -99,7 +101,7 @@ def _vote(
 
 
 class VectorPatternIdentifier(ClassicIdentifier):
-    """The one-dimensional vector pattern behind the interface of all identifiers."""
+    """The one-dimensional vector pattern behind the common interface of all identifiers."""
 
     stars_per_field: ClassVar[float] = 30.0
 

@@ -1,1 +1,1 @@
-"""The geometric star identifier: verified triangles of bright stars, and tracking near a prediction."""
+"""The geometric star identifier: search by triangles of bright stars, verification, and tracking."""

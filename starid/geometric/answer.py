@@ -1,4 +1,4 @@
-"""Test, refinement and verification of a candidate attitude, and the kernels' answer."""
+"""Testing, refinement and verification of a candidate attitude; the answer of the kernels."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from starid.geometric.verification import log_false_probability, worth_refining
 from starid.jit import inner
 
 MIN_MATCHED: Final = 4
-"""Least number of matches of an answer that is not near a prediction."""
+"""Least number of matches for an answer without a predicted attitude."""
 
 MIN_TESTED: Final = 4
-"""Detections outside the pattern with which the sequential test can reject."""
+"""Number of detections outside the pattern from which the sequential test can reject."""
 
 
 class Answer(NamedTuple):
@@ -50,9 +50,9 @@ class Answer(NamedTuple):
     covariance : ndarray (3, 3)
         rad², sensor frame.
     pairs : ndarray (2, m) int64
-        Matched rows of the detections, and of the index's stars.
+        Matched rows: detections, and stars of the index.
     numbers : ndarray (6,)
-        rms (px), noise (px), logarithm of the bound on the probability of a false answer, scale, triangles, candidates.
+        RMS (px), noise (px), log of the bound on the false-answer probability, scale, triangles, candidates.
     """
 
     status: int
@@ -68,7 +68,7 @@ class Candidate(NamedTuple):
     Attributes
     ----------
     frames : ndarray (3, 3, 3)
-        Frames of the pattern in the sensor and in the sky, and the rotation between them.
+        Axes of the pattern in the sensor and in the sky, and the rotation between them.
     stars : ndarray (n,) int64
     normal : ndarray (4, 4)
     numbers : ndarray (`NUMBERS`,)
@@ -82,7 +82,7 @@ class Candidate(NamedTuple):
 
 @inner
 def new_candidate(count: int) -> Candidate:
-    """Workspace for a number of detections."""
+    """Allocate a workspace for a number of detections."""
     stars = np.empty(count, dtype=np.int64)
     return Candidate(np.empty((3, 3, 3)), stars, np.empty((4, 4)), np.empty(NUMBERS))
 
@@ -96,7 +96,7 @@ def test_and_refine(
     candidate: Candidate,
     tests: tuple[Array, Indices],
     used: tuple[int, int, int],
-    least_matched: int,
+    min_matched: int,
     prior: tuple[float, float],
 ) -> tuple[int, float]:
     """Test, refine and verify the attitude in ``candidate.frames[2]``.
@@ -104,27 +104,28 @@ def test_and_refine(
     Parameters
     ----------
     candidate : Candidate
-        Rotation, scale and zero point must be set.
+        Its rotation, scale and zero point must be set.
     tests : (odds, order)
         From `starid.geometric.verification.hit_odds` and `test_order`.
     used : (int, int, int)
-        Detections that the attitude was derived from.
-    least_matched : int
-        Least number of matches. Below `MIN_MATCHED` a few detections are not tested one by one: the bound alone decides.
+        Detections from which the attitude was derived.
+    min_matched : int
+        Least number of matches. Below `MIN_MATCHED`, a few detections are not tested individually: only the
+        bound decides.
     prior : (float, float)
-        As in `log_false_probability`.
+        See `log_false_probability`.
 
     Returns
     -------
     matched : int
-        Stars matched; 0 for a rejected candidate.
+        Number of stars matched; 0 for a rejected candidate.
     bound : float
-        Logarithm of the bound on the probability of a false answer.
+        Log of the bound on the probability of a false answer.
     """
     rotation, numbers = candidate.frames[2], candidate.numbers
     faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
     odds, order = tests
-    few = least_matched < MIN_MATCHED and observed.shape[0] < least_matched + MIN_TESTED
+    few = min_matched < MIN_MATCHED and observed.shape[0] < min_matched + MIN_TESTED
     if not few and not worth_refining(
         index, raw.params, observed, rotation, numbers[SCALE], faintest, settings, odds, order, used
     ):
@@ -135,7 +136,7 @@ def test_and_refine(
         raw,
         observed,
         settings,
-        least_matched,
+        min_matched,
         seen,
         rotation,
         candidate.stars,
@@ -154,7 +155,7 @@ def test_and_refine(
 
 @inner
 def quaternion_of(m: Array, q: Array) -> None:
-    """Fill in the scalar-last quaternion, scalar ≥ 0, of a rotation matrix (Shepperd 1978)."""
+    """Convert a rotation matrix to a scalar-last quaternion, scalar ≥ 0, in place (Shepperd 1978)."""
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     if trace > 0.0:
         q[3] = 1.0 + trace
@@ -187,11 +188,11 @@ def make_answer(
     triangles: int,
     candidates: int,
 ) -> Answer:
-    """Make the answer of an accepted candidate, or an empty one for any other status than `ACCEPTED`.
+    """Build the answer from an accepted candidate; it is empty for any status but `ACCEPTED`.
 
-    The covariance is the inverse normal matrix times the variance of unit weight. That is estimated from the
-    residuals with ν degrees of freedom and multiplied by ν/(ν − 2), which makes it the covariance of the
-    (Student) posterior; the caller's errors count as additional degrees of freedom.
+    The covariance is the inverse normal matrix times the variance of unit weight. This variance is estimated
+    from the residuals with ν degrees of freedom and multiplied by ν/(ν − 2), which gives the covariance of
+    the (Student) posterior; errors given by the caller count as additional degrees of freedom.
     """
     numbers = candidate.numbers
     quaternion, covariance = np.full(4, math.nan), np.full((3, 3), math.nan)

@@ -1,7 +1,8 @@
 """The geometric star identifier: verified triangles of bright stars, over the whole sky, for any camera.
 
-It combines the lost-in-space search (`starid.geometric.search`), tracking (`starid.geometric.tracking`), refinement
-(`starid.geometric.refinement`) and verification (`starid.geometric.verification`) for one camera and one catalogue.
+It combines the lost-in-space search (`starid.geometric.search`), tracking (`starid.geometric.tracking`),
+refinement (`starid.geometric.refinement`) and verification (`starid.geometric.verification`) for one camera
+and one catalogue.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from starid.geometric.index_choice import (
     obtain_index,
     pixels_per_radian,
 )
-from starid.geometric.pattern_index import field_solid_angle, seen_stars
+from starid.geometric.pattern_index import field_solid_angle, resolved_stars
 from starid.geometric.search import identify_kernel
 from starid.geometric.settings import (
     ACCEPTED,
@@ -53,7 +54,7 @@ from starid.geometric.settings import (
 )
 from starid.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KNOWN, track_kernel
 from starid.geometric.verification import WHOLE_SKY
-from starid.single_camera import Measured, SingleCameraIdentifier, near
+from starid.single_camera import CheckedDetections, SingleCameraIdentifier, near
 from starid.solution import Mode, Reason, Solution
 
 BLEND_PX: Final = 2.0
@@ -61,10 +62,10 @@ TRACKING_WINDOW_PX: Final = 20.0
 WIDEST_TOLERANCE: Final = 0.3
 MAX_PART_STARS: Final = 30
 _QUICK_TRIANGLES: Final = 60
-"""Triangles tried at each focal length before any is searched in full."""
+"""Number of triangles tried at each focal length before any full search."""
 
 _SCALE_ERROR: Final = 0.012
-"""Largest difference of scale across the field at which triangles are still found."""
+"""Largest variation of scale across the field at which triangles are still found."""
 
 
 @dataclass(frozen=True)
@@ -80,14 +81,14 @@ class Effort:
     test_window_px : float
         Window in which a candidate attitude is tested, pixels.
     magnitude_gate : float
-        Largest deviation of a star's catalogue magnitude from the one of its flux.
+        Largest difference between a star's catalogue magnitude and the magnitude from its flux.
     max_triangles : int
-        Most triangles of detections looked up over the whole field.
+        Largest number of triangles of detections looked up over the whole field.
     part_stars : int
-        Brightest detections in each quadrant and the middle of the field of which every triangle is tried
-        after that; 0 skips this stage.
+        Number of detections, brightest first, whose triangles are all tried afterwards in each quadrant and
+        in the middle of the field; 0 skips this stage.
     max_false_probability, max_false_probability_tracking : float
-        Largest accepted bound on the probability of a false solution, lost in space and near a predicted
+        Largest accepted bound on the probability of a false solution, when lost in space and near a predicted
         attitude.
     """
 
@@ -110,7 +111,7 @@ class Effort:
                 raise StaridError(f"identifier {field.name}: must be a positive number, not {value}")
 
     def numbers(self, camera: Camera, px_per_rad: float) -> Array:
-        """Settings of the kernels (`starid.geometric.settings`) for a camera of known focal length."""
+        """Kernel settings (`starid.geometric.settings`) for a camera of known focal length."""
         numbers = np.zeros(SETTING_COUNT)
         numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
         numbers[MAGNITUDE_GATE] = self.magnitude_gate
@@ -129,20 +130,20 @@ class Effort:
 class Identifier(SingleCameraIdentifier):
     """Star identification for one camera and one catalogue.
 
-    In `track` three stars can be enough, and two if their errors are given. Whether they are depends on the window, by
-    default `TRACKING_WINDOW_PX`: the narrower, the less can agree by chance.
+    In `track`, three stars can be enough, or two if their errors are given. Whether they are depends on the
+    window (default `TRACKING_WINDOW_PX`): the narrower it is, the fewer stars agree by chance.
 
     Parameters
     ----------
     camera : Camera
         The camera that took the images.
     catalog : StarCatalog, optional
-        By default the whole of Hipparcos at its default epoch.
+        By default all of Hipparcos at its default epoch.
     limiting_magnitude : float, optional
         Faintest V in the index; by default some 200 stars per field, at least V 6.
     fov_tolerance : float
-        Relative uncertainty of the focal length, 0 for a calibrated camera. Otherwise solutions carry the
-        refined camera.
+        Relative uncertainty of the focal length, 0 for a calibrated camera. If it is not 0, solutions carry
+        the refined camera.
     blend_px : float
         Stars closer than this are merged, pixels.
     effort : Effort
@@ -182,13 +183,13 @@ class Identifier(SingleCameraIdentifier):
         if limiting_magnitude is None:
             limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(typical))
         settings = index_settings(typical, self._catalog, limiting_magnitude, blend_px, effort.window_px)
-        self._stars = seen_stars(self._catalog, limiting_magnitude, settings.blend_rad)
+        self._stars = resolved_stars(self._catalog, limiting_magnitude, settings.blend_rad)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
         self._index = obtain_index(self._stars, settings, cache)
         self._configure(camera, fov_tolerance, effort)
 
     def _configure(self, camera: Camera, fov_tolerance: float, effort: Effort) -> None:
-        """Set everything that depends on the camera or the bounds of the search."""
+        """Set what depends on the camera and the bounds of the search."""
         self._camera = camera
         self._fov_tolerance = fov_tolerance
         self._effort = effort
@@ -199,7 +200,7 @@ class Identifier(SingleCameraIdentifier):
 
     @property
     def stars(self) -> StarCatalog:
-        """The stars of the index as the camera resolves them: doubles merged, brightest first."""
+        """The stars of the index, brightest first, with unresolved doubles merged."""
         return self._stars
 
     @property
@@ -207,19 +208,19 @@ class Identifier(SingleCameraIdentifier):
         """Size of the index, bytes."""
         return sum(part.nbytes for part in self._index)
 
-    def _identify(self, measured: Measured) -> Solution:
+    def _identify(self, measured: CheckedDetections) -> Solution:
         if self._fov_tolerance > 0.0:
             return self._identify_any_scale(measured)
         answer = self._search(self._camera, measured, self._numbers_for(measured))
         return self._solution(answer, "lost_in_space")
 
-    def _search(self, camera: Camera, measured: Measured, numbers: Array) -> Answer:
-        """Search the whole sky with a camera and settings of the kernels."""
+    def _search(self, camera: Camera, measured: CheckedDetections, numbers: Array) -> Answer:
+        """Search the whole sky with a given camera and kernel settings."""
         detections = measured.xy, measured.flux, measured.sigmas
         return identify_kernel(self._index, camera.params, *detections, numbers)
 
-    def _numbers_for(self, measured: Measured) -> Array:
-        """Settings of the kernels for one call."""
+    def _numbers_for(self, measured: CheckedDetections) -> Array:
+        """Kernel settings for one call."""
         numbers = self._numbers_with_errors if measured.sigmas_known else self._numbers
         if measured.observer_velocity is None:
             return numbers
@@ -227,11 +228,11 @@ class Identifier(SingleCameraIdentifier):
         numbers[BETA_X : BETA_Z + 1] = checked_beta(measured.observer_velocity)
         return numbers
 
-    def _identify_any_scale(self, measured: Measured) -> Solution:
+    def _identify_any_scale(self, measured: CheckedDetections) -> Solution:
         """Try focal lengths from the nominal one outward, each with its share of the tolerance.
 
-        A short search at every focal length comes before the full one. Each search bounds its own probability of a
-        false solution; the bound of the whole is the sum over the focal lengths.
+        A short search at every focal length precedes the full one. Each search bounds its own probability of
+        a false solution; the total bound is the sum over the focal lengths.
         """
         steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
         share = self._fov_tolerance / (2 * steps - 1)
@@ -272,20 +273,25 @@ class Identifier(SingleCameraIdentifier):
         Parameters
         ----------
         xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity
-            As in `track`. That the attitude is near the candidate one is no evidence for it.
+            See `track`. Unlike there, agreement with the candidate is not taken as evidence.
 
         Raises
         ------
         StaridError
-            As in `track`.
+            See `track`.
         """
         search = functools.partial(self._track, anywhere=True)
         return near(xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, search)
 
     def _track(
-        self, measured: Measured, predicted: Attitude, window_px: float | None, *, anywhere: bool = False
+        self,
+        measured: CheckedDetections,
+        predicted: Attitude,
+        window_px: float | None,
+        *,
+        anywhere: bool = False,
     ) -> Solution:
-        """Find the attitude near another, which is prior knowledge unless it came from a search (`anywhere`)."""
+        """Find the attitude near another, which is a prediction, or the result of a search (`anywhere`)."""
         numbers = self._numbers_for(measured)
         window = (TRACKING_WINDOW_PX if window_px is None else window_px) / self._px_per_rad
         prior, least = self._prior(window), MIN_TRACKED_KNOWN if measured.sigmas_known else MIN_TRACKED
@@ -299,8 +305,8 @@ class Identifier(SingleCameraIdentifier):
         return self._solution(answer, "tracking")
 
     def _prior(self, window_rad: float) -> tuple[float, float]:
-        """Volume of the rotations that keep every star of the field within a window, rad³, and the window's solid angle."""
-        # a star at the border of the field stays within it after a roll of window/(field's radius)
+        """Prior volume of rotations within a window, rad³, and solid angle of the window."""
+        # a star at the edge of the field stays within it after a roll of window/(field radius)
         radius = math.sqrt(self._camera.width * self._camera.height / math.pi) / self._px_per_rad
         volume = 2.0 * math.pi * window_rad**2 * min(window_rad / radius, math.pi)
         return min(volume, WHOLE_SKY[0]), min(math.pi * window_rad**2, WHOLE_SKY[1])
@@ -314,12 +320,12 @@ class Identifier(SingleCameraIdentifier):
     def with_camera(
         self, camera: Camera, *, fov_tolerance: float = 0.0, effort: Effort | None = None
     ) -> Identifier:
-        """Identifier that shares the index, for a camera of the same size and a focal length within the tolerance.
+        """Identifier for a similar camera, of the same size, that shares this one's index.
 
         Parameters
         ----------
         camera : Camera
-            The other camera.
+            The other camera; its focal length must be within the tolerance.
         fov_tolerance : float
             Relative uncertainty of its focal length.
         effort : Effort, optional
@@ -337,14 +343,16 @@ class Identifier(SingleCameraIdentifier):
 
     @property
     def directions(self) -> Array:
-        """Unit vectors (m, 3) of `stars`, as the index holds them."""
+        """Unit vectors (m, 3) of `stars`, as stored in the index."""
         return self._index.stars[:, :3]
 
     def with_direction(self, row: int, direction: Array) -> Identifier:
-        """Identifier whose index holds another direction (3,), not necessarily of unit length, for a row of `stars`."""
+        """Identifier with another direction (3,), of any length, for a row of `stars`."""
         stars = self._index.stars.copy()
         stars[row, :3] = direction
-        stars.flags.writeable = False  # as in an index from its file: the same machine code serves both
+        stars.flags.writeable = (
+            False  # as in an index loaded from a file, so that the same machine code is used
+        )
         other = object.__new__(Identifier)
         other.__dict__.update(self.__dict__)
         other._index = self._index._replace(stars=stars)
@@ -373,7 +381,7 @@ class Identifier(SingleCameraIdentifier):
 
 
 def _scale_variation(camera: Camera) -> float:
-    """Spread across the field of the scale of triangles' sides, per relative change of the focal length."""
+    """Variation across the field of the scale of triangle sides, per relative change of focal length."""
     angle = min(camera.field_radius_rad, 0.5 * math.pi)
     if camera.model == "pinhole":
         return 2.0 * math.sin(angle) ** 2

@@ -1,4 +1,4 @@
-"""The index that suits a camera: its depth, pattern size and resolution from the field and the pixels."""
+"""Choice of the index for a camera: depth, pattern size and resolution, from the field and the pixels."""
 
 from __future__ import annotations
 
@@ -27,34 +27,34 @@ STARS_PER_FIELD: Final = 200
 
 BRIGHTEST_LIMIT: Final = 6.0
 FAINTEST_LIMIT: Final = 9.0
-"""Range of the default limiting magnitude: Hipparcos is incomplete beyond the second."""
+"""Range of the default limiting magnitude; beyond the faint end Hipparcos is incomplete."""
 
 BRIGHT_QUOTA: Final = 5
 LARGEST_QUOTA: Final = 20
 SMALLEST_QUOTA: Final = 6
-"""Pattern stars in half the field's area: a few bright ones, and as many deep ones as the size of the index allows."""
+"""Pattern stars in half the area of the field: a few bright ones, and as many deep ones as fit."""
 
 MAX_BRIGHT: Final = 120_000
 MAX_DEEP: Final = 420_000
-"""Approximate limits of the numbers of triangles of bright and of deep pattern stars."""
+"""Approximate limits on the number of triangles of bright and of deep pattern stars."""
 
 BRIGHT_SIDES: Final = (0.04, 1.3)
 DEEP_SIDES: Final = (0.12, 0.95)
-"""Shortest and longest side as shares of the field's width; narrow fields have a smaller longest side."""
+"""Shortest and longest side as a share of the width of the field; smaller longest side in narrow fields."""
 
 MIDDLE_SIDE: Final = 0.5
-"""The number of deep pattern stars is reduced rather than their longest side below this share."""
+"""Below this share the number of deep pattern stars is reduced, not their longest side."""
 
 SIDE_BINS: Final = 128
 _STARS_PER_QUOTA: Final = 30.0
-"""Pattern stars of the whole sky, times the field's solid angle, over the quota; measured on indices."""
+"""(Pattern stars in the whole sky) · (solid angle of the field) / quota; measured on indices."""
 
 _TRIANGLES_PER_QUOTA2: Final = 6.0
-"""Triangles per pattern star over (quota² · (longest side / width)⁴); measured on indices."""
+"""(Triangles per pattern star) / (quota² · (longest side / width)⁴); measured on indices."""
 
 
 def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> float:
-    """V at which a field holds `STARS_PER_FIELD` on average, in steps of ¼, within 6…9."""
+    """V limit at which a field has `STARS_PER_FIELD` on average, in steps of ¼, within 6…9."""
     wanted = STARS_PER_FIELD * 4.0 * math.pi / field_area_sr
     row = min(int(wanted), len(catalog)) - 1
     limit = math.ceil(4.0 * float(catalog.v[row])) / 4.0
@@ -62,7 +62,7 @@ def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> fl
 
 
 def pixels_per_radian(camera: Camera) -> float:
-    """Least pixels per radian anywhere in the field: the smaller singular value of the projection."""
+    """Lowest scale in the field, pixels per radian: the smaller singular value of the projection."""
     steps = np.linspace(0.0, 1.0, 9)
     grid = np.stack(np.meshgrid(steps * (camera.width - 1), steps * (camera.height - 1)), axis=-1)
     directions = camera.back_project(grid.reshape(-1, 2))
@@ -74,7 +74,7 @@ def pixels_per_radian(camera: Camera) -> float:
 def index_settings(
     camera: Camera, catalog: StarCatalog, limiting_magnitude: float, blend_px: float, window_px: float
 ) -> IndexSettings:
-    """Settings of the index that suits a camera.
+    """Choose the settings of the index for a camera.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ def index_settings(
 
 
 def _longest_share(triangles: int, quota: int, area: float) -> float:
-    """Longest side, as a share of the field's width, that yields about a number of triangles."""
+    """Longest side, as a share of the width of the field, for about a given number of triangles."""
     per_star = triangles * area / (_STARS_PER_QUOTA * quota)
     return float((per_star / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25)
 
@@ -120,9 +120,9 @@ def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str 
     Parameters
     ----------
     stars : StarCatalog
-        From `starid.geometric.pattern_index.seen_stars`.
+        From `starid.geometric.pattern_index.resolved_stars`.
     settings : IndexSettings
-        Settings of the index.
+        From `index_settings`.
     cache : bool or path
         True for the cache folder, a path for another folder, False for memory only.
     """

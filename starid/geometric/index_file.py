@@ -1,7 +1,7 @@
 """The identification index on disk: written atomically, verified by a checksum, and mapped into memory.
 
-Layout: magic, length of the header (u64, little-endian), header (JSON: key, checksum of the data, name,
-dtype, shape and offset of each array), then the arrays, each beginning on a multiple of 64 bytes.
+Layout: magic, length of the header (u64, little-endian), header (JSON: key, checksum of the data, and name,
+dtype, shape and offset of each array), then the arrays, each aligned to 64 bytes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def _padded(length: int) -> int:
 
 
 def pack(arrays: IndexArrays, key: str) -> bytes:
-    """Bytes of an index file."""
+    """Serialise an index."""
     table = []
     data = bytearray()
     for name, array in arrays._asdict().items():
@@ -44,7 +44,7 @@ def pack(arrays: IndexArrays, key: str) -> bytes:
 
 
 def unpack(buffer: bytes | mmap.mmap, key: str) -> IndexArrays:
-    """Arrays of an index file, read-only views into the buffer.
+    """Parse an index file into arrays, which are read-only views into the buffer.
 
     Raises
     ------
@@ -56,13 +56,13 @@ def unpack(buffer: bytes | mmap.mmap, key: str) -> IndexArrays:
         raise ValueError("not an index file")
     header_end = prefix + int.from_bytes(buffer[len(_MAGIC) : prefix], "little")
     if header_end > len(buffer):
-        raise ValueError("header cut off")
+        raise ValueError("header is truncated")
     header: dict[str, Any] = json.loads(buffer[prefix:header_end])
     if header["key"] != key:
         raise ValueError("made for another catalogue, camera or version")
     data = memoryview(buffer)[_padded(header_end) :]
     if zlib.crc32(data) != header["crc32"]:
-        raise ValueError("checksum does not fit the data")
+        raise ValueError("checksum does not match the data")
     views: dict[str, NDArray[Any]] = {}
     for entry in header["arrays"]:
         count = int(np.prod(entry["shape"], dtype=np.int64))
@@ -72,7 +72,7 @@ def unpack(buffer: bytes | mmap.mmap, key: str) -> IndexArrays:
 
 
 def load(path: Path, key: str) -> IndexArrays | None:
-    """Map an index file; None, with a warning in the log, where it is damaged or of another index."""
+    """Map an index file; log a warning and return None if it is damaged or belongs to another index."""
     try:
         with path.open("rb") as stream:
             return unpack(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), key)
@@ -84,7 +84,7 @@ def load(path: Path, key: str) -> IndexArrays | None:
 
 
 def store(path: Path, arrays: IndexArrays, key: str) -> IndexArrays:
-    """Write an index file and map it; where that fails the index stays in memory."""
+    """Write an index file and map it; if that fails, the index stays in memory."""
     content = pack(arrays, key)
     try:
         write_atomically(path, lambda part: _write(part, content))

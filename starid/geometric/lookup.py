@@ -14,7 +14,7 @@ from starid.jit import inner
 
 @inner
 def _first_at_least(sides: NDArray[np.uint16], begin: int, end: int, shortest: int) -> int:
-    """First triangle of a run whose shortest side has at least a length; `end` where there is none."""
+    """First triangle in a range whose shortest side reaches a length; `end` if there is none."""
     while begin < end:
         middle = (begin + end) >> 1
         if int(np.int64(sides[middle, 2])) < shortest:
@@ -33,9 +33,9 @@ def find_triangles(
     spread: float,
     found: Indices,
 ) -> int:
-    """Find the triangles of the index with three sides, longest first, within a tolerance; return their number.
+    """Find index triangles with given sides (longest first) within a tolerance; return their number.
 
-    With a `spread` the sides may be scaled by a common factor within 1 ± spread.
+    A non-zero `spread` also allows a common scale factor of the sides, within 1 ± spread.
     """
     sides, row_start = index.sides, index.row_start
     bins, steps = int(index.numbers[SIDE_BINS]), 1.0 / index.numbers[SIDE_STEP]

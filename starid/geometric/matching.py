@@ -1,4 +1,4 @@
-"""Matching of detections to catalogue stars under an attitude."""
+"""Matching of detections to catalogue stars for a given attitude."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ WINDOW_SIGMAS: Final = 4.0
 
 SMALLEST_WINDOW_PX: Final = 0.15
 BY_NOISE: Final = 0.0
-"""Value of the reach that selects windows of `WINDOW_SIGMAS` times each detection's noise."""
+"""Value of `reach` for windows of `WINDOW_SIGMAS` times the noise of each detection."""
 
 
 @inner
 def to_sky(rotation: Array, seen: Table, i: int) -> tuple[float, float, float]:
-    """Direction of detection i expressed in ICRS, by the ICRS→sensor matrix."""
+    """Direction of detection i in ICRS, given the ICRS→sensor matrix."""
     x, y, z = seen[i, X], seen[i, Y], seen[i, Z]
     return (
         rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z,
@@ -50,7 +50,7 @@ def to_sky(rotation: Array, seen: Table, i: int) -> tuple[float, float, float]:
 def residual(
     star_table: Array, seen: Table, rotation: Array, i: int, star: int
 ) -> tuple[float, float, float, float, float]:
-    """Residual of detection i against a star (columns, rows; pixels), and the star's direction in the sensor."""
+    """Residual of detection i (column, row; pixels), and the star's direction in the sensor frame."""
     a, b, c = star_table[star, 0], star_table[star, 1], star_table[star, 2]
     x = rotation[0, 0] * a + rotation[0, 1] * b + rotation[0, 2] * c
     y = rotation[1, 0] * a + rotation[1, 1] * b + rotation[1, 2] * c
@@ -66,8 +66,8 @@ def residual(
 
 
 @inner
-def middle_value(values: Array, count: int) -> float:
-    """Median (the lower one of an even number) of the first `count` values, reordered in place (quickselect)."""
+def lower_median(values: Array, count: int) -> float:
+    """Lower median of the first `count` values, which are reordered in place (quickselect)."""
     low, high, middle = 0, count - 1, (count - 1) // 2
     while low < high:
         pivot = values[(low + high) // 2]
@@ -100,7 +100,7 @@ def _best_star(
     zero_point: float,
     scatter: float,
 ) -> tuple[int, float]:
-    """Likeliest star for detection i and its cost, −1 where there is none; see `match_detections`."""
+    """Find the likeliest star for detection i, or −1, and its cost; see `match_detections`."""
     star_table, grid_start, grid_stars = index.stars, index.grid_start, index.grid_stars
     reach, sigma, gate, px_per_rad = windows
     error_u, error_v = reach / WINDOW_SIGMAS, reach / WINDOW_SIGMAS
@@ -144,20 +144,21 @@ def match_detections(
 ) -> int:
     """Match each detection to the likeliest star in its window; return the number of matches.
 
-    The likeliest star has the least cost ``(r/σ)² + (Δm/s)²``. Of two detections of one star the cheaper one keeps it.
+    The likeliest star has the least cost ``(r/σ)² + (Δm/s)²``. If two detections choose the same star, the
+    one with the lower cost keeps it.
 
     Parameters
     ----------
     excluded : ndarray (n,) of bool
         Detections that are not matched.
     windows : (reach, sigma, gate, px_per_rad)
-        Window of all detections in pixels, or `BY_NOISE`; noise of a detection of unit error, pixels;
-        largest deviation from the expected magnitude; least pixels per radian in the field, for a first
-        coarse test.
+        Window for all detections in pixels, or `BY_NOISE`; noise in pixels of a detection of unit error;
+        largest deviation from the expected magnitude; lowest scale in the field, pixels per radian, for a
+        quick first test.
     zero_point, scatter : float
         Catalogue minus instrumental magnitude, and its scatter s.
     stars, costs : ndarray (n,)
-        Filled: index star or −1, and its cost.
+        Filled with the index star, or −1, and its cost.
     owners : ndarray of a power of two, > 2·n
         Workspace: an open-addressing hash of star → detection.
     """

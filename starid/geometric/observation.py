@@ -36,32 +36,32 @@ Z: Final = 2
 U_X: Final = 3
 U_Y: Final = 4
 U_Z: Final = 5
-"""Derivative of the column by the direction, pixels per unit."""
+"""Derivative of the column with respect to direction, pixels per unit."""
 V_X: Final = 6
 V_Y: Final = 7
 V_Z: Final = 8
-"""Derivative of the row by the direction, pixels per unit."""
+"""Derivative of the row with respect to direction, pixels per unit."""
 MAGNITUDE: Final = 9
 """−2.5·log10(flux)."""
 SIGMA_U: Final = 10
 SIGMA_V: Final = 11
-"""One-sigma errors of column and row, pixels, or in units of an unknown common one."""
+"""One-sigma errors of column and row, in pixels or, if only relative errors are known, in arbitrary units."""
 SOURCE: Final = 12
 """Row of the detection in the caller's arrays."""
 OFFSET_U: Final = 13
 OFFSET_V: Final = 14
-"""Position from the camera's centre, pixels."""
+"""Position relative to the centre of the camera, pixels."""
 COLUMNS: Final = 15
 
 NOWHERE: Final = 1e-9
-"""Length of the direction of a detection outside the image circle."""
+"""Length of the direction vector of a detection outside the image circle."""
 
 FAINTEST: Final = 99.0
 """Instrumental magnitude of a detection without positive flux."""
 
 
 class Raw(NamedTuple):
-    """Input of the caller: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
+    """Input from the caller: camera (`starid.camera.Camera.params`), positions, flux, errors (n, 2)."""
 
     params: Array
     xy: Array
@@ -70,8 +70,8 @@ class Raw(NamedTuple):
 
 
 @inner
-def by_falling_flux(flux: Array) -> Indices:
-    """Rows by falling flux (Shell sort, gaps of Ciura); the order of equal ones is undefined."""
+def by_decreasing_flux(flux: Array) -> Indices:
+    """Rows sorted by decreasing flux (Shell sort, Ciura's gaps); the order of equal fluxes is undefined."""
     n = flux.shape[0]
     order = np.empty(n, dtype=np.int64)
     for i in range(n):
@@ -89,7 +89,10 @@ def by_falling_flux(flux: Array) -> Indices:
 
 @inner
 def fill_direction(params: Array, scale: float, column: float, row: float, table: Table, n: int) -> bool:
-    """Fill in direction and gradients of a position, the focal length divided by `scale`; False outside the image circle."""
+    """Fill in the direction and gradients of a position for a focal length divided by `scale`.
+
+    Returns False outside the image circle.
+    """
     fx, fy, model = params[FX] / scale, params[FY] / scale, params[MODEL]
     a, b = (column - params[CX]) / fx, (row - params[CY]) / fy
     j11, j12, j22 = 1.0, 0.0, 1.0
@@ -120,8 +123,8 @@ def fill_direction(params: Array, scale: float, column: float, row: float, table
 
 @inner
 def observe(raw: Raw) -> Table:
-    """Sort detections by falling flux and compute their directions; those outside the image circle are left out."""
-    order = by_falling_flux(raw.flux)
+    """Sort detections by decreasing flux, compute directions, drop those outside the image circle."""
+    order = by_decreasing_flux(raw.flux)
     params, xy, flux, sigmas = raw.params, raw.xy, raw.flux, raw.sigmas
     table = np.empty((flux.shape[0], COLUMNS))
     n = 0
@@ -137,10 +140,10 @@ def observe(raw: Raw) -> Table:
 
 
 @inner
-def observe_again(raw: Raw, observed: Table, scale: float, seen: Table) -> None:
-    """Fill `seen` with the same detections under a focal length divided by `scale`.
+def observe_scaled(raw: Raw, observed: Table, scale: float, seen: Table) -> None:
+    """Fill `seen` with the same detections for a focal length divided by `scale`.
 
-    A detection outside the image circle gets a direction of length `NOWHERE`, which is near no star.
+    A detection outside the image circle gets a direction of length `NOWHERE`, far from any star.
     """
     for i in range(observed.shape[0]):
         for column in range(COLUMNS):
@@ -151,10 +154,10 @@ def observe_again(raw: Raw, observed: Table, scale: float, seen: Table) -> None:
 
 
 @inner
-def at_rest(
+def without_aberration(
     x: float, y: float, z: float, beta_x: float, beta_y: float, beta_z: float
 ) -> tuple[float, float, float]:
-    """Direction for an observer at rest of what one with velocity β sees; the inverse of `starid.aberration.aberrated`."""
+    """Remove the aberration for velocity β from a direction; the inverse of `starid.aberration.aberrated`."""
     inverse_gamma = math.sqrt(1.0 - beta_x * beta_x - beta_y * beta_y - beta_z * beta_z)
     along = beta_x * x + beta_y * y + beta_z * z
     share = 1.0 - along / (1.0 + inverse_gamma)
@@ -171,19 +174,19 @@ def at_rest(
 def remove_aberration(
     observed: Table, beta: tuple[float, float, float], rotation: Array, seen: Table
 ) -> None:
-    """Set the directions of `seen` to those of `observed` for an observer at rest, under an ICRS→sensor matrix."""
+    """Fill `seen` with the directions of `observed`, corrected for aberration at an ICRS→sensor matrix."""
     bx = rotation[0, 0] * beta[0] + rotation[0, 1] * beta[1] + rotation[0, 2] * beta[2]
     by = rotation[1, 0] * beta[0] + rotation[1, 1] * beta[1] + rotation[1, 2] * beta[2]
     bz = rotation[2, 0] * beta[0] + rotation[2, 1] * beta[1] + rotation[2, 2] * beta[2]
     for i in range(seen.shape[0]):
         x, y, z = observed[i, X], observed[i, Y], observed[i, Z]
         if x * x + y * y + z * z > NOWHERE:
-            seen[i, X], seen[i, Y], seen[i, Z] = at_rest(x, y, z, bx, by, bz)
+            seen[i, X], seen[i, Y], seen[i, Z] = without_aberration(x, y, z, bx, by, bz)
 
 
 @inner
 def scaled(model: float, x: float, y: float, z: float, scale: float) -> tuple[float, float, float]:
-    """Unit direction seen where the focal length is divided by `scale` (without the distortion)."""
+    """Unit direction for a focal length divided by `scale` (ignoring distortion)."""
     if scale == 1.0:
         return x, y, z
     if model == PINHOLE:

@@ -1,14 +1,15 @@
 """The identification index: merged catalogue stars, sky grid, star counts and triangles of bright stars.
 
-The corners of triangles are *pattern stars*, selected by falling brightness: a star is selected while fewer than a quota
-of selected ones lie within a neighbourhood of half the field's area. Rich and poor regions of the sky thus have about as
-many, and a half-blocked field still holds some. A small quota selects the *bright* pattern stars: any three of them that
-fit the field make a triangle, for fields that show few other stars. A large quota selects the *deep* ones: triangles of
-medium size, for fields with many false stars. A narrow field has more sky to cover and uses smaller triangles.
+The corners of triangles are *pattern stars*, selected in order of brightness: a star is selected while fewer
+than a quota of selected stars lie in its neighbourhood, a cap of half the field's area. Rich and poor regions
+of the sky thus have similar numbers, and a half-blocked field still has some. A small quota selects the
+*bright* pattern stars: any three of them that fit into the field form a triangle, for fields with few other
+stars. A large quota selects the *deep* ones: they form triangles of medium size, for fields with many false
+stars. A narrow field has more sky to cover and uses smaller triangles.
 
 Sides are chords of the unit sphere (2·sin(angle/2)), sorted longest first; corner k lies opposite side k.
-Triangles are stored in rows of equal handedness, binned longest and binned middle side, each sorted by the shortest
-side, so that a query reads a few short runs.
+A row of triangles has the same handedness and the same bins of the longest and middle side, and is sorted by
+the shortest side, so that a query reads a few short runs.
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from starid.arrays import Array, Indices, Indices32, Mask
 from starid.camera import Camera
 from starid.catalog import StarCatalog, companions, merge_close_stars
 from starid.errors import StaridError
-from starid.geometric.pattern_stars import pick_pattern_stars
+from starid.geometric.pattern_stars import select_pattern_stars
 from starid.geometric.sky_grid import FACES, build_sky_grid, cell_of
 from starid.jit import compiled_ieee, inner
 
 INDEX_VERSION: Final = 5
-"""Increased whenever the same catalogue and settings would yield another index."""
+"""Incremented whenever the same catalogue and settings would yield a different index."""
 
 SIDE_STEPS: Final = 65535
-"""Number of steps of the longest chord in which sides are stored."""
+"""Number of steps into which the longest chord is divided for storing sides."""
 
 BRIGHTEST_BIN: Final = -2.0
 """Magnitude at which the bins of the star counts begin."""
@@ -40,7 +41,7 @@ BRIGHTEST_BIN: Final = -2.0
 BINS_PER_MAGNITUDE: Final = 4
 COUNT_CELLS: Final = 12
 _BLEND_DEPTH: Final = 1.5
-"""Stars down to this far below the limit are merged with any star; fainter ones only with a star within the limit."""
+"""Stars up to this many magnitudes below the limit are merged; fainter ones only with stars above it."""
 
 
 class IndexArrays(NamedTuple):
@@ -56,15 +57,15 @@ class IndexArrays(NamedTuple):
         Stars down to a magnitude bin in a cap with the area of the field around each coarse cell; the last
         row counts the whole sky.
     row_start : ndarray int32
-        Triangles of row r (`pattern_row`) are in ``[start[r], start[r + 1])``, by rising shortest side.
+        The triangles of row r (`pattern_row`) are in ``[start[r], start[r + 1])``, sorted by shortest side.
     sides : ndarray (p, 3) uint16
         Longest, middle and shortest chord in steps.
     corners : ndarray (p, 3) uint16
-        The pattern star opposite each.
+        The pattern star opposite each side.
     pattern_stars : ndarray int32
         Row of `stars` for each pattern star.
     numbers : ndarray (7,) float64
-        cells per edge of the grid, its margin (rad), bins per side, chord of one step, shortest side of all,
+        Cells per edge of the grid, its margin (rad), bins per side, chord of one step, shortest side of all,
         shortest and longest side of the deep triangles (chords).
     """
 
@@ -98,7 +99,7 @@ class IndexSettings:
     Attributes
     ----------
     limiting_magnitude : float
-        Faintest V of a star in it.
+        Faintest V of a star in the index.
     blend_rad : float
         Stars closer than this are merged.
     window_rad : float
@@ -106,14 +107,14 @@ class IndexSettings:
     field_area_sr : float
         Solid angle of the field.
     bright_sides_rad, deep_sides_rad : (float, float)
-        Shortest and longest side of a triangle of bright pattern stars, and of any; the first range holds
-        the second.
+        Shortest and longest side of a triangle of bright pattern stars, and of any other; the first range
+        contains the second.
     bright_quota, deep_quota : int
-        Pattern stars within a neighbourhood of half the field's area.
+        Number of pattern stars in a neighbourhood of half the field's area.
     cells_per_edge : int
         Cells along the edge of a face of the sky grid.
     side_bins : int
-        Bins for the longest and the middle side.
+        Number of bins for the longest and for the middle side.
     """
 
     limiting_magnitude: float
@@ -132,7 +133,7 @@ class IndexSettings:
         if not 0.0 < bright_low <= deep_low < deep_high <= bright_high < math.pi:
             raise StaridError(
                 f"index sides: bright {self.bright_sides_rad}, deep {self.deep_sides_rad} rad; "
-                "must be 0 < shortest < longest < π, the deep range within the bright one"
+                "must be 0 < shortest < longest < π, and the deep range within the bright one"
             )
         if not (
             self.deep_quota >= self.bright_quota >= 3 and self.cells_per_edge >= 1 and self.side_bins >= 1
@@ -140,8 +141,8 @@ class IndexSettings:
             raise StaridError("index: quota must be 3 or more, cells and bins 1 or more")
 
 
-def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float) -> StarCatalog:
-    """Stars to a limiting magnitude as a sensor resolves them: those closer than `blend_rad` merged, brightest first."""
+def resolved_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float) -> StarCatalog:
+    """Select the stars to a limiting magnitude, merging those closer than `blend_rad`; brightest first."""
     deep = catalog.v <= limiting_magnitude + _BLEND_DEPTH
     deep[companions(catalog, limiting_magnitude, blend_rad)] = True
     return merge_close_stars(catalog.subset(deep), blend_rad, as_fitted=True).brighter_than(
@@ -150,7 +151,7 @@ def seen_stars(catalog: StarCatalog, limiting_magnitude: float, blend_rad: float
 
 
 def _adjacency(vectors: Array, radius_rad: float) -> tuple[Indices, Indices]:
-    """All pairs within a radius, as compressed rows: (start (m + 1,), neighbours), both ways, ascending."""
+    """Neighbours of each star within a radius, ascending, in compressed rows: start (m + 1,), neighbours."""
     from scipy.spatial import cKDTree
 
     pairs = cKDTree(vectors).query_pairs(2.0 * math.sin(0.5 * radius_rad), output_type="ndarray")
@@ -187,7 +188,7 @@ def chord(vectors: Array, i: int, j: int) -> float:
 
 @inner
 def handedness(vectors: Array, i: int, j: int, k: int) -> int:
-    """1 where the triple product of rows i, j, k is positive, else 0."""
+    """1 if the triple product of rows i, j, k is positive, else 0."""
     product = (
         vectors[i, 0] * (vectors[j, 1] * vectors[k, 2] - vectors[k, 1] * vectors[j, 2])
         + vectors[i, 1] * (vectors[j, 2] * vectors[k, 0] - vectors[k, 2] * vectors[j, 0])
@@ -198,7 +199,7 @@ def handedness(vectors: Array, i: int, j: int, k: int) -> int:
 
 @inner
 def pattern_row(hand: int, longest: int, middle: int, bins: int) -> int:
-    """Row of the triangles of a handedness and two bins, middle ≤ longest; rows of one longest bin adjoin."""
+    """Row of a handedness and two bins, middle ≤ longest; rows with the same longest bin are adjacent."""
     return (hand * bins * (bins + 1) + longest * (longest + 1)) // 2 + middle
 
 
@@ -212,7 +213,7 @@ def _triangles(
     deep_sides: tuple[float, float],
     bins: int,
 ) -> tuple[NDArray[np.uint16], Indices]:
-    """All triangles i < j < k with sides within their limits: sides and corners (p, 6), and rows."""
+    """List all triangles i < j < k with sides within the limits: sides and corners (p, 6), and rows."""
     longest = bright_sides[1]
     step = longest / SIDE_STEPS
     count = 0
@@ -288,18 +289,18 @@ def magnitude_bin(magnitude: float, bins: int) -> int:
 
 
 def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
-    """Index over stars sorted by falling brightness, from `seen_stars`.
+    """Build the index of stars from `resolved_stars`, brightest first.
 
     Raises
     ------
     StaridError
-        Too few stars for a single triangle, or too many pattern stars for the 16-bit corners.
+        No triangle fits the field, or there are more pattern stars than 16 bits can number.
     """
     vectors, magnitudes = stars.vectors.copy(), stars.v.copy()
     grid_start, grid_stars = build_sky_grid(vectors, settings.cells_per_edge, settings.window_rad)
     half_field = 0.5 * settings.field_area_sr
-    bright_stars = pick_pattern_stars(vectors, half_field, settings.bright_quota)
-    pattern_stars = np.union1d(bright_stars, pick_pattern_stars(vectors, half_field, settings.deep_quota))
+    bright_stars = select_pattern_stars(vectors, half_field, settings.bright_quota)
+    pattern_stars = np.union1d(bright_stars, select_pattern_stars(vectors, half_field, settings.deep_quota))
     if pattern_stars.size > SIDE_STEPS:
         raise StaridError(
             f"index: {pattern_stars.size} pattern stars, at most {SIDE_STEPS} fit; the field is too narrow"
@@ -347,12 +348,12 @@ def build_arrays(stars: StarCatalog, settings: IndexSettings) -> IndexArrays:
 
 
 def _chords(angles: tuple[float, float]) -> tuple[float, float]:
-    """Chords of the unit sphere under two angles."""
+    """Chords that subtend two angles."""
     return 2.0 * math.sin(0.5 * angles[0]), 2.0 * math.sin(0.5 * angles[1])
 
 
 def field_solid_angle(camera: Camera) -> float:
-    """Solid angle of a camera's field, steradians, from the solid angles of a grid of its pixels."""
+    """Solid angle of a camera's field, steradians, summed over a grid of pixels."""
     steps = 24
     x = (np.arange(steps) + 0.5) * camera.width / steps - 0.5
     y = (np.arange(steps) + 0.5) * camera.height / steps - 0.5

@@ -1,4 +1,4 @@
-"""Selection of pattern stars by falling brightness, with a quota per neighbourhood."""
+"""Selection of pattern stars in order of brightness, with a quota per neighbourhood."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from starid.arrays import Array, Indices, Mask
 from starid.jit import compiled_ieee
 
 _FINEST_CELL: Final = 0.01
-"""Least edge of a cell of the lookup grid, on the unit sphere: bounds its memory."""
+"""Smallest edge of a cell of the lookup grid, on the unit sphere; bounds its memory."""
 
 
 @compiled_ieee
-def _pick(vectors: Array, chord: float, quota: int, finest_cell: float) -> Mask:
-    """Select stars in order while fewer than `quota` selected ones lie within the chord of them.
+def _select(vectors: Array, chord: float, quota: int, finest_cell: float) -> Mask:
+    """Select stars in order while fewer than `quota` selected ones lie within a chord of them.
 
-    Selected stars are kept in lists, one for each cell of a cubic grid as wide as the chord.
+    Selected stars are kept in lists, one for each cell of a cubic grid whose cells are as wide as the chord.
     """
     edge = max(chord, finest_cell)
     cells = int(2.0 / edge) + 1
@@ -47,7 +47,7 @@ def _pick(vectors: Array, chord: float, quota: int, finest_cell: float) -> Mask:
     return taken
 
 
-def pick_pattern_stars(vectors: Array, cap_area_sr: float, quota: int) -> Indices:
+def select_pattern_stars(vectors: Array, cap_area_sr: float, quota: int) -> Indices:
     """Select the rows of the pattern stars.
 
     Parameters
@@ -57,7 +57,7 @@ def pick_pattern_stars(vectors: Array, cap_area_sr: float, quota: int) -> Indice
     cap_area_sr : float
         Solid angle of the cap around a star that counts as its neighbourhood.
     quota : int
-        Most selected stars in a neighbourhood.
+        Largest number of selected stars in a neighbourhood.
     """
     radius = math.acos(max(1.0 - cap_area_sr / (2.0 * math.pi), -1.0))
-    return np.flatnonzero(_pick(vectors, 2.0 * math.sin(0.5 * radius), quota, _FINEST_CELL))
+    return np.flatnonzero(_select(vectors, 2.0 * math.sin(0.5 * radius), quota, _FINEST_CELL))

@@ -1,10 +1,10 @@
 """Refinement of a coarse attitude: match, solve, estimate the noise, repeat.
 
-Residuals are pixels: ``r = G (u − A c)``, u the direction of a detection, c that of the catalogue star, G the
-derivative of the pixel position by the direction. A turn of the sensor by a small vector v moves the star's
-predicted position by ``G (A c × v)``, which makes weighted least squares a 3 × 3 system; where the focal
-length is unknown, its logarithm is the fourth unknown. Pixel residuals weighted by each star's own error make
-the estimate the maximum-likelihood one for centroid noise, wide fields included.
+Residuals are in pixels: ``r = G (u − A c)``, where u is the direction of a detection, c the direction of the
+catalogue star, and G the derivative of the pixel position with respect to direction. A small rotation v of
+the sensor moves the predicted position by ``G (A c × v)``, so weighted least squares is a 3 × 3 system; if
+the focal length is unknown, its logarithm is the fourth unknown. With pixel residuals weighted by the error
+of each star, this is the maximum-likelihood estimate for centroid noise, also in wide fields.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import numpy as np
 from starid.arrays import Array, Indices
 from starid.geometric.matching import (
     BY_NOISE,
+    lower_median,
     match_detections,
-    middle_value,
     residual,
 )
 from starid.geometric.observation import (
@@ -35,9 +35,9 @@ from starid.geometric.observation import (
     V_Z,
     Raw,
     Table,
-    at_rest,
-    observe_again,
+    observe_scaled,
     remove_aberration,
+    without_aberration,
 )
 from starid.geometric.pattern_index import STAR_MAGNITUDE, IndexArrays
 from starid.geometric.settings import (
@@ -53,16 +53,16 @@ from starid.geometric.settings import (
 from starid.jit import inner
 
 MAX_ROUNDS: Final = 12
-"""Rounds of matching and solving."""
+"""Largest number of rounds of matching and solving."""
 
 FEW_MATCHED: Final = 30
 """Up to this number of matches, each is tested as an outlier against the others."""
 
 OUTLIER_CHANCE: Final = 3.3e-4
-"""Probability that the test rejects a good star: that of a window of 4 sigma."""
+"""Probability that the test rejects a good star: as for a window of 4 sigma."""
 
 MIN_GATE: Final = 0.5
-"""Deviation from the expected magnitude that is always accepted."""
+"""A deviation from the expected magnitude up to this is always accepted."""
 
 PRIOR_FREEDOM: Final = 10.0
 """Weight of the caller's errors against the residuals, in degrees of freedom."""
@@ -75,15 +75,15 @@ _MAD_TO_SIGMA: Final = 1.4826
 SCALE: Final = 0
 """Factor on the tangents of the directions."""
 VARIANCE: Final = 1
-"""Mean square of residual over the caller's error, per degree of freedom."""
+"""Mean square, per degree of freedom, of residual over the caller's error."""
 RMS: Final = 2
 """Root mean square distance of the matched stars, pixels."""
 ZERO_POINT: Final = 3
 """Catalogue minus instrumental magnitude."""
 SCATTER: Final = 4
-"""Its scatter, magnitudes."""
+"""Scatter of the zero point, magnitudes."""
 SCALE_VARIANCE: Final = 5
-"""Variance of the logarithm of the scale in units of the caller's errors, 0 where it is fixed."""
+"""Variance of the log of the scale, in units of the caller's errors; 0 if the scale is fixed."""
 NUMBERS: Final = 6
 
 
@@ -106,7 +106,7 @@ def rotate_sensor(rotation: Array, vx: float, vy: float, vz: float) -> None:
 
 @inner
 def solve_symmetric(matrix: Array, right: Array, size: int, solution: Array) -> bool:
-    """Solve a positive definite system of the leading `size` rows by Cholesky; False where it is singular."""
+    """Solve the leading `size` rows of a positive definite system by Cholesky; False if it is singular."""
     lower = np.zeros((4, 4))
     for i in range(size):
         for j in range(i + 1):
@@ -136,8 +136,8 @@ def solve_symmetric(matrix: Array, right: Array, size: int, solution: Array) -> 
 def _slopes(seen: Table, i: int, x: float, y: float, z: float, slopes: Array) -> None:
     """Fill (2, 4) with the derivatives of the predicted position of detection i by rotation and scale.
 
-    A rotation v of the sensor moves it by G (c × v), c = (x, y, z) being the star in the sensor frame; a larger scale,
-    that is a shorter focal length, moves it to the centre.
+    A rotation v of the sensor moves it by G (c × v), where c = (x, y, z) is the star in the sensor frame; a
+    larger scale, that is, a shorter focal length, moves it towards the centre.
     """
     ux, uy, uz = seen[i, U_X], seen[i, U_Y], seen[i, U_Z]
     vx, vy, vz = seen[i, V_X], seen[i, V_Y], seen[i, V_Z]
@@ -157,10 +157,10 @@ def _outlier(
     freedom: int,
     settings: Array,
 ) -> int:
-    """The match most inconsistent with the others, if beyond chance; else −1.
+    """Find the match most inconsistent with the others; −1 if that may be chance.
 
-    Leaving match i out lowers χ² by ``r' (1 − H)⁻¹ r``, H its own block of the hat matrix; the drop over
-    what remains follows an F distribution with 2 and ν − 2 degrees of freedom, whose tail is
+    Leaving match i out lowers χ² by ``r' (1 − H)⁻¹ r``, where H is its block of the hat matrix. The ratio of
+    this drop to the remaining χ² follows an F distribution with 2 and ν − 2 degrees of freedom, whose tail is
     ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
     """
     rest = float(freedom - 2)
@@ -212,7 +212,7 @@ def normal_equations(
 ) -> float:
     """Fill the normal matrix (4, 4) and right side (4,) over the matches; return Σ (r/σ)².
 
-    The unknowns are the turn of the sensor v (3) and, where there are 4, the change of the logarithm of the
+    The unknowns are the rotation v of the sensor (3) and, if there are 4, the change of the logarithm of the
     scale.
     """
     for a in range(4):
@@ -241,16 +241,16 @@ def normal_equations(
 
 @inner
 def photometry(star_table: Array, seen: Table, stars: Indices, scratch: Array) -> tuple[float, float]:
-    """Zero point (catalogue minus instrumental magnitude) and its scatter, robust, over the matches."""
+    """Robust zero point (catalogue minus instrumental magnitude) of the matches, and its scatter."""
     m = 0
     for i in range(stars.shape[0]):
         if stars[i] >= 0:
             scratch[m] = star_table[stars[i], STAR_MAGNITUDE] - seen[i, MAGNITUDE]
             m += 1
-    zero_point = middle_value(scratch, m)
+    zero_point = lower_median(scratch, m)
     for k in range(m):
         scratch[k] = abs(scratch[k] - zero_point)
-    scatter = _MAD_TO_SIGMA * middle_value(scratch, m)
+    scatter = _MAD_TO_SIGMA * lower_median(scratch, m)
     return zero_point, min(max(scatter, MAGNITUDE_FLOOR), MAGNITUDE_CEILING)
 
 
@@ -258,7 +258,7 @@ def photometry(star_table: Array, seen: Table, stars: Indices, scratch: Array) -
 def distances(
     star_table: Array, seen: Table, rotation: Array, stars: Indices, scratch: Array
 ) -> tuple[float, float]:
-    """Noise of a star of unit error from the median distance of the matches (Rayleigh), and their rms, px."""
+    """Noise for unit error, from the median distance of the matches (Rayleigh); their RMS distance, px."""
     m = 0
     total = 0.0
     for i in range(stars.shape[0]):
@@ -267,7 +267,7 @@ def distances(
             scratch[m] = math.sqrt((r0 / seen[i, SIGMA_U]) ** 2 + (r1 / seen[i, SIGMA_V]) ** 2)
             total += r0 * r0 + r1 * r1
             m += 1
-    return middle_value(scratch, m) / _RAYLEIGH_MEDIAN, math.sqrt(total / max(m, 1))
+    return lower_median(scratch, m) / _RAYLEIGH_MEDIAN, math.sqrt(total / max(m, 1))
 
 
 @inner
@@ -283,7 +283,7 @@ def _same(stars: Indices, previous: Indices) -> bool:
 
 @inner
 def _marginalise(normal: Array, scratch: Array) -> float:
-    """Marginalise the scale: the leading block becomes the normal matrix of the rotation alone.
+    """Marginalise over the scale: the leading block becomes the normal matrix of the rotation alone.
 
     Returns the marginal variance of the logarithm of the scale.
     """
@@ -299,7 +299,7 @@ def _marginalise(normal: Array, scratch: Array) -> float:
 
 @inner
 def directions_depend_on_solution(settings: Array) -> bool:
-    """Whether the directions of the detections change with the solution: with its scale, or by aberration."""
+    """Whether the directions of the detections change with the solution: with its scale or by aberration."""
     return bool(settings[SCALE_TOLERANCE] > 0.0) or _observer_moves(settings)
 
 
@@ -312,9 +312,9 @@ def _observer_moves(settings: Array) -> bool:
 def _observe_with(
     raw: Raw, observed: Table, settings: Array, rotation: Array, scale: float, seen: Table
 ) -> None:
-    """Fill `seen` with the detections under the refined scale and without aberration."""
+    """Fill `seen` with the detections for the refined scale, corrected for aberration."""
     if settings[SCALE_TOLERANCE] > 0.0:
-        observe_again(raw, observed, scale, seen)
+        observe_scaled(raw, observed, scale, seen)
     if _observer_moves(settings):
         beta = (settings[BETA_X], settings[BETA_Y], settings[BETA_Z])
         remove_aberration(seen if settings[SCALE_TOLERANCE] > 0.0 else observed, beta, rotation, seen)
@@ -322,9 +322,9 @@ def _observe_with(
 
 @inner
 def _rotate_by_aberration(settings: Array, rotation: Array) -> None:
-    """Rotate an attitude derived from aberrated directions by the aberration of its boresight, in place."""
+    """Rotate an attitude derived from aberrated directions by the aberration at the boresight, in place."""
     bx, by, bz = settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
-    x, y, _ = at_rest(
+    x, y, _ = without_aberration(
         0.0,
         0.0,
         1.0,
@@ -341,7 +341,7 @@ def refine(
     raw: Raw,
     observed: Table,
     settings: Array,
-    least_matched: int,
+    min_matched: int,
     seen: Table,
     rotation: Array,
     stars: Indices,
@@ -353,25 +353,25 @@ def refine(
     Parameters
     ----------
     raw, observed
-        Detections of the caller, and sorted (`observe`).
-    least_matched : int
-        Fewer matches fail.
+        The detections from the caller, and the same sorted (`observe`).
+    min_matched : int
+        The refinement fails with fewer matches.
     seen : Table
-        Where `directions_depend_on_solution`: a copy of `observed`, filled with the detections under the refined
-        focal length and attitude. Else `observed`.
+        Where `directions_depend_on_solution`, a copy of `observed`, filled with the detections for the
+        refined focal length and attitude; otherwise `observed`.
     rotation : ndarray (3, 3)
         ICRS→sensor; coarse on entry, refined on return.
     stars : ndarray (n,) int64
-        Filled: index star of each detection, −1 without.
+        Filled with the index star of each detection, or −1.
     normal : ndarray (4, 4)
-        Filled: normal matrix of the rotation in units of the caller's errors (leading 3 × 3).
+        Filled with the normal matrix of the rotation in units of the caller's errors (leading 3 × 3).
     numbers : ndarray (`NUMBERS`,)
-        `SCALE` and `ZERO_POINT` on entry, all of them on return.
+        `SCALE` and `ZERO_POINT` on entry; all values on return.
 
     Returns
     -------
     int
-        Stars matched, 0 where it failed.
+        Number of stars matched; 0 if the refinement failed.
     """
     n = observed.shape[0]
     star_table = index.stars
@@ -394,7 +394,7 @@ def refine(
             index, seen, rotation, excluded, (reach, sigma, gate, settings[PX_PER_RAD]),
             numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
         )  # fmt: skip
-        if matched < least_matched:
+        if matched < min_matched:
             return 0
         stable = _same(stars, previous) and number > 0
         chi2 = normal_equations(star_table, seen, rotation, stars, unknowns, normal, right)
@@ -417,7 +417,7 @@ def refine(
             excluded[worst] = True
         sigma = math.sqrt(numbers[VARIANCE])
         if number == 0:
-            # wrong pairs may be among the first matches: robust estimates
+            # robust estimates, because the first matches may be wrong
             sigma, _ = distances(star_table, seen, rotation, stars, scratch)
             sigma *= math.sqrt(2.0 * matched / freedom)
             numbers[ZERO_POINT], numbers[SCATTER] = photometry(star_table, seen, stars, scratch)

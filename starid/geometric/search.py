@@ -1,8 +1,8 @@
 """Lost in space: triangles of bright detections looked up in the index, each hit tested and refined.
 
-Triangles of the brightest detections come first, in the order of their faintest member, so that a few false stars among
-the brightest only delay the solution. Random triangles of a larger set of detections follow. Last, for fields with much
-clutter, each quadrant and the middle are searched separately.
+Triangles of the brightest detections are tried first, in order of their faintest member, so that a few false
+stars among the brightest only delay the solution. Random triangles from a larger set of detections follow.
+Last, for fields with much clutter, each quadrant and the middle of the field are searched separately.
 """
 
 from __future__ import annotations
@@ -53,22 +53,22 @@ from starid.jit import compiled_ieee, inner
 from starid.projection import HEIGHT, MODEL, WIDTH
 
 SYSTEMATIC: Final = 14
-"""Brightest detections of which every triangle is tried first."""
+"""Number of detections, brightest first, whose triangles are all tried first."""
 
 DRAWN_FROM: Final = 200
-"""Brightest detections from which random triangles are drawn."""
+"""Number of detections, brightest first, from which random triangles are drawn."""
 
 STRICT_TOLERANCE: Final = 0.5
-"""Tolerance of the sides of random triangles over that of the first ones: they are many, and each must be cheap."""
+"""Side tolerance of random triangles relative to the first stage: there are many, so each must be cheap."""
 
 STRICT_GATE: Final = 0.6
-"""Magnitude gate of random triangles over that of the first ones."""
+"""Magnitude gate of random triangles relative to the first stage."""
 
 PARTS: Final = 5
-"""Parts of the field: four quadrants and the middle."""
+"""Number of parts of the field: four quadrants and the middle."""
 
 MAX_FOUND: Final = 4096
-"""Most triangles of the index tried for one triangle of detections."""
+"""Largest number of index triangles tried for one triangle of detections."""
 
 _SEED: Final = 88172645463325252
 
@@ -82,8 +82,8 @@ def copy_corner(table: Array, source: int, model: float, scale: float, frame: Ta
 
 
 @inner
-def make_frame(frame: Table) -> None:
-    """Replace three unit vectors (rows) by an orthonormal frame: sum, orthogonalised second − third, cross product."""
+def make_triad(frame: Table) -> None:
+    """Replace three unit vectors (rows) by a triad: sum, orthogonalised second − third, cross product."""
     along, square_sum, square_side = 0.0, 0.0, 0.0
     for axis in range(3):
         total = frame[0, axis] + frame[1, axis] + frame[2, axis]
@@ -104,7 +104,7 @@ def make_frame(frame: Table) -> None:
 
 
 @inner
-def set_sensor_frame(
+def set_sensor_triad(
     observed: Table, detections: tuple[int, int, int], model: float, scale: float, frames: Array
 ) -> None:
     """Fill ``frames[0]`` with the frame of three detections.
@@ -112,24 +112,24 @@ def set_sensor_frame(
     Parameters
     ----------
     model, scale : float
-        Model of the camera, and the divisor of its focal length.
+        Camera model, and the divisor of its focal length.
     """
     for row in range(3):
         copy_corner(observed, detections[row], model, scale, frames[0], row)
-    make_frame(frames[0])
+    make_triad(frames[0])
 
 
 @inner
 def set_rotation(star_table: Array, stars: tuple[int, int, int], frames: Array) -> None:
-    """Fill ``frames[2]`` with the ICRS→sensor matrix that maps three stars to the detections of ``frames[0]``.
+    """Fill ``frames[2]`` with the ICRS→sensor matrix from three stars to the detections of ``frames[0]``.
 
-    The second and the third should be far apart: they determine the roll. ``frames[1]`` is workspace.
+    The second and third should be far apart, because they determine the roll. ``frames[1]`` is workspace.
     """
     sensor, sky = frames[0], frames[1]
     for row in range(3):
         for axis in range(3):
             sky[row, axis] = star_table[stars[row], axis]
-    make_frame(sky)
+    make_triad(sky)
     for i in range(3):
         for j in range(3):
             frames[2, i, j] = sensor[0, i] * sky[0, j] + sensor[1, i] * sky[1, j] + sensor[2, i] * sky[2, j]
@@ -149,9 +149,9 @@ def _try_patterns(
     count: int,
     gate: float,
 ) -> float:
-    """Try the triangles of the index found for one triangle of detections.
+    """Try the index triangles found for one triangle of detections.
 
-    Returns the bound of the first accepted one, left in `candidate`, or 0.
+    Returns the bound of the first one accepted, which is left in `candidate`, or 0.
     """
     stars, sides, corner_stars = index.stars, index.sides, index.corners
     frames, numbers = candidate.frames, candidate.numbers
@@ -177,7 +177,7 @@ def _try_patterns(
         if spread > 0.0:
             numbers[SCALE] = sides[pattern, 0] * index.numbers[SIDE_STEP] / longest_side
         if spread > 0.0 or not framed:
-            set_sensor_frame(observed, corners, raw.params[MODEL], numbers[SCALE], frames)
+            set_sensor_triad(observed, corners, raw.params[MODEL], numbers[SCALE], frames)
             framed = True
         set_rotation(stars, (a, b, c), frames)
         _, bound = test_and_refine(
@@ -190,7 +190,7 @@ def _try_patterns(
 
 @inner
 def _draw_three(state: np.uint64, choice: int) -> tuple[np.uint64, int, int, int]:
-    """Step of a xorshift generator, and three numbers below `choice` from it (16 bits each)."""
+    """Advance a xorshift generator and draw three numbers below `choice` from it (16 bits each)."""
     state ^= state << np.uint64(13)
     state ^= state >> np.uint64(7)
     state ^= state << np.uint64(17)
@@ -231,7 +231,7 @@ def _detections_in_part(raw: Raw, observed: Table, part: int) -> Indices:
 
 @inner
 def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
-    """Next of the triangles i < j < k in the order (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4)."""
+    """Next triangle i < j < k in the order (0, 1, 2), (0, 1, 3), (0, 2, 3), (1, 2, 3), (0, 1, 4)."""
     if i + 1 < j:
         return i + 1, j, k
     if j + 1 < k:
@@ -245,10 +245,10 @@ def identify_kernel(
 ) -> Answer:
     """Find the attitude of a set of detections without prior knowledge.
 
-    Stage 0 tries the triangles of the brightest detections, stage 1 random triangles of more of them, and
-    each further stage those of the brightest of one part of the field. The detections of a part also give its
-    sequential test, so that clutter elsewhere does not count; what it finds is refined and test_and_refine on the
-    whole field all the same.
+    Stage 0 tries the triangles of the brightest detections, stage 1 random triangles of more detections, and
+    each further stage the triangles of the brightest detections in one part of the field. In that stage the
+    sequential test uses only detections in the part, so that clutter elsewhere does not count; a candidate is
+    still refined and verified on the whole field.
     """
     raw = Raw(params, xy, flux, sigmas)
     observed = observe(raw)

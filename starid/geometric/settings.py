@@ -1,4 +1,4 @@
-"""Positions of the settings in the array that the identification kernels receive."""
+"""Indices into the array of settings for the identification kernels."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Final
 SEARCH_TOLERANCE: Final = 0
 """Largest error of a triangle's side, radians."""
 MAGNITUDE_GATE: Final = 1
-"""Largest deviation of a star's catalogue magnitude from the one of its flux."""
+"""Largest difference between a star's catalogue magnitude and the magnitude from its flux."""
 MAX_TRIANGLES: Final = 2
-"""Most triangles of detections looked up."""
+"""Largest number of triangles of detections looked up."""
 SCALE_TOLERANCE: Final = 3
-"""Relative error of the focal length, 0 where it is known."""
+"""Relative error of the focal length; 0 if it is known."""
 WINDOW: Final = 4
 """First matching window, pixels."""
 TEST_WINDOW: Final = 5
@@ -23,17 +23,17 @@ LOG_CHANCE: Final = 7
 LOG_CHANCE_TRACKING: Final = 8
 """The same near a predicted attitude."""
 PX_PER_RAD: Final = 9
-"""Least pixels per radian in the field."""
+"""Lowest scale in the field, pixels per radian."""
 SIGMAS_KNOWN: Final = 10
-"""Not 0 where the caller provides the errors of the positions."""
+"""Non-zero if the caller provides position errors."""
 FIELD_PX: Final = 11
-"""Pixels in the field."""
+"""Number of pixels in the field."""
 PART_STARS: Final = 12
-"""Brightest detections of each part of the field that form triangles, 0 for none."""
+"""Number of detections, brightest first, that form triangles in each part of the field; 0 for none."""
 BETA_X: Final = 13
 BETA_Y: Final = 14
 BETA_Z: Final = 15
-"""Velocity of the observer over that of light, ICRS; zeros where aberration is not corrected."""
+"""Velocity of the observer over the speed of light, ICRS; zeros if aberration is not corrected."""
 SETTING_COUNT: Final = 16
 
 NOTHING: Final = 0

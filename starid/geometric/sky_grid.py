@@ -1,9 +1,9 @@
 """A cube-map grid of the sky: the catalogue stars near a direction, in one lookup.
 
-The sphere is cut into the six faces of a cube with n × n cells each. A cell lists every star inside it *or
-nearer to it than a margin*, so that all stars within the margin of a direction are in the single cell of
-that direction. Stars are numbered by falling brightness, and the lists
-are sorted, so that a search can stop at a magnitude.
+The sphere is divided into the six faces of a cube with n × n cells each. A cell lists every star inside it
+*or nearer to it than a margin*, so that all stars within the margin of a direction are in the single cell of
+that direction. Stars are numbered by decreasing brightness and the lists are sorted, so that a search can
+stop at a magnitude.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from starid.jit import compiled_ieee, inner
 
 FACES: Final = 6
 _SLOPE_MARGIN: Final = 1.25
-"""Safety factor on the linear bound of a cube coordinate's change with angle; holds for margins to 0.2 rad."""
+"""Safety factor on the linear bound of a cube coordinate's change with angle, for margins up to 0.2 rad."""
 
 
 @inner
@@ -39,9 +39,9 @@ def cell_of(x: float, y: float, z: float, n: int) -> int:
 
 @inner
 def _reach(vector: Array, face: int, n: int, margin: float) -> tuple[int, int, int, int]:
-    """First and last row and column of the cells of a face that lie within the margin of a star.
+    """First and last row and column of the cells of a face that are within the margin of a star.
 
-    The last are −1 where there are none. The bound is generous: |∇u| on the face is at most 1 + u² + v².
+    Without such cells the last ones are −1. The bound is generous: |∇u| on the face is at most 1 + u² + v².
     """
     axis = face // 2
     depth = vector[axis] if face % 2 == 0 else -vector[axis]
@@ -62,7 +62,7 @@ def _reach(vector: Array, face: int, n: int, margin: float) -> tuple[int, int, i
 
 @compiled_ieee
 def _fill(vectors: Array, n: int, margin: float) -> tuple[Indices32, Indices32]:
-    """Count, then list; see `build_sky_grid`."""
+    """Count the stars of each cell, then list them; see `build_sky_grid`."""
     start = np.zeros(FACES * n * n + 1, dtype=np.int32)
     for star in range(vectors.shape[0]):
         for face in range(FACES):
@@ -86,7 +86,7 @@ def _fill(vectors: Array, n: int, margin: float) -> tuple[Indices32, Indices32]:
 
 
 def build_sky_grid(vectors: Array, cells_per_edge: int, margin_rad: float) -> tuple[Indices32, Indices32]:
-    """Grid over stars sorted by falling brightness.
+    """Build the grid for stars sorted by decreasing brightness.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def build_sky_grid(vectors: Array, cells_per_edge: int, margin_rad: float) -> tu
     cells_per_edge : int
         Cells along the edge of a face, n.
     margin_rad : float
-        Every star within this angle of a direction is in the direction's cell.
+        The cell of a direction lists every star within this angle of it.
 
     Returns
     -------

@@ -1,13 +1,13 @@
 """Tracking: the attitude near a predicted one.
 
-Bright detections are paired with the catalogue stars within a window around their predicted directions.
-Two such pairs of equal separation determine an attitude, which goes through the same sequential test,
-refinement and verification as one found lost in space. A prediction that is off by any turn within the
-window, roll included, is followed; anything else is excluded.
+Bright detections are paired with the catalogue stars within a window around their predicted directions. Two
+such pairs of equal separation determine an attitude, which goes through the same sequential test, refinement
+and verification as in the lost-in-space search. An attitude that differs from the prediction by any rotation
+within the window, roll included, is found; others are excluded.
 
-Three matched stars can be enough, and two where the errors of the positions are known: the bound on the probability of
-a false answer says whether they are. An answer of fewer than `MIN_MATCHED` is compared with all others near the prediction,
-and its bound is that of the best one with which it has not even two matches in common.
+Three matched stars can be enough, or two if position errors are known: the bound on the probability of a
+false answer decides. An answer with fewer than `MIN_MATCHED` matches is compared with all others near the
+prediction. Its bound is then relative to the best one that has fewer than two matches in common with it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from starid.geometric.answer import (
     test_and_refine,
 )
 from starid.geometric.matching import to_sky
-from starid.geometric.observation import MAGNITUDE, Raw, Table, at_rest, observe
+from starid.geometric.observation import MAGNITUDE, Raw, Table, observe, without_aberration
 from starid.geometric.pattern_index import (
     DEEP_SHORTEST,
     GRID_CELLS,
@@ -36,7 +36,7 @@ from starid.geometric.pattern_index import (
     chord,
 )
 from starid.geometric.refinement import SCALE, ZERO_POINT
-from starid.geometric.search import set_rotation, set_sensor_frame
+from starid.geometric.search import set_rotation, set_sensor_triad
 from starid.geometric.settings import (
     ACCEPTED,
     BETA_X,
@@ -55,16 +55,16 @@ from starid.jit import compiled_ieee, inner
 from starid.projection import MODEL
 
 PAIRED: Final = 16
-"""Brightest detections that form pairs."""
+"""Number of detections, brightest first, that form pairs."""
 
 CANDIDATES: Final = 6
-"""Catalogue stars considered for each of them, the brightest in its window."""
+"""Number of catalogue stars considered for each of them, the brightest in its window."""
 
 MIN_TRACKED: Final = 3
-"""Least number of matches near a prediction: two leave one residual, from which no noise can be estimated."""
+"""Least number of matches near a prediction: one residual is left with two, too few to estimate the noise."""
 
 MIN_TRACKED_KNOWN: Final = 2
-"""The same where the errors of the positions are known."""
+"""The same if position errors are known."""
 
 
 @inner
@@ -94,8 +94,8 @@ def _stars_near(
 
 
 @inner
-def _weigh(candidate: Candidate, bound: float, best: Candidate, bounds: Array) -> None:
-    """Keep a candidate in `best` if its bound is the least; ``bounds`` are that of `best` and of its best rival."""
+def _keep_better(candidate: Candidate, bound: float, best: Candidate, bounds: Array) -> None:
+    """Keep a candidate in `best` if its bound is lower; ``bounds`` belong to `best` and to its best rival."""
     shared = 0
     for i in range(candidate.stars.shape[0]):
         shared += 1 if candidate.stars[i] >= 0 and candidate.stars[i] == best.stars[i] else 0
@@ -122,10 +122,10 @@ def _try_pair(
     tests: tuple[Array, Indices],
     detections: tuple[int, int],
     stars: tuple[int, int],
-    least_matched: int,
+    min_matched: int,
     prior: tuple[float, float],
 ) -> tuple[int, float]:
-    """Matches and bound of the attitude of two pairs, left in `candidate`; 0 where it is rejected."""
+    """Try the attitude of two pairs, left in `candidate`; return its matches (0 if rejected) and bound."""
     i, j = detections
     a, b = stars
     da = index.stars[a, STAR_MAGNITUDE] - observed[i, MAGNITUDE]
@@ -133,9 +133,9 @@ def _try_pair(
     if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
         return 0, 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
-    set_sensor_frame(observed, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
+    set_sensor_triad(observed, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
     set_rotation(index.stars, (a, a, b), candidate.frames)
-    return test_and_refine(index, raw, observed, settings, candidate, tests, (i, j, j), least_matched, prior)
+    return test_and_refine(index, raw, observed, settings, candidate, tests, (i, j, j), min_matched, prior)
 
 
 @inner
@@ -149,15 +149,16 @@ def _try_detections(
     detections: tuple[int, int],
     near: Indices,
     counts: Indices,
-    least_matched: int,
+    min_matched: int,
     prior: tuple[float, float],
     best: Candidate,
     bounds: Array,
     work: Indices,
 ) -> float:
-    """Try all pairs of stars near two detections; return the bound of the first that needs no comparison, or 0.
+    """Try all pairs of stars near two detections; return the bound of the first accepted outright, or 0.
 
-    The others are left to `best` and ``bounds`` (`_weigh`). `work` counts pairs, and those of equal separation.
+    Other candidates are compared through `best` and ``bounds`` (`_keep_better`). `work` counts the pairs, and those
+    of equal separation.
     """
     i, j = detections
     separation = chord(observed, i, j)
@@ -171,12 +172,12 @@ def _try_detections(
                 continue
             work[1] += 1
             matched, bound = _try_pair(
-                index, raw, observed, settings, candidate, tests, detections, (a, b), least_matched, prior
+                index, raw, observed, settings, candidate, tests, detections, (a, b), min_matched, prior
             )
             if matched >= MIN_MATCHED and bound < settings[LOG_CHANCE_TRACKING]:
                 return bound
             if matched > 0 and bound < 0.0:
-                _weigh(candidate, bound, best, bounds)
+                _keep_better(candidate, bound, best, bounds)
     return 0.0
 
 
@@ -190,7 +191,7 @@ def track_kernel(
     settings: Array,
     predicted: Array,
     window_rad: float,
-    least_matched: int,
+    min_matched: int,
     prior: tuple[float, float],
 ) -> Answer:
     """Find the attitude near a predicted one.
@@ -200,11 +201,11 @@ def track_kernel(
     predicted : ndarray (3, 3)
         ICRS→sensor.
     window_rad : float
-        Largest angle of a star from its predicted direction.
-    least_matched : int
-        Least number of matches of an answer.
+        Largest angle between a star and its predicted direction.
+    min_matched : int
+        Least number of matches for an answer.
     prior : (float, float)
-        As in `starid.geometric.verification.log_false_probability`.
+        See `starid.geometric.verification.log_false_probability`.
     """
     raw = Raw(params, xy, flux, sigmas)
     observed = observe(raw)
@@ -214,16 +215,16 @@ def track_kernel(
     tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
     near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
     counts = np.zeros(PAIRED, dtype=np.int64)
-    status, bound, work = TOO_FEW if n < least_matched else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
+    status, bound, work = TOO_FEW if n < min_matched else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
     for j in range(min(n, PAIRED) if status == NOTHING else 0):
-        x, y, z = at_rest(
+        x, y, z = without_aberration(
             *to_sky(predicted, observed, j), settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
         )
         counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
         for i in range(j):
             bound = _try_detections(
                 index, raw, observed, settings, candidate, tests, (i, j), near, counts,
-                least_matched, prior, best, bounds, work,
+                min_matched, prior, best, bounds, work,
             )  # fmt: skip
             if bound < 0.0:
                 status = ACCEPTED

@@ -1,26 +1,28 @@
 """Verification: a fast sequential test, then a bound on the probability that an agreement is chance.
 
-Two stages. `worth_refining` tests a candidate attitude star by star by Wald's sequential probability ratio:
-wrong candidates fail after a handful of lookups. `log_false_probability` computes the bound.
+There are two stages. `worth_refining` tests a candidate attitude star by star with Wald's sequential
+probability ratio test: wrong candidates fail after a handful of lookups. `log_false_probability` computes the
+bound.
 
-It compares two explanations of the detections. *Chance*: each of n detections lies anywhere in the field of
-area A. *Sky*: an attitude drawn uniformly from all rotations; then each detection is, with probability a, a
-catalogue star of about its brightness, displaced by the centroid noise, else anywhere. A detection matched to a
-star at distance r with magnitude deviation Δm thus favours the sky by
+The bound compares two explanations of the detections. *Chance*: each of n detections lies anywhere in the
+field of area A. *Sky*: an attitude is drawn uniformly from all rotations; then each detection is, with
+probability a, a catalogue star of about its brightness, displaced by the centroid noise, and otherwise lies
+anywhere. A detection matched to a star at distance r with magnitude deviation Δm thus favours the sky by
 
     (1 − a) + a · A · w · N₂(r; σ) ,  w = N(Δm; s)/λ(m)  (at most 1),
 
-λ(m) being the number of catalogue stars per magnitude in the field: the probability that it is this star among those
-of its brightness. Unmatched ones give 1 − a. The product is integrated over the attitude (Laplace's method:
-the posterior's volume over the prior's), over the photometric zero point, over the noise where it was
-estimated, and averaged over a few shares a. The result is a Bayes factor B whose expectation under chance
-is 1, so that by Markov's inequality chance reaches B or more with a probability of at most 1/B, however long
-the search was: 1/B is the bound reported in a solution.
+where λ(m) is the number of catalogue stars per magnitude in the field, so that w is the probability that it
+is this star among those of its brightness. An unmatched detection contributes 1 − a. The product is
+integrated over the attitude (Laplace's method: the volume of the posterior over that of the prior), over the
+photometric zero point, and over the noise if that was estimated, and averaged over a few shares a. The result
+is a Bayes factor B whose expectation under chance is 1. By Markov's inequality, chance reaches B or more with
+a probability of at most 1/B, however long the search was: 1/B is the bound reported in a solution.
 
-Near a prediction a second rival is as serious as chance: *one star*, which is where it was expected, and chance for
-all others. Its own factor is at most A·w·z/Ω, Ω being the solid angle (px²) in which the prediction lets that star
-lie, and z the share of the zero points that fit it. Where this exceeds 1, B is divided by it. Two true stars are no
-rival: they determine the attitude. Lost in space, Ω is the whole sphere and the rival never counts.
+Near a prediction a second rival is as serious as chance: *one star* is where it was expected, and all others
+are chance. Its factor is at most A·w·z/Ω, where Ω is the solid angle (px²) in which the prediction lets that
+star lie, and z the share of the zero points that fit it. If this exceeds 1, B is divided by it. Two true
+stars are no rival: they determine the attitude. When lost in space, Ω is the whole sphere and the rival never
+counts.
 """
 
 from __future__ import annotations
@@ -51,30 +53,29 @@ TRUE_SHARE: Final = 0.5
 """Share of the detections that are catalogue stars, for the sequential test."""
 
 REJECT_BELOW: Final = -2.6
-"""Logarithmic odds at which a candidate is dropped: four misses in a row."""
+"""Log odds at which a candidate is dropped: four misses in succession."""
 
 ACCEPT_ABOVE: Final = 9.0
-"""Logarithmic odds at which the sequential test accepts a candidate."""
+"""Log odds at which the sequential test accepts a candidate."""
 
 MAX_TESTED: Final = 40
-"""Detections tested at most."""
+"""Largest number of detections tested."""
 
 WHOLE_SKY: Final = (8.0 * math.pi**2, 4.0 * math.pi)
-"""Prior of an attitude that nothing is known of: volume of all rotations, measured in rotation vectors (rad³), and solid
-angle in which one star may lie (sr)."""
+"""Prior for an unknown attitude: volume of all rotations (rad³), solid angle for one star (sr)."""
 
 ZERO_POINT_RANGE: Final = 10.0
-"""Magnitudes over which the photometric zero point may lie."""
+"""Range of the photometric zero point, magnitudes."""
 
 MIN_NOISE: Final = 0.05
 MAX_NOISE: Final = 5.0
-"""Range of the centroid noise where it is estimated, pixels."""
+"""Range of the centroid noise if it is estimated, pixels."""
 
 SHARES: Final = (0.2, 0.5, 0.9)
-"""Shares of true stars among the detections that the Bayes factor is averaged over."""
+"""Shares of true stars among the detections, over which the Bayes factor is averaged."""
 
 _SMALL: Final = 1e-150
-"""Products below this or above its inverse are replaced by their logarithm."""
+"""A product below this or above its inverse is replaced by its logarithm."""
 
 SCATTER_FLOOR: Final = 0.15
 """Least scatter of magnitudes assumed in the bound."""
@@ -82,7 +83,7 @@ SCATTER_FLOOR: Final = 0.15
 
 @inner
 def hit_odds(index: IndexArrays, window_rad: float) -> Array:
-    """Logarithm of the odds gained by a hit, for each magnitude limit of the lookup (bins)."""
+    """Log of the odds gained by a hit, for each magnitude limit of the lookup (bins)."""
     sky, bins = index.counts.shape[0] - 1, index.counts.shape[1]
     odds = np.empty(bins)
     for b in range(bins):
@@ -93,10 +94,10 @@ def hit_odds(index: IndexArrays, window_rad: float) -> Array:
 
 @inner
 def test_order(count: int) -> Indices:
-    """Order in which detections are tested: bright and faint half alternate.
+    """Order in which detections are tested: alternately from the bright and the faint half.
 
-    The brightest carry the most information, but false stars are frequent among them. Each pattern starts at a
-    different position of the order, so that a few false stars cannot block every candidate.
+    The brightest carry the most information, but are often false. Each pattern starts at a different position
+    of the order, so that a few false stars cannot block every candidate.
     """
     order = np.empty(count, dtype=np.int64)
     half = (count + 1) // 2
@@ -120,14 +121,14 @@ def worth_refining(
     order: Indices,
     used: tuple[int, int, int],
 ) -> bool:
-    """Sequential test of a candidate attitude on detections outside its pattern.
+    """Test a candidate attitude sequentially on detections outside its pattern.
 
     Parameters
     ----------
     params : ndarray
         The camera.
     scale : float
-        Divisor of its focal length (1 where it is known).
+        Divisor of its focal length (1 if it is known).
     faintest_offset : float
         Largest catalogue minus instrumental magnitude of a true star.
     odds : ndarray
@@ -198,7 +199,7 @@ def _log_detections(
     deviation_of_one: float,
     field_px: float,
 ) -> tuple[float, float]:
-    """Logarithm of the product over the detections, averaged over `SHARES`, and the largest A·w·z; see the module.
+    """Log of the product over the detections, averaged over `SHARES`, and the largest A·w·z; see the module.
 
     `deviation_of_one` is the centroid noise in units of the stated errors.
     """
@@ -240,11 +241,11 @@ def _log_detections(
 
 @inner
 def _noise(numbers: Array, freedom: int, known: bool) -> tuple[float, float]:
-    """Variance of unit weight that the bound is computed with, and the logarithm of the factor for averaging over it.
+    """Variance of unit weight for the bound, and the log of the factor for averaging over it.
 
-    Where the caller stated the errors, the prior of the variance is the scaled inverse χ² of `PRIOR_FREEDOM` degrees of
-    freedom about 1; else the noise is uniform in its logarithm from `MIN_NOISE` to `MAX_NOISE`. Both averages by Laplace's
-    method, or by the integral's bound where the estimate lies below the range.
+    If the caller gave errors, the prior of the variance is the scaled inverse χ² with `PRIOR_FREEDOM` degrees
+    of freedom about 1; otherwise the logarithm of the noise is uniform from `MIN_NOISE` to `MAX_NOISE`. The
+    average is by Laplace's method, or by a bound on the integral if the estimate lies below the range.
     """
     variance = numbers[VARIANCE]
     if known:
@@ -269,17 +270,17 @@ def log_false_probability(
     settings: Array,
     prior: tuple[float, float],
 ) -> float:
-    """Logarithm of the bound on the probability that an agreement is chance; see the module.
+    """Log of the bound on the probability that an agreement is chance; see the module.
 
     Parameters
     ----------
     seen : Table
-        Detections under the refined attitude (rescaled where the focal length was free).
+        Detections for the refined attitude (rescaled if the focal length was free).
     rotation, stars, matched, normal, numbers
         From `starid.geometric.refinement.refine`.
     prior : (float, float)
-        Prior volume of rotations, rad³, and solid angle in which one star may lie, sr: `WHOLE_SKY` when lost in
-        space.
+        Prior volume of rotations, rad³, and solid angle in which one star may lie, sr: `WHOLE_SKY` when lost
+        in space.
     """
     spread = settings[SCALE_TOLERANCE]
     freedom = 2 * matched - (4 if spread > 0.0 else 3)

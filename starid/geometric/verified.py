@@ -1,4 +1,4 @@
-"""What identifiers share that have the geometric one verify their answers and track for them."""
+"""Base of the identifiers whose answers the geometric identifier verifies, and that track with it."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ from abc import abstractmethod
 
 from starid.attitude import Attitude
 from starid.geometric.identifier import Identifier
-from starid.single_camera import Measured, SingleCameraIdentifier
+from starid.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.solution import Solution
 
 
 class VerifiedIdentifier(SingleCameraIdentifier):
-    """An algorithm that is for lost in space only: its answers are verified, and tracking is the verifier's."""
+    """A lost-in-space algorithm with verified answers; the verifier does the tracking."""
 
     @property
     @abstractmethod
     def verifier(self) -> Identifier:
-        """What verifies and tracks."""
+        """The geometric identifier that verifies answers and tracks."""
 
-    def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
+    def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
         return self.verifier.track(
             measured.xy,
             measured.flux,
@@ -28,7 +28,7 @@ class VerifiedIdentifier(SingleCameraIdentifier):
             observer_velocity=measured.observer_velocity,
         )
 
-    def verify(self, measured: Measured, candidate: Attitude, window_px: float) -> Solution:
+    def verify(self, measured: CheckedDetections, candidate: Attitude, window_px: float) -> Solution:
         """Verify an attitude that was found lost in space (`Identifier.verify`)."""
         return self.verifier.verify(
             measured.xy,

@@ -1,1 +1,1 @@
-"""From an image to stars: background, matched filter, centroids, trails, and image files."""
+"""Star detection: background, matched filter, centroids, trails; reading and writing of image files."""

@@ -1,4 +1,4 @@
-"""Background and noise of a frame: robust in blocks, interpolated between their centres."""
+"""Background and noise of an image: robust estimates in blocks, interpolated between their centres."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starid.arrays import Array32, GreyImage
 from starid.jit import compiled_ieee, compiled_sums
 
 BLOCK_PX: Final = 32
-"""Side of a block, pixels: stars cover a percent of it, and glare is nearly plane within it."""
+"""Side of a block, pixels: stars cover about 1 % of it, and stray light is nearly plane within it."""
 
 MIN_NOISE_DN: Final = 12.0**-0.5
 """Standard deviation of rounding to whole counts."""
@@ -27,7 +27,7 @@ _MIN_SAMPLES: Final = 8.0
 
 
 def median(values: npt.NDArray[np.floating]) -> float:
-    """Median of a few hundred numbers in a fifth of the time of ``numpy.median``."""
+    """Median of a few hundred numbers, five times as fast as ``numpy.median``."""
     ordered = np.sort(values, axis=None)
     return float(0.5 * (float(ordered[(ordered.size - 1) // 2]) + float(ordered[ordered.size // 2])))
 
@@ -39,8 +39,8 @@ class Background:
     Attributes
     ----------
     level, noise : ndarray (rows, columns), float32
-        Counts; value in the middle of a block and standard deviation about the plane through its pixels, both
-        without its stars.
+        Value at the centre of a block, and standard deviation about the plane through its pixels, both without
+        stars; counts.
     block_px : float
         Side of a block; the centre of block (i, j) lies at ((j + ½)·block − ½, (i + ½)·block − ½).
     """
@@ -62,10 +62,10 @@ class Background:
 
 @compiled_sums
 def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float], plane: Array32) -> None:
-    """Plane through the samples of a block without its stars: (level, slopes by dx and dy, noise).
+    """Fit a plane to the samples of a block without its stars: (level, slopes along dx and dy, noise).
 
-    Samples farther than 3.5 sigmas from the plane are left out, half a count more being allowed, so that rounding to
-    counts does not make the interval lopsided. The offsets `dx`, `dy` are measured from their mean.
+    Samples farther than 3.5 sigmas from the plane are left out, with half a count of allowance, so that rounding to
+    counts does not make the interval asymmetric. The offsets `dx`, `dy` are relative to their mean.
     """
     level, sigma = np.float32(start[0]), np.float32(start[1])
     along = across = np.float32(0.0)
@@ -100,7 +100,7 @@ def _refine(values: Array32, dx: Array32, dy: Array32, start: tuple[float, float
 
 @compiled_ieee
 def _sample_offsets(columns: int, count: int, dx: Array32, dy: Array32) -> None:
-    """Offsets of the samples of a block from their mean, pixels: every fourth row, all its columns."""
+    """Offsets of the samples of a block from their mean, pixels: all columns of every fourth row."""
     middle_x, middle_y = 0.5 * (columns - 1), 0.5 * (count // columns - 1)
     for k in range(count):
         dx[k] = np.float32(k % columns - middle_x)
@@ -109,7 +109,7 @@ def _sample_offsets(columns: int, count: int, dx: Array32, dy: Array32) -> None:
 
 @compiled_ieee
 def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array32) -> None:
-    """Median and quartiles of a few pixels of every block first, then a plane through every fourth row of it."""
+    """Fit a plane to every fourth row of each block, starting from the median and quartiles of a few pixels."""
     height, width = image.shape
     first = np.empty(_FIRST_SAMPLES, np.int32)
     values = np.empty(block * block, np.float32)
@@ -144,7 +144,7 @@ def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array
                 _sample_offsets(columns, count, dx, dy)
             start = (float(first[chosen // 2]), max(spread, 0.5))
             _refine(values[:count], dx[:count], dy[:count], start, plane)
-            # from the middle of the sampled pixels to the middle of the block on the grid
+            # from the centre of the sampled pixels to the centre of the block on the grid
             first_row = top + column % _ROW_STEP
             last_row = first_row + _ROW_STEP * (count // columns - 1)
             off_y = (row + 0.5) * block - 0.5 - 0.5 * (first_row + last_row)
@@ -154,10 +154,10 @@ def _block_statistics(image: GreyImage, block: int, level: Array32, noise: Array
 
 
 def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Background:
-    """Background and noise of an image (h, w) on a grid of blocks.
+    """Estimate the background and noise of an image (h, w) on a grid of blocks.
 
-    A block that lies over the image's edge is moved inside, so that every block is whole; images smaller than a
-    block are one block.
+    A block that would extend beyond the image is moved inside, so that every block is whole; an image smaller than a
+    block is one block.
     """
     height, width = image.shape
     rows, columns = -(-height // block_px), -(-width // block_px)
@@ -169,9 +169,9 @@ def estimate_background(image: GreyImage, block_px: int = BLOCK_PX) -> Backgroun
 
 @compiled_ieee
 def block_position(position: float, block: float, count: int) -> tuple[int, int, float]:
-    """The two of `count` block centres on either side of a pixel, and its fraction of the way to the second.
+    """The two block centres on either side of a pixel, and its fraction of the way to the second.
 
-    Beyond the outermost centres the fraction is below 0 or above 1, so that slopes continue to the image's edge.
+    Beyond the outermost centres the fraction is below 0 or above 1, so that slopes continue to the edge of the image.
     """
     u = (position + 0.5) / block - 0.5
     i = min(max(int(u), 0), max(count - 2, 0))
@@ -180,7 +180,7 @@ def block_position(position: float, block: float, count: int) -> tuple[int, int,
 
 @compiled_ieee
 def interpolate_at(grid: Array32, block: float, x: float, y: float) -> float:
-    """Value of a grid of blocks at a pixel position, linear between block centres and extrapolated to the edges."""
+    """Value of a grid of blocks at a pixel, interpolated linearly between centres and extrapolated to the edges."""
     i, i2, q = block_position(y, block, grid.shape[0])
     j, j2, p = block_position(x, block, grid.shape[1])
     upper = grid[i, j] * (1.0 - p) + grid[i, j2] * p

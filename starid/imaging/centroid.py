@@ -1,9 +1,10 @@
 """Sub-pixel position and flux of a star: the maximum-likelihood fit of its spot to the pixels around it.
 
 The model of a pixel is flux × (share of the spot in the pixel) + background. Position and flux are found by
-Gauss–Newton steps on the weighted squares, each pixel weighted by the inverse of its variance under the model:
-background noise, shot noise of the star's own light, and a share of its light for errors of the model (pixel response, shape of the spot). The inverse of the normal matrix is then the covariance of the estimate, that
-is the Cramér–Rao bound for the noise given. Saturated pixels carry no weight.
+Gauss–Newton steps on the weighted squares. Each pixel is weighted by the inverse of its variance under the model:
+background noise, shot noise of the star, and a share of its light for errors of the model (pixel response, shape of the
+spot). The inverse of the normal matrix is then the covariance of the estimate, which is the Cramér–Rao bound for the
+given noise. Saturated pixels have no weight.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
 """Columns of a table of fits; STATE is one of the numbers below."""
 
 UNUSABLE: Final = 1e9
-"""Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
+"""Counts from this value up have no weight: saturated and masked pixels are set to infinity."""
 
 GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
 
@@ -40,7 +41,7 @@ SHORT_TRAIL_PX: Final = 0.5
 
 @compiled_ieee
 def spot_profile(centre: float, sigma: float, first: int, share: Array, slope: Array, count: int) -> None:
-    """Shares of a Gaussian at `centre` in `count` pixels from `first` on, and their derivatives by the centre."""
+    """Shares of a Gaussian in `count` pixels from `first` on, and their derivatives with respect to `centre`."""
     scale = 1.0 / sigma
     z = (first - 0.5 - centre) * scale
     cdf, bell = normal(z)
@@ -64,11 +65,11 @@ def spot_model(
     x, y, sigma : float
         Centre and standard deviation, pixels.
     window : (int, int, int, int)
-        Image column and row of the first pixel; columns and rows.
+        Image column and row of the first pixel; number of columns and rows.
     model : ndarray (3, rows·columns)
-        Filled with the share of the light in each pixel, row by row, and its derivatives by x and by y.
+        Filled with the share of the light in each pixel, row by row, and its derivatives in x and y.
     work : ndarray (4, side)
-        Scratch; side at least that of the window.
+        Scratch; at least as wide as the window.
     """
     left, top, columns, rows = window
     share_x, slope_x, share_y, slope_y = work[0], work[1], work[2], work[3]
@@ -92,10 +93,10 @@ def trail_model(
     window: tuple[int, int, int, int],
     model: Array,
 ) -> None:
-    """As `spot_model`, for a spot that moves evenly by `trail` pixels during the exposure, x and y its middle.
+    """As `spot_model`, for a spot that moves uniformly by `trail` pixels during the exposure, centred on x, y.
 
-    Along the trail the light is a Gaussian smeared over its length, across it a Gaussian; the pixel's own size
-    counts as 1/12 square pixel more of the spot's variance.
+    Along the trail the light is a Gaussian smeared over its length, across it a Gaussian. The size of a pixel adds 1/12
+    square pixel to the variance of the spot.
     """
     left, top, columns, rows = window
     length = math.hypot(trail[0], trail[1])
@@ -148,7 +149,7 @@ def star_model(
 def _normal_equations(
     pixels: Array32, model: Array, flux: float, noise: tuple[float, float, float], sums: Array
 ) -> None:
-    """Sums over a window that a Gauss–Newton step needs; see the order in `fit_star`."""
+    """Sums over a window for a Gauss–Newton step, in the order used in `fit_star`."""
     variance, per_dn, model_error = noise
     error2 = model_error * model_error
     a_xx = a_xy = a_yy = a_xf = a_yf = a_ff = 0.0
@@ -197,22 +198,22 @@ def fit_star(
     Parameters
     ----------
     pixels : ndarray (rows·columns,), float32
-        Counts above the background, row by row; those from `UNUSABLE` up are not used.
+        Counts above the background, row by row; counts from `UNUSABLE` up are not used.
     window : (int, int, int, int)
-        Image column and row of the first pixel; columns and rows.
+        Image column and row of the first pixel; number of columns and rows.
     start : (float, float)
         First guess of the position, image pixels.
     shape : (float, float, float)
         Standard deviation of the spot, and the trail along x and y, pixels.
     noise : (float, float, float)
-        Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
-        unknown); relative error of the model in a pixel.
+        Variance of a pixel without star light (counts²); variance per count of star light (1/gain, 0 if unknown);
+        relative error of the model in a pixel.
     model : ndarray (3, rows·columns)
         On return, the model near the result.
     work : ndarray (5, side)
-        Scratch; side at least that of the window, and 11.
+        Scratch; at least as wide as the window, and at least 11.
     result : ndarray (FIT_COLUMNS,)
-        Filled; CHI2 is the sum of weighted squares over PIXELS pixels.
+        Filled; CHI2 is the weighted sum of squares over PIXELS pixels.
     """
     x, y = start
     result[STATE] = NO_FIT
@@ -240,7 +241,7 @@ def fit_star(
         step_y = (c_xy * b_x + c_yy * b_y + c_yf * b_f) * scale
         step_f = (c_xf * b_x + c_yf * b_y + c_ff * b_f) * scale
         longest = max(abs(step_x), abs(step_y))
-        # a step far below the errors is negligible
+        # a step far smaller than the errors is negligible
         small = max(_CONVERGED_PX, _CONVERGED_SIGMA * math.sqrt(max(c_xx, c_yy) * scale))
         small_flux = max(_CONVERGED_FLUX * flux, _CONVERGED_SIGMA * math.sqrt(c_ff * scale))
         settled = longest <= small and abs(step_f) <= small_flux
@@ -266,7 +267,7 @@ def fit_star(
 
 @compiled_sums
 def _best_flux(pixels: Array32, model: Array) -> float:
-    """Best-fitting flux at a fixed position, with equal weights of all pixels."""
+    """Best-fitting flux at a fixed position, with all pixels weighted equally."""
     above = 0.0
     below = 1e-12
     for k in range(pixels.size):
@@ -281,8 +282,8 @@ def _best_flux(pixels: Array32, model: Array) -> float:
 def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float]:
     """Reduction of the sum of squares of a window by the fitted shape, and by its highest pixel alone.
 
-    Each has its best-fitting flux. Where the highest pixel explains more than the shape of a star, it is a hot pixel or
-    a particle's hit. The sum of squares itself and its number of pixels are returned too.
+    Each has its best-fitting flux. If the highest pixel explains more than the shape of a star, it is a hot pixel or a
+    particle hit. The sum of squares and its number of pixels are also returned.
     """
     highest = product = total = used = 0.0
     shape2 = 1e-12

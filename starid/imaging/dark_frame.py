@@ -1,4 +1,4 @@
-"""Dark frames: what a hot detector adds to an image without light."""
+"""Dark frames: the signal of a detector without light."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ Counts = npt.NDArray[Any]
 
 
 def dark_excess(dark: Counts) -> Array32:
-    """Return how far each pixel (h, w) of a dark frame is above the median of all, counts."""
+    """Return the excess of each pixel (h, w) of a dark frame over the median, counts."""
     return np.asarray(dark - np.float32(np.median(dark)), dtype=np.float32)
 
 
 def without_dark(image: Counts, excess_dn: Array32) -> Counts:
-    """Subtract the dark signal from an image; its mean level stays.
+    """Subtract the dark signal from an image, but keep its mean level.
 
     Parameters
     ----------
     image : ndarray (h, w) of uint8 or uint16
         The image.
     excess_dn : ndarray (h, w)
-        Dark signal of each pixel above the typical one, counts at the exposure and temperature of the image.
+        Dark signal of each pixel above the median, counts, at the exposure time and temperature of the image.
 
     Returns
     -------
     ndarray (h, w)
-        Of the type of the image. A pixel that its dark signal fills to half of the image's largest count holds no
-        light, and takes the median of its neighbours.
+        Of the same type as the image. A pixel with a dark signal of half the largest count or more carries no
+        information and takes the median of its neighbours.
 
     Raises
     ------
@@ -46,7 +46,9 @@ def without_dark(image: Counts, excess_dn: Array32) -> Counts:
 
     if image.shape != excess_dn.shape:
         here, there = ("×".join(str(side) for side in reversed(array.shape)) for array in (excess_dn, image))
-        raise StaridError(f"dark frame of {here} pixels: the image has {there}; give one of the same camera")
+        raise StaridError(
+            f"dark frame of {here} pixels: the image has {there}; give a dark frame of the same camera"
+        )
     most = np.iinfo(image.dtype).max
     result = np.clip(np.rint(image - excess_dn), 0, most).astype(image.dtype)
     blind = excess_dn > _BLIND_SHARE * float(image.max(initial=1))

@@ -92,32 +92,32 @@ _MAX_NEIGHBOURS: Final = 64
 
 @dataclass(frozen=True)
 class DetectionSettings:
-    """Known properties of the image and thresholds of the detection.
+    """Known properties of the image, and detection thresholds.
 
     Attributes
     ----------
     threshold_sigma : float
-        Least ratio of the smoothed peak to its noise.
+        Smallest ratio of the smoothed peak to its noise.
     psf_sigma_px : float or None
-        Standard deviation of a star's spot; estimated from the frame if None.
+        Standard deviation of a star's spot; estimated from the image if None.
     gain_e_per_dn : float or None
-        Electrons per count; if set, errors include shot noise and fluxes are in electrons.
+        Electrons per count; if given, errors include shot noise and fluxes are in electrons.
     saturation_dn : int or None
-        Count from which a pixel is saturated; the largest the image's type can hold if None.
+        Smallest count of a saturated pixel; if None, the largest value of the image type.
     model_error : float
         Relative error of the model of the spot in a pixel.
     max_stars : int
-        Most stars returned, the brightest first.
+        Largest number of stars returned, brightest first.
     block_px : int
         Side of the blocks in which the background is estimated.
     follow_trails : bool
-        Whether trails of a rotating sensor are searched for.
+        Whether to search for the trails of a rotating sensor.
     blend_px : float
-        Stars closer than this are reported as one, at the position that the fit of one spot has.
+        Stars closer than this are reported as one, at the position where a single spot fits.
     pixel_sigma : float
-        Least excess over the sky of a pixel lit by a star, in sigmas of the noise.
+        Smallest excess over the sky of a lit pixel, in sigmas of the noise.
     min_star_pixels, max_star_pixels : int
-        Fewest and most lit pixels of a star; other candidates are rejected.
+        Smallest and largest number of lit pixels of a star; other candidates are rejected.
     """
 
     threshold_sigma: float = 5.5
@@ -155,30 +155,30 @@ class DetectionSettings:
 
 @dataclass(frozen=True)
 class Detections:
-    """Stars found on an image, brightest first.
+    """Stars found in an image, brightest first.
 
     Attributes
     ----------
     xy_px : ndarray (n, 2)
-        Positions; pixel centres are integers. On a trail, its middle.
+        Positions (middle of a trail); pixel centres are integers.
     flux, flux_sigma : ndarray (n,)
-        Flux and its error, in electrons if the gain is set, else in counts.
+        Flux and its one-sigma error, in electrons if the gain is given, else in counts.
     xy_sigma_px : ndarray (n, 2)
         One-sigma errors of the position along x and y, pixels.
     saturated, edge : ndarray (n,) of bool
-        The star has saturated pixels; its light is cut by the image's edge.
+        The star has saturated pixels; its light is cut off by the edge of the image.
     background, noise : float
         Typical sky level and noise of a pixel, counts.
     psf_sigma_px : float
-        Width of the spot that was used.
+        Standard deviation of the spot, as used.
     trail_px : float
-        Median length of the stars' trails; 0 where they are round.
+        Median length of the trails; 0 if the stars are round.
     rejected : int
-        Candidates above the noise that are not stars: hot pixels, bodies, edges.
+        Number of candidates above the noise that are not stars: hot pixels, bodies, edges.
     reason : str
-        Why no star was found; empty otherwise.
+        Why no star was found; otherwise empty.
     searchable : bool
-        False if the image cannot be searched because it is saturated all over; an image without stars can.
+        False only if the whole image is saturated, so that it cannot be searched.
     """
 
     xy_px: Array
@@ -207,7 +207,7 @@ class Detections:
 
 @dataclass(frozen=True)
 class _Scene:
-    """An image (h, w) with its background, the settings, and the count from which a pixel is saturated."""
+    """An image (h, w) with its background, the settings, and the smallest saturated count."""
 
     counts: GreyImage
     background: Background
@@ -227,9 +227,9 @@ class _Scene:
 
 @dataclass(frozen=True)
 class _Fits:
-    """Candidates with their windows, the pixels of these, their neighbours, fits and flags.
+    """Candidates with their windows and pixels, neighbours, fits and flags.
 
-    `sensor`, `lit` and `size` are those of `starid.imaging.measurement.measure`.
+    `sensor`, `lit` and `size` are arguments of `starid.imaging.measurement.measure`.
     """
 
     windows: Table
@@ -243,7 +243,7 @@ class _Fits:
     flags: npt.NDArray[np.uint8]
 
     def measure(self, todo: Mask, turns: tuple[int, int]) -> None:
-        """Fit the candidates of a mask (n,) in some turns."""
+        """Fit the candidates of a mask (n,) in the given rounds."""
         measure(
             self.windows,
             self.pixels,
@@ -260,7 +260,7 @@ class _Fits:
 
     @property
     def suspicious(self) -> bool:
-        """Whether the shape of a star does not explain many of the candidates."""
+        """Whether many candidates do not have the shape of a star."""
         good = self.stars[self.stars[:, STATE] == GOOD]
         misfits = np.count_nonzero(_misfits(good)[1]) + np.count_nonzero(self.stars[:, STATE] == NOT_A_STAR)
         return bool(misfits >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(good)))
@@ -279,12 +279,12 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
     Returns
     -------
     Detections
-        Empty, with a reason, where no star is found.
+        Empty, with a reason, if no star is found.
 
     Raises
     ------
     StaridError
-        The image has another type or shape.
+        The image has an unsupported type or shape.
     """
     chosen = DetectionSettings() if settings is None else settings
     counts = _checked_image(image)
@@ -335,7 +335,7 @@ def _checked_image(image: npt.NDArray[np.generic]) -> GreyImage:
 
 
 def _no_detections(background: Background, reason: str, rejected: int = 0) -> Detections:
-    """Detections without a star."""
+    """Return empty detections with a reason."""
     none = np.zeros(0)
     pairs = np.zeros((0, 2))
     no = np.zeros(0, dtype=bool)
@@ -344,7 +344,7 @@ def _no_detections(background: Background, reason: str, rejected: int = 0) -> De
 
 
 def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
-    """Candidates (n, 2), the highest above the background first, and their smoothed heights above it."""
+    """Candidates (n, 2), highest first, and their smoothed heights above the background."""
     counts, background = scene.counts, scene.background
     bytes_taps = integer_taps(sigma_px)
     if counts.dtype == np.uint8 and bytes_taps is not None:
@@ -366,7 +366,7 @@ def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
 def _without_hot_pixels(
     scene: _Scene, peaks: Indices32, heights: Grid, sigma_px: float
 ) -> tuple[Indices32, Grid, Table]:
-    """Candidates that are more than a hot pixel, their heights, and (n, 3) the hot pixels with the sky under them."""
+    """Drop hot pixels: return candidates, heights, and (n, 3) the hot pixels with the sky under them."""
     if sigma_px < MIN_SPREAD_PX:
         return peaks, heights, np.zeros((0, 3))
     sky = np.empty(len(peaks))
@@ -376,7 +376,7 @@ def _without_hot_pixels(
 
 
 def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[Indices32, Grid]:
-    """As `_peaks`, with the filter for the frame's trails, and without the hot pixels, which it would smear."""
+    """As `_peaks`, with the filter for trails, and without the hot pixels, which it would smear."""
     background, counts = scene.background, scene.counts.copy()
     columns, rows = hot[:, :2].astype(np.int64).T
     counts[rows, columns] = hot[:, 2]
@@ -396,7 +396,7 @@ def _trail_peaks(scene: _Scene, shape: SpotShape, hot: Table) -> tuple[Indices32
 def _search(
     search: Callable[[Grid, Indices32, Grid], int], background: Background, factor: float
 ) -> tuple[Indices32, Grid]:
-    """Search for peaks above `factor` times the noise, or above a higher threshold where there are too many."""
+    """Search for peaks above `factor` times the noise, or above a higher threshold if there are too many."""
     peaks = np.empty((_MAX_PEAKS, 2), dtype=np.int32)
     heights = np.empty(_MAX_PEAKS, dtype=np.float32)
     while True:
@@ -414,7 +414,7 @@ def _search(
 
 
 def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_SIGMA_PX) -> SpotShape:
-    """Spot and trail from the brightest stars that are not saturated."""
+    """Estimate spot and trails from the brightest unsaturated stars."""
     settings = scene.settings
     height, width = scene.counts.shape
     start = settings.psf_sigma_px if settings.psf_sigma_px is not None else assumed
@@ -439,7 +439,7 @@ def _estimate_shape(scene: _Scene, peaks: Indices32, assumed: float = _ASSUMED_S
 
 
 def _trails_among_round(scene: _Scene, peaks: Indices32, shape: SpotShape) -> SpotShape:
-    """Check whether stars leave trails although the brightest objects are round."""
+    """Check for trails although the brightest objects are round."""
     tries = peaks[:_PEAKS_FOR_TRAILS]
     table = np.empty((len(tries), MOMENT_COLUMNS))
     limits = (_SHAPE_WINDOW_PX, scene.saturation)
@@ -448,7 +448,7 @@ def _trails_among_round(scene: _Scene, peaks: Indices32, shape: SpotShape) -> Sp
 
 
 def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotShape) -> _Fits:
-    """Fit the highest candidates, each as one star."""
+    """Fit the highest candidates, each as a single star."""
     counts, background, settings = scene.counts, scene.background, scene.settings
     peaks, heights = peaks[: 2 * settings.max_stars], heights[: 2 * settings.max_stars]
     per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
@@ -481,7 +481,7 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
 
 
 def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
-    """Return the candidates with the companions that bad fits indicate."""
+    """Fit bad candidates as pairs and add their companions."""
     stars = fits.stars
     bad = (stars[:, STATE] == GOOD) & (stars[:, CHI2] > BAD_FIT * (stars[:, PIXELS] - FIT_PARAMETERS))
     if not bad.any():
@@ -503,14 +503,14 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
 
 
 def _misfits(fits: Table) -> tuple[Array, Mask]:
-    """Sum of weighted squares per degree of freedom (n,) of fits, and where the shape of a star does not explain it."""
+    """Reduced χ² (n,) of the fits, and which of them do not have the shape of a star."""
     freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
     misfit = fits[:, CHI2] / freedom
     return misfit, misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
 
 
 def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detections:
-    """Keep the candidates that are stars, `hot` others having been rejected before."""
+    """Keep the candidates that are stars; `hot` others were rejected before."""
     background, settings = scene.background, scene.settings
     fits = _with_companions(fits, settings.blend_px)
     states = fits.stars[:, STATE]

@@ -14,7 +14,7 @@ from starid.errors import StaridError
 from starid.files import MEGABYTE, is_stream, read_bytes, write_atomically
 
 IMAGE_LIMIT: Final = 1000 * MEGABYTE
-"""Largest image file that is read, bytes: a colour TIFF of 16 bits of the largest cameras has some 900 MB."""
+"""Largest image file that is read, bytes: a 16-bit colour TIFF of the largest cameras has about 900 MB."""
 
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
@@ -26,14 +26,14 @@ _GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
 
 
 def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
-    """Read a grey PNG, TIFF or JPEG of 8 or 16 bits.
+    """Read an 8- or 16-bit grey PNG, TIFF or JPEG.
 
     Parameters
     ----------
     path : path
         The file.
     allow_colour : bool
-        Turn a colour image into grey (luma of BT.601, alpha dropped) instead of rejecting it.
+        Convert a colour image to grey (BT.601 luma, alpha dropped) instead of rejecting it.
 
     Returns
     -------
@@ -43,8 +43,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
     Raises
     ------
     StaridError
-        The file is missing, not such an image, truncated, in colour, of another depth, or every pixel has
-        the same value.
+        The file is missing, truncated, in colour, or not such an image; or every pixel has the same value.
     """
     source = Path(path)
     try:
@@ -60,39 +59,37 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
     if pixels.ndim == 3:
         if not allow_colour:
             raise StaridError(
-                f"image {source}: has {pixels.shape[2]} channels; a star sensor's frame is grey, "
+                f"image {source}: has {pixels.shape[2]} channels, but star sensor images are grey; "
                 "convert it or allow colour"
             )
         pixels = grey_of(pixels)
     if pixels.dtype not in (np.uint8, np.uint16):
-        raise StaridError(f"image {source}: pixels must be whole numbers of 8 or 16 bit, not {pixels.dtype}")
+        raise StaridError(f"image {source}: pixels must be integers of 8 or 16 bits, not {pixels.dtype}")
     low, high = int(pixels.min()), int(pixels.max())
     if low == high:
         appearance = {0: "all black", 256**pixels.dtype.itemsize - 1: "all white"}.get(
             low, "without any contrast"
         )
-        raise StaridError(
-            f"image {source}: {appearance}, every pixel is {low}; give a frame that shows stars"
-        )
+        raise StaridError(f"image {source}: {appearance}, every pixel is {low}; give an image with stars")
     return np.ascontiguousarray(pixels)
 
 
 def grey_of(pixels: NDArray[Any]) -> NDArray[Any]:
-    """Luma (h, w) of an image (h, w, 3 or 4) in the order blue, green, red, of the same type; alpha is dropped."""
+    """Luma (h, w) of an image (h, w, 3 or 4) in BGR order, of the same type; alpha is dropped."""
     grey: NDArray[Any] = np.rint(pixels[:, :, :3] @ _GREY_WEIGHTS).astype(pixels.dtype)
     return grey
 
 
 def image_suffix(path: Path) -> str:
-    """Return the suffix that selects the format of an image to write; .png for a device or pipe without a suffix.
+    """Return the suffix that selects the output format; .png for a device or pipe without one.
 
     Raises
     ------
     StaridError
-        The suffix is of no supported format, or the path is a folder.
+        The suffix is not supported, or the path is a folder.
     """
     if path.is_dir():
-        raise StaridError(f"image {path}: is a folder; name a file in it")
+        raise StaridError(f"image {path}: is a folder; give a file name in it")
     suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
     if suffix not in SUFFIXES:
         raise StaridError(f"image {path}: suffix must be one of {', '.join(SUFFIXES)}, not {suffix!r}")
@@ -108,12 +105,12 @@ def write_image(path: str | Path, image: GreyImage) -> None:
         Its suffix selects the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy); a device or pipe
         without one gets a PNG.
     image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
-        Colour in the order blue, green, red.
+        Colour in BGR order.
 
     Raises
     ------
     StaridError
-        The suffix is none of these, or the file cannot be written.
+        The suffix is not supported, or the file cannot be written.
     """
     import cv2
 
@@ -145,18 +142,18 @@ def _check_whole(source: Path, content: bytes) -> None:
     elif content.startswith(_TIFFS):
         whole = True
     else:
-        what = "is empty" if not content else "is no PNG, TIFF or JPEG"
-        raise StaridError(f"image {source}: {what}; give a grey image of 8 or 16 bit")
+        what = "is empty" if not content else "is not a PNG, TIFF or JPEG"
+        raise StaridError(f"image {source}: {what}; give a grey image of 8 or 16 bits")
     if not whole:
         raise _truncated(source)
 
 
 def _truncated(source: Path) -> StaridError:
-    return StaridError(f"image {source}: truncated or damaged; write or fetch the file again")
+    return StaridError(f"image {source}: truncated or damaged; write or download the file again")
 
 
 def _png_is_whole(content: bytes) -> bool:
-    """Whether every chunk of a PNG has the right checksum and the end chunk is present."""
+    """Whether every chunk of a PNG has a correct checksum and the end chunk is present."""
     at = len(_PNG)
     while at + _CHUNK_FRAME <= len(content):
         size = int.from_bytes(content[at : at + 4], "big")
@@ -173,10 +170,10 @@ def _png_is_whole(content: bytes) -> bool:
 
 
 def _decode(source: Path, content: bytes) -> NDArray[Any]:
-    """Pixels (height, width) or (height, width, channels) as they are stored."""
+    """Decode the pixels (height, width) or (height, width, channels) as stored."""
     import cv2
 
-    log: Any = getattr(cv2.utils, "logging", cv2)  # its place since OpenCV 5
+    log: Any = getattr(cv2.utils, "logging", cv2)  # moved in OpenCV 5
     level = log.getLogLevel()
     log.setLogLevel(0)
     try:

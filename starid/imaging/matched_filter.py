@@ -1,7 +1,7 @@
-"""Candidates for stars: local maxima of the image smoothed by the star's own profile, above the noise.
+"""Candidate stars: local maxima, above the noise, of the image smoothed with the profile of a star.
 
-Smoothing with the profile of a star is the linear filter with the best signal-to-noise ratio for its detection in
-white noise. One sweep keeps a few rows at a time, so that nothing leaves the processor's first cache.
+Smoothing with the profile of a star is the linear filter with the best signal-to-noise ratio for detecting it in white
+noise. One sweep keeps a few rows at a time, so that everything stays in the first-level cache.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from starid.imaging.background import block_position
 from starid.jit import compiled_ieee, compiled_sums
 
 INTEGER_TAPS_SUM: Final = 16
-"""Sum of the integer filter's taps along one axis: a byte smoothed along both axes fits 16 bits."""
+"""Sum of the integer filter's taps along one axis, so that a byte smoothed along both axes fits 16 bits."""
 
 _SHARP_BELOW_PX: Final = 0.65
 _INTEGER_UP_TO_PX: Final = 1.3
@@ -39,12 +39,12 @@ def spot_taps(sigma_px: float) -> Array32:
 
 
 def noise_factor(taps: npt.NDArray[np.floating]) -> float:
-    """Noise of the smoothed image over that of a pixel."""
+    """Ratio of the noise of the smoothed image to the noise of a pixel."""
     return float(taps[0] ** 2 + 2.0 * np.sum(taps[1:] ** 2, dtype=np.float64))
 
 
 def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
-    """Right half (3,) of an integer filter close to `spot_taps`, centre first; None where there is none.
+    """Right half (3,) of an integer filter close to `spot_taps`, centre first; None if there is none.
 
     Its signal-to-noise ratio is within 4 % of the best for spots of 0.6 to 1.3 pixels.
     """
@@ -55,7 +55,7 @@ def integer_taps(sigma_px: float) -> npt.NDArray[np.uint16] | None:
 
 @compiled_ieee
 def _smooth_down(image: GreyImage, y: int, taps: Array32, out: Array32) -> None:
-    """Smooth row y of the image across rows; the first and the last row are repeated beyond the edge."""
+    """Smooth row y of the image across rows; the first and last rows are repeated beyond the edge."""
     height, width = image.shape
     reach = taps.size - 1
     bottom = height - 1
@@ -80,7 +80,7 @@ def _smooth_down(image: GreyImage, y: int, taps: Array32, out: Array32) -> None:
 
 @compiled_ieee
 def _smooth_along(padded: Array32, taps: Array32, out: Array32) -> None:
-    """Smooth a row padded by the reach of the filter at both ends with the values there."""
+    """Smooth a row that is padded at both ends, by the reach of the filter, with its end values."""
     width = out.size
     reach = taps.size - 1
     for k in range(reach):
@@ -105,12 +105,12 @@ def _smooth_along(padded: Array32, taps: Array32, out: Array32) -> None:
 
 @compiled_ieee
 def _grid_line(grid: Array32, i: int, block: float, out: Array32) -> None:
-    """Values of row i of a grid of blocks at every image column."""
+    """Interpolate row i of a grid of blocks at every image column."""
     columns = grid.shape[1]
     width = out.size
     start = 0
     for j in range(max(columns - 1, 1)):
-        # from the centre of block j to that of the next, the first and the last on to the edges
+        # from the centre of block j to the next; the first and last extend to the edges
         end = width if j >= columns - 2 else min(math.ceil((j + 1.5) * block - 0.5), width)
         low = grid[i, j]
         slope = (grid[i, min(j + 1, columns - 1)] - low) / np.float32(block)
@@ -132,7 +132,7 @@ def _threshold_row(lines: Array32, q: np.float32, limit: Array32) -> None:
 def _flag_groups(
     row: Array32, limit: Array32, above: npt.NDArray[np.uint8], flags: npt.NDArray[np.uint8]
 ) -> None:
-    """Mark the groups of 32 pixels with one above its limit; `above` is workspace of 32 zero bytes per group."""
+    """Mark groups of 32 pixels with any above its limit; `above` is workspace of 32 zero bytes per group."""
     for x in range(row.size):
         above[x] = row[x] > limit[x]
     words = above.view(np.uint64)
@@ -171,9 +171,9 @@ def _peaks_of_row(
     peaks: Indices32,
     heights: Array32,
 ) -> int:
-    """Add the peaks of row y above its limit, in the groups that are marked, to the list; return their number.
+    """Append the peaks of row y above its limit, in the marked groups, to the list; return its length.
 
-    A peak is a pixel with no higher neighbour, nor an earlier one as high. The three rows have an additional zero at either end.
+    A peak has no higher neighbour, nor an earlier equal one. The three rows have an extra zero at each end.
     """
     is_top = np.empty(_GROUP, np.bool_)
     for group in range(flags.size):
@@ -211,7 +211,7 @@ def _peaks_of_row(
 def _update_grid_lines(
     grid: Array32, block: float, y: int, current: int, lines: Array32
 ) -> tuple[int, np.float32]:
-    """Update the two grid lines on either side of row y; return the first one and the fraction between them."""
+    """Update the two grid lines on either side of row y; return the first, and the fraction between them."""
     i, i2, q = block_position(float(y), block, grid.shape[0])
     if i != current:
         _grid_line(grid, i, block, lines[0])
@@ -223,20 +223,20 @@ def _update_grid_lines(
 def find_peaks(
     image: GreyImage, threshold: Array32, block: float, taps: Array32, peaks: Indices32, heights: Array32
 ) -> int:
-    """Local maxima of the smoothed image above a threshold.
+    """Find the local maxima of the smoothed image above a threshold.
 
     Parameters
     ----------
     image : ndarray (h, w)
         Counts.
     threshold : ndarray (rows, columns), float32
-        Least smoothed value, on the grid of blocks of `block` pixels.
+        Smallest smoothed value of a peak, on the grid of blocks.
     block : float
         Side of a block, pixels.
     taps : ndarray (r + 1,)
         From `spot_taps`.
     peaks : ndarray (m, 2), int32
-        Filled with column and row of each peak.
+        Filled with the column and row of each peak.
     heights : ndarray (m,), float32
         Filled with the smoothed value.
 
@@ -262,7 +262,7 @@ def find_peaks(
         else:
             smooth[y % 3] = 0.0
         if y > 0:
-            # row y − 1 has both neighbours now
+            # now both neighbours of row y − 1 are available
             line, q = _update_grid_lines(threshold, block, y - 1, line, lines)
             row, before, after = smooth[(y - 1) % 3], smooth[(y + 1) % 3], smooth[y % 3]
             _threshold_row(lines, q, limit)
@@ -291,7 +291,7 @@ def _smooth_down_integer(
 def _smooth_along_integer(
     padded: npt.NDArray[np.uint16], taps: npt.NDArray[np.uint16], out: npt.NDArray[np.uint16]
 ) -> None:
-    """As `_smooth_along`, in 16-bit integers; `padded` has two additional values at either end."""
+    """As `_smooth_along`, in 16-bit integers; `padded` has two extra values at each end."""
     width = out.size
     padded[0] = padded[1] = padded[2]
     padded[width + 2] = padded[width + 3] = padded[width + 1]

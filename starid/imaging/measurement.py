@@ -1,4 +1,4 @@
-"""Fit of each candidate in its window without its neighbours' light, and its classification."""
+"""Fitting each candidate in its window, without the light of its neighbours, and classifying it."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ SATURATED, AT_EDGE = 1, 2
 
 FRESH: Final = (0, 3)
 AGAIN: Final = (1, 4)
-"""First and last round of `measure`: from the candidates, or from existing fits."""
+"""First and last round of `measure`: starting from the candidates, or from existing fits."""
 
 FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
 """Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""
@@ -58,7 +58,7 @@ _WANDER_PX: Final = 1.5
 _WING_SHARE: Final = 0.6
 _EDGE_SIGMA: Final = 2.5
 BAD_FIT: Final = 4.0
-"""Least sum of weighted squares per degree of freedom of a bad fit."""
+"""Smallest reduced χ² of a bad fit."""
 
 _AT_REST: Final = 0.5
 _STRAY_SIGMA: Final = 7.0
@@ -69,18 +69,18 @@ _MIN_SIDE: Final = 11
 
 @compiled_ieee
 def find_neighbours(windows: Array, order: Indices, first: Indices32, neighbours: Indices32) -> int:
-    """List for every window the others whose stars may contribute light to it.
+    """List, for every window, the others whose stars may contribute light to it.
 
     Parameters
     ----------
     windows : ndarray (n, WINDOW_COLUMNS)
         From `lay_windows`.
     order : ndarray (n,)
-        Indices of the windows in the order of START_Y.
+        Indices of the windows, sorted by START_Y.
     first : ndarray (n + 1,)
-        Filled: the neighbours of k are ``neighbours[first[k]:first[k + 1]]``.
+        Filled so that the neighbours of k are ``neighbours[first[k]:first[k + 1]]``.
     neighbours : ndarray (m,)
-        Filled as far as it has room.
+        Filled as far as there is room.
 
     Returns
     -------
@@ -124,7 +124,7 @@ def find_neighbours(windows: Array, order: Indices, first: Indices32, neighbours
 def _mask_stray_pixel(
     pixels: Array32, model: Array, star: Array, window: Array, sigma: float, per_dn: float, model_error: float
 ) -> bool:
-    """Mask the pixel that contradicts the fit most, if any does, outside the star's core."""
+    """Mask the pixel outside the star's core that contradicts the fit most, if any does."""
     worst = _STRAY_SIGMA * _STRAY_SIGMA
     stray = -1
     variance = window[NOISE] * window[NOISE]
@@ -153,11 +153,11 @@ def _is_one_pixel(
     model: Array,
     work: Array,
 ) -> bool:
-    """Whether one pixel holds so much of a window's light that it explains more than the shape of a star anywhere.
+    """Whether a single pixel explains more of a window's light than the shape of a star can anywhere.
 
-    With u the share of the shape's norm in the pixel at its centre, the Cauchy–Schwarz inequality bounds the sum of squares
-    that the shape explains (`explained`): it is below that of the pixel alone where the pixel has more than
-    (1 + u)/2 of all. Such a window needs no fit.
+    Let u be the share of the shape's norm in its central pixel. The Cauchy–Schwarz inequality bounds the sum of squares
+    that the shape explains (`explained`): it is less than for the pixel alone if the pixel has more than
+    (1 + u)/2 of the total. Such a window needs no fit.
     """
     highest = total = squares = 0.0
     place = 0
@@ -192,7 +192,7 @@ def _is_at_rest(
     star: Array,
     spot: Array,
 ) -> bool:
-    """Whether a spot that did not move explains what the trail of a star does not; `spot` is workspace for its fit."""
+    """Whether a spot at rest fits and the trail of a star does not; `spot` is workspace for its fit."""
     bad = BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
     if star[STATE] != GOOD or star[CHI2] <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
         return False
@@ -212,7 +212,7 @@ def _classify_fit(
     lit: tuple[float, float, float],
     size: tuple[int, int],
 ) -> float:
-    """Return GOOD for a star, else the reason to reject the fit."""
+    """Return GOOD for a star, or the reason to reject the fit."""
     width, height = size
     noise, patch = window[NOISE], window[PATCH]
     length = math.hypot(window[TRAIL_X], window[TRAIL_Y])
@@ -250,7 +250,7 @@ def _classify_fit(
 
 @compiled_ieee
 def _flags(star: Array, window: Array, pixels: Array32, sigma: float, size: tuple[int, int]) -> int:
-    """Flags of a star: whether pixels of its core are saturated, whether the image's edge cuts its light."""
+    """Flags of a star: whether its core has saturated pixels, and whether the image edge cuts off its light."""
     flags = 0
     reach_x = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_X])
     reach_y = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_Y])
@@ -278,7 +278,7 @@ def _subtract_star(
     work: Array,
     target: Array32,
 ) -> None:
-    """Subtract the light of a star, if it is one, from a window."""
+    """Subtract the light of a candidate, if it is a star, from a window."""
     if star[STATE] != GOOD:
         return
     star_model(star[X], star[Y], shape, bounds, lights, work)
@@ -300,10 +300,10 @@ def measure(
     stars: Array,
     flags: npt.NDArray[np.uint8],
 ) -> None:
-    """Fit and judge candidates.
+    """Fit and classify candidates.
 
-    The brightest come first, and each is fitted after the light of its brighter neighbours is subtracted; those with
-    neighbours are then fitted again without the light of all of them.
+    The brightest come first, and each is fitted after subtracting the light of its brighter neighbours; those with
+    neighbours are then fitted again without the light of any of them.
 
     Parameters
     ----------
@@ -312,19 +312,19 @@ def measure(
     first, neighbours
         From `find_neighbours`.
     sensor : (float, float, float, float, float)
-        Standard deviation of the spot, pixels; variance in counts² that a count of star light brings; model error;
-        least signal-to-noise ratio of a star; counts above the sky that saturate.
+        Standard deviation of the spot, pixels; variance in counts² per count of star light; model error;
+        smallest signal-to-noise ratio of a star; saturation in counts above the sky.
     lit : (float, float, float)
-        Sigmas from which a pixel is lit; fewest and most lit pixels of a star.
+        Sigmas from which a pixel is lit; smallest and largest number of lit pixels of a star.
     size : (int, int)
         Columns and rows of the image.
     todo : ndarray (n,) of bool
         The candidates to fit; the fits of the others are kept.
     turns : (int, int)
-        First and last round: `FRESH`, or `AGAIN` to continue from existing fits. In the last round a fit that stays bad is
+        First and last round: `FRESH`, or `AGAIN` to continue from existing fits. In the last round a fit that is still bad is
         repeated without the pixel that contradicts it most.
     stars : ndarray (n, FIT_COLUMNS)
-        Filled with the fits; STATE is NO_FIT before the first turn.
+        Filled with the fits; STATE is NO_FIT before the first round.
     flags : ndarray (n,)
         Filled with bits `SATURATED`, `AT_EDGE`.
     """

@@ -1,4 +1,4 @@
-"""The normal distribution and its density for compiled loops: a small table and a Taylor step from its nearest entry."""
+"""The normal distribution and its density for compiled loops: a small table with Taylor interpolation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from starid.jit import compiled_ieee
 
 REACH: Final = 8.0
-"""Beyond this many standard deviations the distribution is taken as 0 or 1."""
+"""Number of standard deviations beyond which the distribution is taken as 0 or 1."""
 
 _PER_SIGMA: Final = 32
 _COUNT: Final = int(2 * REACH) * _PER_SIGMA + 1
@@ -21,7 +21,7 @@ _PDF: Final = np.exp(-0.5 * _NODES**2) / math.sqrt(2.0 * math.pi)
 
 @compiled_ieee
 def normal(z: float) -> tuple[float, float]:
-    """Distribution and density of the standard normal at z, to 1e-8."""
+    """Standard normal distribution function and density at z, to 1e-8."""
     if z <= -REACH:
         return 0.0, 0.0
     if z >= REACH:

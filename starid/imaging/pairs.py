@@ -1,4 +1,4 @@
-"""Deblending: a badly fitted star is fitted as two stars too close for separate peaks."""
+"""Deblending: a badly fitted star is fitted as two stars that are too close for separate peaks."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _MAX_STEP_PX: Final = 0.4
 _MAX_CHANGE: Final = 0.5
 _BETTER: Final = 0.5
 _HOPEFUL_STEPS: Final = 10
-"""Steps within which the fit of a true pair is better than that of one star; a worse fit is then abandoned."""
+"""Steps after which the fit is abandoned unless it is better than the fit of one star."""
 
 _MIN_SIGNAL: Final = 6.0
 _MIN_SHARE: Final = 0.03
@@ -44,13 +44,12 @@ _FAR_SIGMA: Final = 4.0
 _CORE_SIGMA: Final = 1.0
 _ONE_PIXEL: Final = 0.5
 _DOUBTFUL: Final = 1.4
-"""Pairs closer than this many blending distances may be one star in a catalogue merged by angle: off the axis of a wide
-lens the same angle covers more pixels."""
+"""Pairs closer than this many blending distances may be merged in the catalogue (off axis, an angle has more pixels)."""
 
 
 @compiled_ieee
 def _invert(matrix: Array, inverse: Array) -> bool:
-    """Invert a small positive matrix by Gauss–Jordan elimination, destroying it; False if it is singular."""
+    """Invert a small positive matrix in place by Gauss–Jordan elimination; False if it is singular."""
     size = matrix.shape[0]
     inverse[:] = 0.0
     for i in range(size):
@@ -87,13 +86,13 @@ def fit_pair(
     Parameters
     ----------
     pixels, window, shape, noise, work
-        As in `fit_star`.
+        See `fit_star`.
     models : ndarray (6, rows·columns)
         On return, the models of both stars.
     enough : float
-        CHI2 that a fit has to reach in its first steps, or it is abandoned.
+        CHI2 that the fit must reach in its first steps; otherwise it is abandoned.
     pair : ndarray (2, FIT_COLUMNS)
-        Holds first guesses of X, Y and FLUX; filled with the fits. CHI2 and PIXELS refer to both together.
+        First guesses of X, Y and FLUX on entry; filled with the fits. CHI2 and PIXELS are for both together.
 
     Returns
     -------
@@ -168,7 +167,7 @@ def fit_pair(
 def _first_guesses(
     left_over: Array, window: tuple[int, int, int, int], star: Array, sigma: float, pair: Array
 ) -> bool:
-    """First guesses of two stars from the residual of the fit of one; False if there is no residual light."""
+    """Guess two stars from the residuals of a single-star fit; False if there is no residual light."""
     left, top, columns, rows = window
     best = 0.0
     best_x = best_y = 0.0
@@ -193,7 +192,7 @@ def _first_guesses(
         pair[1, Y] += best_y
         pair[1, FLUX] = min(best * 2.0 * math.pi * sigma * sigma, star[FLUX])
         return True
-    # hardly apart: both share the light, on either side of the single fit
+    # very close: share the light between two stars on either side of the single fit
     half = 0.5 * _PAIR_SIGMA * sigma / distance
     for k in range(2):
         sense = 1.0 if k == 1 else -1.0
@@ -205,7 +204,7 @@ def _first_guesses(
 
 @compiled_ieee
 def _is_better(pair: Array, chi2: float, sigma: float, models: Array, pixels: Array32) -> bool:
-    """Whether two stars explain a window much better than one did, and neither is noise or a single pixel."""
+    """Whether two stars fit much better than one, and neither is noise or a single pixel."""
     apart = math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y])
     if pair[0, CHI2] > _BETTER * chi2 or apart < _CLOSEST_SIGMA * sigma:
         return False
@@ -214,7 +213,7 @@ def _is_better(pair: Array, chi2: float, sigma: float, models: Array, pixels: Ar
         flux = pair[k, FLUX]
         if flux < _MIN_SHARE * total or flux < _MIN_SIGNAL * math.sqrt(pair[k, VAR_FLUX]):
             return False
-    # the fainter one's own light, all but one pixel's
+    # light of the fainter star without its highest pixel
     highest = everything = 0.0
     faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
     for k in range(pixels.size):
@@ -227,7 +226,7 @@ def _is_better(pair: Array, chi2: float, sigma: float, models: Array, pixels: Ar
 
 @compiled_ieee
 def _blend_shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> float:
-    """Position of the fit of one spot between a star and its companion, as a share of their distance."""
+    """Where a single spot fits between a star and its companion, as a share of their distance."""
     gaussian = math.exp(-(off_x * off_x + off_y * off_y) / (blend_px * blend_px))
     share = 1.0 - (1.0 - gaussian) * max(1.0 - (ratio / EVEN_PAIR) ** 2, 0.0)
     return share * ratio / (1.0 + ratio)
@@ -237,16 +236,16 @@ def _blend_shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> f
 def doubt_close_pairs(stars: Array, order: Indices, blend_px: float) -> None:
     """Increase the errors of the brighter star of a pair that is barely resolved.
 
-    A catalogue with merged close pairs may hold it as one star, displaced by the shift of the merged position.
+    A catalogue with merged pairs may have it as one star, displaced by the shift of the merged position.
 
     Parameters
     ----------
     stars : ndarray (n, FIT_COLUMNS)
         Fits; VAR_X and VAR_Y grow.
     order : ndarray (n,)
-        Indices of the stars by falling Y.
+        Indices of the stars, sorted by decreasing Y.
     blend_px : float
-        As in `split_pairs`.
+        See `split_pairs`.
     """
     reach = _DOUBTFUL * blend_px
     for place in range(order.size):
@@ -268,9 +267,9 @@ def doubt_close_pairs(stars: Array, order: Indices, blend_px: float) -> None:
 
 @compiled_ieee
 def _merge(pair: Array, blend_px: float, star: Array) -> None:
-    """Replace two stars by one with all their light, at the position and with the errors of the fit of one spot.
+    """Replace two stars by one with their total light, at the position and with the errors of a single-spot fit.
 
-    The position is that of `starid.photometry.fitted_share`, so that resolved and unresolved pairs agree with an index
+    The position follows `starid.photometry.fitted_share`, so that resolved and unresolved pairs agree with an index
     of merged stars.
     """
     faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
@@ -302,19 +301,19 @@ def split_pairs(
     Parameters
     ----------
     windows, pixels, first, neighbours, stars
-        As in `starid.imaging.measurement.measure`, after it.
+        See `starid.imaging.measurement.measure`, which must have been called.
     noise : (float, float, float)
-        Standard deviation of the spot, pixels; variance in counts² that a count of star light brings; model error.
+        Standard deviation of the spot, pixels; variance in counts² per count of star light; model error.
     suspects : ndarray (m,)
         Indices of the stars to try.
     blend_px : float
-        Pairs closer than this stay one star, at the position of the fit of one spot.
+        Pairs closer than this stay one star, at the position where a single spot fits.
     partners : ndarray (m, FIT_COLUMNS)
         Filled with the fits of the fainter stars.
     owners : ndarray (m,)
         Filled with the indices of the brighter members.
     todo : ndarray (n,) of bool
-        Cleared for the stars that are pairs.
+        Cleared for stars that are pairs.
 
     Returns
     -------

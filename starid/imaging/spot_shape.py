@@ -1,7 +1,7 @@
-"""Shape of the stars of an image: width of the spot, and the trails of a rotating sensor.
+"""Shape of the stars in an image: width of the spot, and the trails of a rotating sensor.
 
-Second moments of bright stars under a Gaussian weight that is adapted to the star itself (Bernstein & Jarvis 2002)
-give each star's covariance: across a trail that of the spot, along it more.
+Second moments of bright stars under an adaptive Gaussian weight (Bernstein & Jarvis 2002) give the covariance of each
+star: across a trail it is the variance of the spot, along it is larger.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class SpotShape:
     sigma_px : float
         Standard deviation of the spot, pixels.
     flow : ndarray (5,)
-        Flow of the trails (`starid.imaging.trail_flow`); all zero where stars are round.
+        Flow of the trails (`starid.imaging.trail_flow`); all zero if stars are round.
     trail_px : float
         Median length of the trails, pixels.
     stars : int
-        Stars that the estimate is based on; 0 for an assumed width.
+        Number of stars used for the estimate; 0 for an assumed width.
     """
 
     sigma_px: float
@@ -66,18 +66,18 @@ def adaptive_moments(
     saturation: float,
     moments: Array,
 ) -> bool:
-    """Centre and covariance of a bright star: (x, y, c_xx, c_xy, c_yy) into `moments`; False if there is none.
+    """Measure centre and covariance (x, y, c_xx, c_xy, c_yy) of a bright star; False if there is none.
 
     Parameters
     ----------
     image : ndarray (h, w)
         Counts.
     x0, y0, background, start_sigma
-        First guess of the position, background there, first guess of the width.
+        First guess of the position, local background, first guess of the width.
     largest : int
-        Half-width of the window at most; a star that needs more is rejected.
+        Largest half-width of the window; a star that needs more is rejected.
     saturation : float
-        Least count of a saturated pixel; saturated stars are rejected.
+        Smallest count of a saturated pixel; saturated stars are rejected.
     """
     height, width = image.shape
     x, y = x0, y0
@@ -93,7 +93,7 @@ def adaptive_moments(
         if left < 0 or top < 0 or right >= width or bottom >= height:
             return False
         determinant = c_xx * c_yy - c_xy * c_xy
-        if not determinant > 1e-4:  # a line has no inverse
+        if not determinant > 1e-4:  # the covariance of a line has no inverse
             return False
         i_xx, i_xy, i_yy = c_yy / determinant, -c_xy / determinant, c_xx / determinant
         total = m_x = m_y = m_xx = m_xy = m_yy = 0.0
@@ -145,9 +145,9 @@ def moments_of(
     saturation: float,
     table: Array,
 ) -> int:
-    """Fill `table` (n, 5) with the moments of the first peaks that have them; return their number.
+    """Fill `table` (n, 5) with the moments of the first measurable peaks; return their number.
 
-    Peaks that converge to the position of an earlier one (several on one trail) count once.
+    Peaks that converge to the same position (several on one trail) count once.
     """
     count = 0
     for k in range(peaks.shape[0]):
@@ -169,7 +169,7 @@ def moments_of(
 def shape_from_moments(
     table: Array, width: int, height: int, known_sigma_px: float | None, assumed_sigma_px: float
 ) -> SpotShape:
-    """Spot and trails from the moments of bright stars.
+    """Estimate the spot and the trails from the moments of bright stars.
 
     Parameters
     ----------
@@ -178,9 +178,9 @@ def shape_from_moments(
     width, height : int
         Size of the image.
     known_sigma_px : float or None
-        Width of the spot, where it is known.
+        Width of the spot, if it is known.
     assumed_sigma_px : float
-        Width to assume where there are too few stars.
+        Width to assume if there are too few stars.
     """
     still = np.zeros(FLOW_TERMS)
     if len(table) < _MIN_FOR_SPOT:
@@ -188,7 +188,7 @@ def shape_from_moments(
     mean, split = _mean_and_split(table)
     across = known_sigma_px**2 + _PIXEL_VARIANCE if known_sigma_px else median(mean - split)
     across = max(across, _MIN_SIGMA_PX**2 + _PIXEL_VARIANCE)
-    # a short trail of length L makes the split L²/24
+    # for a short trail of length L the split is L²/24
     if math.sqrt(24.0 * median(split)) > _ROUND_BELOW_PX:
         positions, trails, length = _trails(table, width, height, across)
         flow = np.zeros(FLOW_TERMS)
@@ -200,13 +200,13 @@ def shape_from_moments(
 
 
 def long_trails(table: Array, sigma_px: float) -> Mask:
-    """Mask (n,) of the stars in a table of moments too long to be explained by noise or a close neighbour."""
+    """Mask (n,) of the stars, in a table of moments, too elongated for noise or a close neighbour."""
     mean, split = _mean_and_split(table)
     return np.asarray(trail_length(mean + split, sigma_px**2 + _PIXEL_VARIANCE) > _LONG_PX, dtype=bool)
 
 
 def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) -> SpotShape:
-    """Trails of an image on which most objects are round and not stars: particles, hot pixels, reflections.
+    """Find trails where most objects are round and not stars: particles, hot pixels, reflections.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
     width, height : int
         Size of the image.
     shape : SpotShape
-        Shape of the round objects; returned unchanged unless enough of the long ones agree on a flow.
+        Shape of the round objects; returned unchanged unless enough elongated ones agree on a flow.
     """
     longest = table[long_trails(table, shape.sigma_px)]
     if len(longest) < _MIN_LONG:
@@ -228,13 +228,13 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
 
 
 def _mean_and_split(table: Array) -> tuple[Array, Array]:
-    """Mean (n,) of the variances along and across each star of a table of moments, and half their difference (n,)."""
+    """Mean (n,) and half-difference (n,) of the variances along and across each star of a table of moments."""
     c_xx, c_xy, c_yy = table[:, 2], table[:, 3], table[:, 4]
     return 0.5 * (c_xx + c_yy), np.hypot(0.5 * (c_xx - c_yy), c_xy)
 
 
 def _trails(table: Array, width: int, height: int, across: float) -> tuple[Array, Array, Array]:
-    """Positions (n, 2) for `fit_flow`, trails (n, 2) and their lengths (n,), for a variance across them."""
+    """Positions (n, 2) for `fit_flow`, trails (n, 2) and lengths (n,), given the variance across the trails."""
     mean, split = _mean_and_split(table)
     length = trail_length(mean + split, across)
     angle = 0.5 * np.arctan2(2.0 * table[:, 3], table[:, 2] - table[:, 4])
@@ -244,7 +244,7 @@ def _trails(table: Array, width: int, height: int, across: float) -> tuple[Array
 
 
 def _sigma(variance: float, known: float | None) -> float:
-    """Standard deviation of the spot from its variance on pixels."""
+    """Standard deviation of the spot from its variance as sampled by pixels."""
     return known or math.sqrt(max(variance - _PIXEL_VARIANCE, _MIN_SIGMA_PX**2))
 
 
@@ -258,11 +258,11 @@ def _box_share() -> tuple[Array, Array]:
 
 
 def trail_length(along: Array, across: float) -> Array:
-    """Lengths (n,) of trails from the adaptive variance along them (n,) and that across.
+    """Lengths (n,) of trails from the adaptive variances along (n,) and across them.
 
     A trail is a box of half-length h convolved with the spot. Under a Gaussian weight of variance C (in units of the
-    spot's) its second moment is C/(C + 1) + (C/(C + 1))²·(C + 1)·s, s being the share by which a Gaussian of
-    variance C + 1 is cut down on (−h, h); adapted moments have the moment C/2, so that s = (C − 1)/2C.
+    spot's) its second moment is C/(C + 1) + (C/(C + 1))²·(C + 1)·s, where s is the share of the variance that a Gaussian of
+    variance C + 1 retains on (−h, h); adapted moments equal C/2, so that s = (C − 1)/2C.
     """
     ratio = np.maximum(along / across, 1.0)
     z, share = _box_share()

@@ -34,7 +34,7 @@ def _one_width(
     saturation: float,
     result: Array,
 ) -> float:
-    """Width of the star at a peak; NaN where it cannot be fitted."""
+    """Fit the width of the star at a peak; NaN if that fails."""
     height, width = image.shape
     sigma = start
     for _ in range(_ROUNDS):
@@ -63,7 +63,7 @@ def _one_width(
         spot_model(x, y, sigma, window, model, work)
         spot_model(x, y, sigma * (1.0 + _STEP), window, wider, work)
         spot_model(x, y, sigma * (1.0 - _STEP), window, narrower, work)
-        # least squares for changes of flux and width; position is uncorrelated with both
+        # least squares for flux and width; the position is uncorrelated with both
         ff = fs = ss = bf = bs = 0.0
         for k in range(pixels.size):
             share = model[0, k]
@@ -100,20 +100,20 @@ def spot_widths(
     saturation: float,
     widths: Array,
 ) -> int:
-    """Fill `widths` (m,) with the spot widths of the first peaks that have one; return their number.
+    """Fill `widths` (m,) with the spot widths at the first peaks that can be fitted; return their number.
 
     Parameters
     ----------
     image : ndarray (h, w)
         Counts.
     peaks : ndarray (n, 2)
-        Column and row of each, the brightest first.
+        Column and row of each, brightest first.
     level, noise, block
-        Grid of the background, and the side of its blocks.
+        Background on its grid, and the side of a block.
     start : float
         First guess, pixels.
     saturation : float
-        Least count of a saturated pixel; saturated stars are rejected.
+        Smallest count of a saturated pixel; saturated stars are rejected.
     """
     count = 0
     result = np.empty(FIT_COLUMNS)

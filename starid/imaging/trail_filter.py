@@ -1,7 +1,7 @@
-"""First half of the matched filter for trails: the image summed along the path of its stars during the exposure.
+"""First half of the matched filter for trails: the image is summed along the paths of its stars.
 
-The sum is taken in integers before the smoothing with the round spot (`starid.imaging.matched_filter.find_peaks`). The
-result does not depend on the order; this one is faster.
+The sum is taken in integers before smoothing with the round spot (`starid.imaging.matched_filter.find_peaks`). The
+result does not depend on the order, but this one is faster.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def _sum_along(
     sums: npt.NDArray[np.uint16] | npt.NDArray[np.uint32],
     out: npt.NDArray[np.uint16],
 ) -> None:
-    """Sum of the image at `steps` positions along the trail of each tile, shifted right; `sums` is a tile's row.
+    """Sum the image at `steps` positions along the trail of each tile, shifted right; `sums` is a row of a tile.
 
-    Indices are unsigned: without the case of negative ones the loops become vector instructions.
+    Indices are unsigned: without negative ones to handle, the loops are vectorised.
     """
     height, width = image.shape
     pixels, target = image.reshape(image.size), out.reshape(out.size)
@@ -62,7 +62,7 @@ def _sum_along(
 
 
 def trail_steps(flow: Array, width: int, height: int) -> int:
-    """Number of positions along a trail, about a pixel apart on the longest trail of the field."""
+    """Number of positions along a trail, about a pixel apart on the longest trail in the field."""
     corners = [(x, y) for x in (0.0, 0.5, 1.0) for y in (0.0, 0.5, 1.0)]
     lengths = [
         math.hypot(*trail_at(flow, x * (width - 1), y * (height - 1), width, height)) for x, y in corners
@@ -87,7 +87,7 @@ def sum_along_trails(image: GreyImage, flow: Array, steps: int) -> tuple[npt.NDA
     sums : ndarray (h, w), uint16
         Pixels beyond the left and right edges count as 0.
     scale : float
-        Sum where every count is 1.
+        Sum for an image whose every count is 1.
     """
     out = np.empty(image.shape, dtype=np.uint16)
     if image.dtype == np.uint8:
@@ -99,7 +99,7 @@ def sum_along_trails(image: GreyImage, flow: Array, steps: int) -> tuple[npt.NDA
 
 
 def trail_noise_factor(sigma_px: float, trail_px: float, steps: int) -> float:
-    """Noise of an image summed along trails and smoothed, over `steps` times that of a pixel, for a trail's length."""
+    """Noise after summing along a trail and smoothing, relative to `steps` times the noise of a pixel."""
     taps = spot_taps(sigma_px).astype(np.float64)
     spot = np.concatenate([taps[:0:-1], taps])
     offsets = np.rint(((np.arange(steps) + 0.5) / steps - 0.5) * trail_px).astype(int)

@@ -1,11 +1,11 @@
 """The trails of a rotating sensor as one flow over the whole field.
 
-Through a lens that keeps straight lines straight, trails follow, with (u, v) measured from the image's centre,
+For a lens without distortion, and (u, v) measured from the centre of the image, trails follow
 
     dx = t_x + a·u² + b·u·v − r·v,    dy = t_y + a·u·v + b·v² + r·u,
 
-and nearly so through any other: t is the rotation across the boresight, r that about it, a and b the perspective. The
-five numbers are fitted to the trails of bright stars, whose senses are unknown.
+and nearly so for any other: t is the rotation across the boresight, r the rotation about it, a and b the perspective. The
+five numbers are fitted to the trails of bright stars, whose directions are known up to sign.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def _flow_trail(flow: Array, u: float, v: float) -> tuple[float, float]:
 
 @compiled_ieee
 def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[float, float]:
-    """Trail (dx, dy) in pixels at an image position, up to its sense.
+    """Trail (dx, dy) in pixels at an image position, up to its sign.
 
     Parameters
     ----------
@@ -56,14 +56,14 @@ def trail_at(flow: Array, x: float, y: float, width: int, height: int) -> tuple[
 
 @compiled_ieee
 def _rows(u: float, v: float, rows: Array) -> None:
-    """Factors (2, 5) of a flow in dx and in dy at a position."""
+    """Coefficients (2, 5) of the flow terms in dx and dy at a position."""
     rows[0, 0], rows[0, 1], rows[0, 2], rows[0, 3], rows[0, 4] = 1.0, 0.0, -v, u * u, u * v
     rows[1, 0], rows[1, 1], rows[1, 2], rows[1, 3], rows[1, 4] = 0.0, 1.0, u, u * v, v * v
 
 
 @compiled_ieee
 def mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[float, float]:
-    """Distance between the measured trail k and the flow's, and the sense (±1) that minimises it."""
+    """Distance between the measured trail k and the flow, and the sign that minimises it."""
     dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
     forth = math.hypot(trails[k, 0] - dx, trails[k, 1] - dy)
     back = math.hypot(trails[k, 0] + dx, trails[k, 1] + dy)
@@ -72,7 +72,7 @@ def mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[floa
 
 @compiled_ieee
 def _solve(matrix: Array, right: Array, used: int, out: Array) -> bool:
-    """Solve the first `used` equations of a positive system by elimination; False if it is singular."""
+    """Solve the first `used` equations of a positive definite system by elimination; False if it is singular."""
     for column in range(used):
         pivot = column
         for row in range(column + 1, used):
@@ -108,7 +108,7 @@ def _least_squares(
     rows: Array,
     out: Array,
 ) -> bool:
-    """Flow of `used` terms through the trails, each in its sense (0: left out)."""
+    """Fit a flow of `used` terms to the trails, each with its sign (0: left out)."""
     matrix[:] = 0.0
     right[:] = 0.0
     for k in range(positions.shape[0]):
@@ -126,7 +126,7 @@ def _least_squares(
 
 @compiled_ieee
 def _mean_mismatch(flow: Array, positions: Array, trails: Array) -> float:
-    """Mean distance between measured trails and the flow's, each limited to half its length."""
+    """Mean distance between the measured trails and the flow, each limited to half its length."""
     total = 0.0
     for k in range(positions.shape[0]):
         off, _ = mismatch(flow, positions, trails, k)
@@ -136,11 +136,11 @@ def _mean_mismatch(flow: Array, positions: Array, trails: Array) -> float:
 
 @compiled_ieee
 def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
-    """Fit a flow (5,) to trails (n, 2) at positions (n, 2), of unknown sense.
+    """Fit a flow (5,) to trails (n, 2) at positions (n, 2), of unknown sign.
 
-    Starts are translations along one of the brightest stars' trails, and translation with roll through two of them
-    in either relative sense; the one with the least mismatch is refined by least squares without outliers. Few stars determine
-    fewer terms: below 5 only the translation, below 12 no perspective.
+    Starting points are translations along the trail of a bright star, and translation with roll through two such trails
+    with either relative sign; the best is refined by least squares without outliers. Few stars determine
+    fewer terms: fewer than 5 only the translation, fewer than 12 no perspective.
     """
     count = positions.shape[0]
     senses = np.zeros(count)
@@ -184,7 +184,7 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
 
 @compiled_ieee
 def typical_trail(flow: Array, positions: Array, trails: Array) -> tuple[float, float]:
-    """Median length of a flow's trails at positions (n, 2), and median distance from the measured ones (n, 2), pixels."""
+    """Median length of the flow at positions (n, 2), and median distance to measured trails (n, 2), pixels."""
     lengths = np.empty(positions.shape[0])
     off = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):

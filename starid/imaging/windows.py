@@ -30,20 +30,22 @@ WINDOW_COLUMNS: Final = 14
     RADIUS_X,
     RADIUS_Y,
 ) = range(WINDOW_COLUMNS)
-"""Columns of a table of windows: position and size; start of the pixels in the packed array; first guess of the star;
-sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
+"""Columns of a table of windows.
+
+Position and size; start in the packed pixels; first guess of the star; sky and noise of a pixel (counts); half-width of
+the saturated patch; trail; half-widths of the window (pixels)."""
 
 LARGEST_HALF_WIDTH: Final = 40
-"""Half-width of a window at most, pixels."""
+"""Largest half-width of a window, pixels."""
 
 MAX_SATURATED: Final = 400
-"""Least number of connected saturated pixels of an object that is not a star."""
+"""An object with this many connected saturated pixels or more is not a star."""
 
 PATCH_REACH: Final = 40
 """Largest distance of the saturated patch of a star from its peak, pixels."""
 
 MIN_SPREAD_PX: Final = 0.5
-"""Standard deviation of a spot from which the light of a star reaches more than one pixel."""
+"""Smallest standard deviation of a spot, pixels, for the light of a star to reach more than one pixel."""
 
 EXTENDED: Final = -1.0
 SEEN_BEFORE: Final = -2.0
@@ -66,7 +68,7 @@ _ALONE_SHARE: Final = 0.125
 
 @compiled_ieee
 def light_radius(sigma: float, flux: float, noise: float) -> int:
-    """Half-width of the square in which a star's light is above a third of the pixel noise, at least 2.5 sigma."""
+    """Half-width of the square where a star exceeds a third of the pixel noise, at least 2.5 sigma."""
     peak = flux / (2.0 * math.pi * sigma * sigma)
     ratio = max(peak / (_VISIBLE_NOISE * noise), 1.0)
     reach = max(_MIN_REACH_SIGMA, min(math.sqrt(2.0 * math.log(ratio)), _MAX_REACH_SIGMA))
@@ -95,7 +97,7 @@ def _ring_statistics(
 ) -> tuple[float, float]:
     """Mean of the middle half, and standard deviation from the quartiles, of pixels on a ring around a window.
 
-    The sky's slopes along x and y are subtracted first.
+    The slopes of the sky along x and y are subtracted first.
     """
     height, width = image.shape
     count = 0
@@ -130,7 +132,7 @@ def _saturated_patch(
     stack: Indices32,
     patch: Array,
 ) -> bool:
-    """Follow the connected saturated pixels from (x, y); False if there are too many, or too far, for a star.
+    """Follow the connected saturated pixels from (x, y); False if they are too many or too far for a star.
 
     Fills `patch` (7,) with their mean column and row, half their larger extent, and their first and last column and
     row. `seen` is workspace of (2·PATCH_REACH + 1)².
@@ -167,7 +169,7 @@ def _saturated_patch(
 
 @compiled_ieee
 def _in_patches(column: int, row: int, patches: Array, count: int) -> bool:
-    """Whether a pixel lies in the bounding box of an earlier patch."""
+    """Whether a pixel is in the bounding box of an earlier patch."""
     for k in range(count):
         if patches[k, 3] <= column <= patches[k, 4] and patches[k, 5] <= row <= patches[k, 6]:
             return True
@@ -180,7 +182,7 @@ def _sky_under(
 ) -> tuple[float, float]:
     """Sky and noise under a star, from its ring (NaN if there is none) and from the grid of blocks.
 
-    The grid has the smaller error; the ring is used where they disagree, as in glare or near a bright limb.
+    The grid has the smaller error; the ring is used if they disagree, as in stray light or near a bright limb.
     """
     if spread != spread:
         return base, noise
@@ -195,7 +197,7 @@ def _sky_under(
 
 @compiled_ieee
 def _first_position(image: GreyImage, column: int, row: int, sky: float) -> tuple[float, float]:
-    """First guess of a star's position: one and a half times the centroid's offset in the 3 × 3 pixels about its peak."""
+    """Guess a star's position: 1.5 times the offset of the centroid of the 3 × 3 pixels around its peak."""
     height, width = image.shape
     if not (0 < column < width - 1 and 0 < row < height - 1):
         return float(column), float(row)
@@ -212,7 +214,7 @@ def _first_position(image: GreyImage, column: int, row: int, sky: float) -> tupl
 
 @compiled_ieee
 def _stands_alone(image: GreyImage, column: int, row: int, sky: float, noise: float) -> bool:
-    """Whether a pixel is bright and none of its neighbours has even an eighth of its light: a hot pixel."""
+    """Whether a pixel is hot: bright, with no neighbour as bright as an eighth of it."""
     height, width = image.shape
     peak = image[row, column] - sky
     if peak < _ALONE_SIGMA * noise:
@@ -228,7 +230,7 @@ def _stands_alone(image: GreyImage, column: int, row: int, sky: float, noise: fl
 def sky_under_lone_pixels(
     image: GreyImage, peaks: Indices32, level: Array32, noise: Array32, block: float, sky: Array
 ) -> None:
-    """Fill `sky` (n,) with the background under the peaks (n, 2) that are hot pixels, and NaN for the others."""
+    """Fill `sky` (n,) with the background under peaks (n, 2) that are hot pixels, and NaN for the others."""
     for k in range(peaks.shape[0]):
         column, row = peaks[k, 0], peaks[k, 1]
         x, y = float(column), float(row)
@@ -249,29 +251,29 @@ def lay_windows(
     flow: Array,
     windows: Array,
 ) -> int:
-    """Lay a window around every candidate.
+    """Define a window around every candidate.
 
     Parameters
     ----------
     image : ndarray (h, w)
         Counts.
     peaks : ndarray (n, 2)
-        Column and row of each candidate, the brightest first.
+        Column and row of each candidate, brightest first.
     flux : ndarray (n,)
-        First guess of their flux, counts.
+        First guess of the flux, counts.
     level, noise, block
-        Grid of the background, and the side of its blocks.
+        Background on its grid, and the side of a block.
     spot : (float, float, float)
-        Standard deviation of the spot, pixels; saturation and the typical noise of a pixel, counts.
+        Standard deviation of the spot, pixels; saturation and typical noise of a pixel, counts.
     flow : ndarray (5,)
         Flow of the trails (`starid.imaging.trail_flow`).
     windows : ndarray (n, WINDOW_COLUMNS)
-        Filled; COLUMNS marks candidates without a window and why.
+        Filled; COLUMNS of a candidate without a window is the reason.
 
     Returns
     -------
     int
-        Pixels in all windows together.
+        Number of pixels in all windows together.
     """
     height, width = image.shape
     sigma, saturation, typical_noise = spot
@@ -339,9 +341,9 @@ def lay_windows(
 def cut_windows(
     image: GreyImage, windows: Array, level: Array32, block: float, saturation: float, pixels: Array32
 ) -> None:
-    """Copy the windows' pixels minus the sky, one window after another; saturated ones become infinite.
+    """Copy the pixels of all windows, minus the sky; saturated ones become infinite.
 
-    The sky is a plane: `BASE` at the first guess of the star, sloped as the grid of blocks.
+    The sky is a plane: `BASE` at the first guess of the star, with the slopes of the grid.
     """
     position = 0
     for k in range(windows.shape[0]):

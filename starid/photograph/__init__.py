@@ -1,1 +1,1 @@
-"""Identification of photographs by any camera: the field may be unknown, the calibration is found."""
+"""Solving photographs by any camera: the field of view may be unknown, and the lens is calibrated."""

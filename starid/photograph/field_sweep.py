@@ -1,4 +1,4 @@
-"""Identification of photographs without a known field of view: one approximate field after another."""
+"""Solving photographs with an unknown field of view by trying one approximate field after another."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ from starid.solution import Reason
 FIELDS_DEG: Final = tuple(
     FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21, 22, 23)
 )
-"""Widths of the square fields tried, each within `TOLERANCE`: 5° to 66°, the common ones first."""
+"""Widths of the square fields tried, each within `TOLERANCE`: 5° to 66°, common ones first."""
 
 TOLERANCE: Final = 0.1
 
 
 class FieldSweep:
-    """Identification of images of one size without their field of view; what is made for one image serves the next.
+    """Solver for images of one size with an unknown field of view; its indices are reused.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class FieldSweep:
         self._searches: dict[Camera, RoughSearch] = {}
 
     def _search(self, camera: Camera) -> RoughSearch:
-        """Search for a field about as wide as a camera's; made when first needed."""
+        """Return the search for a field about as wide as a camera's, made when first needed."""
         if camera not in self._searches:
             self._searches[camera] = RoughSearch(camera, self._catalog, fov_tolerance=TOLERANCE)
         return self._searches[camera]
@@ -58,21 +58,21 @@ class FieldSweep:
         settings: DetectionSettings | None = None,
         observer_velocity: ArrayLike | None = None,
     ) -> ImageSolution:
-        """Find the stars on an image, and the attitude and field of view of its camera.
+        """Find the stars in an image, and the attitude and field of view of its camera.
 
         Parameters
         ----------
         image : ndarray (h, w) of uint8 or uint16
-            Grey.
+            The image.
         settings : DetectionSettings, optional
-            For the detection.
+            Settings of the detection.
         observer_velocity : array (3,), optional
-            As in `starid.interface.StarIdentifier.identify`.
+            See `starid.interface.StarIdentifier.identify`.
 
         Raises
         ------
         StaridError
-            The image is invalid for detection.
+            The image is not valid for detection.
         """
         begin = time.perf_counter()
         first: ImageSolution | None = None
@@ -104,14 +104,14 @@ def solve_any_field(
     settings: DetectionSettings | None = None,
     observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
-    """Solve one image by a `FieldSweep`.
+    """Solve one image with a `FieldSweep`.
 
     Parameters
     ----------
     image, settings, observer_velocity
-        As in `FieldSweep.solve`.
+        See `FieldSweep.solve`.
     catalog, model
-        As in `FieldSweep`.
+        See `FieldSweep`.
     """
     height, width = image.shape
     return FieldSweep(width, height, catalog, model=model).solve(image, settings, observer_velocity)

@@ -1,8 +1,8 @@
 """Identification for a camera with an approximate field of view and an unknown lens.
 
-The search makes several attempts, from cheap to expensive: with all detections, or with the brightest of each cell of
-the image, so that a tree line, lettering or a nebula counts only by its area; without distortion, or with barrel or
-pincushion distortion; with few or many triangles.
+The search makes several attempts, from cheap to expensive: with all detections, or with the brightest of each
+cell of the image, so that trees, lettering or a nebula count only by their area; without distortion, or with
+barrel or pincushion distortion; with few or many triangles.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ from starid.photograph.typical_camera import typical_camera
 from starid.solution import Reason, Solution
 
 DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
-"""Relative displacements at the corner of the image of the lenses tried."""
+"""Relative displacement of the corner of the image, for each lens tried."""
 
 TRIANGLES: Final = (100, 100, 1000, 5000)
-"""Triangles looked up in each round; the first one has narrow windows, and it and the last one no distortions."""
+"""Triangles looked up in each round; the first has narrow windows, the first and last no distortion."""
 
 ALL_ROUNDS: Final = range(len(TRIANGLES))
 
 SIZE_PX: Final = 1000.0
-"""Side of the square image for which the windows are defined; they scale with the image."""
+"""Side of the image for which the windows are defined; they scale with the side."""
 
 CELLS: Final = 60
-"""Approximate number of cells of the image for an even choice of detections."""
+"""Approximate number of cells of the image for an even selection of detections."""
 
 NARROWEST_DEG: Final = 1.0
-"""Narrowest field: a square one of this width has three stars of Hipparcos on average."""
+"""Narrowest field, degrees: a square one has three Hipparcos stars on average."""
 
 MAX_AT_ONCE: Final = 500
-"""Most detections used in one attempt."""
+"""Largest number of detections used in one attempt."""
 
 WINDOW_PX: Final = 20.0
 """Widest first matching window."""
 
 MAX_FALSE: Final = 1e-7
-"""Bound on the probability of a false solution of each attempt; there are several dozens."""
+"""Bound on the probability of a false solution per attempt; there are several dozen attempts."""
 
 _STRICT: Final = Effort(max_false_probability=MAX_FALSE)
 _LENIENT: Final = Effort(
@@ -69,12 +69,12 @@ class _Attempt(NamedTuple):
 
 
 class RoughSearch:
-    """Lost in space for a camera with a rough field of view and an unknown lens.
+    """Lost-in-space search for a camera with an approximate field of view and an unknown lens.
 
     Parameters
     ----------
     camera : Camera
-        Size, model and approximate focal length; if it has distortion, no other is tried.
+        Size, model and approximate focal length; if it has distortion, only that is tried.
     catalog : StarCatalog
         The stars.
     fov_tolerance : float
@@ -103,16 +103,16 @@ class RoughSearch:
 
     @property
     def identifier(self) -> Identifier:
-        """Identifier for the nominal camera, with the index that the search uses."""
+        """Identifier for the nominal camera that shares the index of the search."""
         return self._first
 
     def identify(self, xy_px: ArrayLike, flux: ArrayLike, *, rounds: Sequence[int] = ALL_ROUNDS) -> Solution:
-        """Find attitude and camera; invalid, with the reason, where every attempt fails.
+        """Find the attitude and the camera; invalid, with the reason, if every attempt fails.
 
         Parameters
         ----------
         xy_px, flux
-            As in `Identifier.identify`.
+            See `Identifier.identify`.
         rounds : sequence of int
             Rounds to run, as indices of `TRIANGLES`.
         """
@@ -144,10 +144,10 @@ class RoughSearch:
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
 
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
-        """All attempts, the cheap ones first."""
+        """Yield all attempts, cheap ones first."""
         brightest = np.argsort(-flux, kind="stable")
         choices = [brightest[:MAX_AT_ONCE]]
-        choices += [even_choice(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
+        choices += [even_selection(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
         known_lens = any(self._first.camera.distortion)
         for number in rounds:
             plain = known_lens or number in (ALL_ROUNDS[0], ALL_ROUNDS[-1])
@@ -158,7 +158,7 @@ class RoughSearch:
                     yield _Attempt(rows, distortion, effort)
 
     def _scaled(self, effort: Effort) -> Effort:
-        """Effort with its windows scaled to the size of the image."""
+        """Scale the windows of an effort to the size of the image."""
         return dataclasses.replace(
             effort,
             tolerance_px=effort.tolerance_px * self._scale,
@@ -167,19 +167,19 @@ class RoughSearch:
         )
 
 
-def even_choice(xy: Array, brightest: NDArray[np.intp], camera: Camera, depth: int) -> NDArray[np.intp]:
-    """Rows of the `depth` brightest detections of each cell of the image.
+def even_selection(xy: Array, brightest: NDArray[np.intp], camera: Camera, depth: int) -> NDArray[np.intp]:
+    """Select the `depth` brightest detections in each cell of the image.
 
     Parameters
     ----------
     xy : ndarray (n, 2)
         Positions, pixels.
     brightest : ndarray (n,)
-        Rows by falling flux.
+        Rows, sorted by decreasing flux.
     camera : Camera
-        Its width and height equal the image's.
+        A camera of the same width and height as the image.
     depth : int
-        Detections of each cell.
+        Number of detections per cell.
     """
     side = math.sqrt(camera.width * camera.height / CELLS)
     columns = math.ceil(camera.width / side)
@@ -194,7 +194,7 @@ def even_choice(xy: Array, brightest: NDArray[np.intp], camera: Camera, depth: i
 
 
 def distorted(camera: Camera, displacement: float) -> Camera:
-    """Camera of the same field of view whose distortion displaces the image's corner by a share of its radius."""
+    """Camera with the same field, and distortion that displaces the corner by a share of its radius."""
     if displacement == 0.0:
         return camera
     corner = 0.5 * math.hypot(camera.width, camera.height) / camera.focal_px[0]

@@ -1,8 +1,8 @@
 """Self-calibration from the stars of several images and an approximate field of view.
 
-Each image is identified with the start camera, whose focal length may be off by the tolerance, and the matches calibrate
-the camera. With it the catalogue stars in the field are matched again, which adds those in the corners, until nothing
-changes.
+Each image is identified with the start camera, whose focal length may be off by the tolerance, and the
+matches calibrate the camera. With the calibrated camera the catalogue stars in the field are matched again,
+which adds stars in the corners, until nothing changes.
 """
 
 from __future__ import annotations
@@ -39,11 +39,13 @@ MODELS: Final[tuple[tuple[str, ...], ...]] = (
     DEFAULT_ESTIMATE,
     ("aspect", *DEFAULT_ESTIMATE[1:]),
 )
-"""Sets of free parameters; the default calibration selects the one that the images justify."""
+"""Sets of free parameters, from which the default calibration chooses the one that the images justify."""
 
 IMAGE_MODELS: Final[tuple[tuple[str, ...], ...]] = (("focal",), ("focal", "k1"), ("focal", "k1", "k2"))
-"""Sets of free parameters for one image of an unknown camera: in a narrow field the optical axis is degenerate with the
-attitude, and stays at the image's centre."""
+"""Sets of free parameters for a single image by an unknown camera.
+
+The centre is fixed: in a narrow field it is degenerate with the attitude.
+"""
 
 _ROUNDS: Final = 4
 _WINDOW_SIGMAS: Final = 5.0
@@ -54,7 +56,7 @@ _BLEND_PX: Final = 2.0
 
 
 class Stars(NamedTuple):
-    """Detections of one frame: positions (n, 2) px, fluxes (n,), errors (n,) or (n, 2) px or None."""
+    """Detections in one frame: positions (n, 2) px, fluxes (n,), errors (n,) or (n, 2) px or None."""
 
     xy_px: Array
     flux: Array
@@ -63,18 +65,18 @@ class Stars(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SelfCalibration:
-    """A calibration and the images that it is based on.
+    """A calibration and the frames on which it is based.
 
     Attributes
     ----------
     calibration : Calibration
         Camera, covariance and residuals.
     frame_index : tuple of int
-        Images that were identified and used, in the order of `calibration.attitudes`.
+        Frames that were identified and used, in the order of `calibration.attitudes`.
     matches : tuple of ndarray (m, 2), int64
-        Detection index and HIP of every matched pair of each of these images.
+        Detection index and HIP of the matched pairs, for each of these frames.
     unidentified : dict of int to str
-        Reason by image, for those that could not be identified.
+        Reason for each frame that could not be identified.
     """
 
     calibration: Calibration
@@ -92,31 +94,31 @@ def self_calibrate(
     estimate: Sequence[str] | None = None,
     models: Sequence[tuple[str, ...]] = MODELS,
 ) -> SelfCalibration:
-    """Identify images and estimate the camera that took them.
+    """Identify frames and estimate the camera that took them.
 
     Parameters
     ----------
     frames : sequence of Stars
-        Detections of each frame.
+        Detections in each frame.
     camera : Camera
         Start value: size, model and approximate focal length.
     catalog : StarCatalog, optional
-        By default the whole of Hipparcos at its default epoch.
+        By default all of Hipparcos at its default epoch.
     fov_tolerance : float
         Relative uncertainty of the start camera's focal length.
     estimate : sequence of str, optional
         Free parameters (see `starid.calibration.GROUPS`); by default the set of `models` with the least
-        Bayesian information criterion.
+        Bayesian information criterion (BIC).
     models : sequence of tuple of str
         Sets to choose from when `estimate` is not given.
 
     Raises
     ------
     StaridError
-        No image could be identified, or `calibrate` fails.
+        No frame could be identified, or `calibrate` fails.
     """
     if not frames:
-        raise StaridError("calibration: no frames; at least one image with stars is needed")
+        raise StaridError("calibration: no frames; at least one with stars is needed")
     if estimate is not None:
         check_estimate(estimate)
     sky = load_catalog() if catalog is None else catalog
@@ -148,21 +150,21 @@ def calibrate_identified(
     estimate: Sequence[str] | None = None,
     models: Sequence[tuple[str, ...]] = MODELS,
 ) -> SelfCalibration:
-    """Estimate the camera that took frames of which some are identified.
+    """Estimate the camera from frames of which some are identified.
 
     Parameters
     ----------
     frames : sequence of Stars
-        Detections of each frame.
+        Detections in each frame.
     solutions : mapping of int to Solution
-        Valid solutions by frame, at least one; the first one's camera, if it has one, is where the
-        adjustment starts.
+        Valid solutions by frame, at least one. The adjustment starts with the camera of the first one, if it
+        has one.
     camera : Camera
-        The camera that the frames were identified with.
+        The camera with which the frames were identified.
     sky : StarCatalog
-        The catalogue whose rows `catalog_index` of the solutions refers to.
+        The catalogue to whose rows `catalog_index` in the solutions refers.
     estimate, models
-        As in `self_calibrate`.
+        See `self_calibrate`.
 
     Raises
     ------
@@ -203,13 +205,13 @@ def calibrate_identified(
         before = result
         start = dataclasses.replace(camera, focal_px=result.camera.focal_px)
         result = _best(again, start, models) if estimate is None else calibrate(again, start, estimate)
-        if _map_alike(before, result):
+        if _maps_equally(before, result):
             break
     return SelfCalibration(result, indices, matches, {})
 
 
 def _floored_sigma(stars: Stars) -> Array | None:
-    """Errors of the positions, with a floor for systematic errors of the detection."""
+    """Position errors, with a floor for systematic errors of the detection."""
     if stars.xy_sigma_px is None:
         return None
     floored: Array = np.hypot(stars.xy_sigma_px, _SIGMA_FLOOR_PX)
@@ -230,7 +232,7 @@ def _frame(
 def _paired(
     stars: Stars, camera: Camera, attitude: Attitude, sky: StarCatalog, sigma_px: float
 ) -> tuple[Indices, Indices]:
-    """Pair detections and catalogue stars that are each other's nearest, within a window: indices of both (m,)."""
+    """Pair detections and catalogue stars that are mutual nearest neighbours in a window; indices (m,)."""
     near = sky.in_cone(attitude.boresight, camera.field_radius_rad * 1.02)
     xy, inside = camera.project(attitude.to_sensor(sky.vectors[near]))
     near, xy = near[inside], xy[inside]
@@ -249,7 +251,7 @@ def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:
 
 
 def _affordable_model(frames: Sequence[CalibrationFrame], model: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the model, or the focal length alone where there are too few stars for the model."""
+    """Return the model, or the focal length alone if there are too few stars for the model."""
     equations = 2 * sum(len(frame.xy_px) for frame in frames)
     return model if equations > 2 * _unknowns(model, frames) else ("focal",)
 
@@ -257,7 +259,7 @@ def _affordable_model(frames: Sequence[CalibrationFrame], model: tuple[str, ...]
 def _best(
     frames: list[CalibrationFrame], camera: Camera, candidates: Sequence[tuple[str, ...]]
 ) -> Calibration:
-    """Calibrate with each model and keep that with the least Bayesian information criterion.
+    """Calibrate with each model and keep the one with the lowest Bayesian information criterion.
 
     Models that fail are skipped; the last error is raised only if all of them fail.
     """
@@ -275,7 +277,7 @@ def _best(
 def _calibrations(
     frames: Sequence[CalibrationFrame], camera: Camera, models: Sequence[tuple[str, ...]]
 ) -> Iterator[tuple[tuple[str, ...], Calibration]]:
-    """Calibrate with one model after another and yield those that succeed; raise the last error if none does."""
+    """Calibrate with each model and yield the successes; raise the last error if all fail."""
     last_error: StaridError | None = None
     held = 0
     for model in models:
@@ -291,7 +293,7 @@ def _calibrations(
 
 
 def _variance_factor(result: Calibration, frames: Sequence[CalibrationFrame]) -> float:
-    """Mean square of the residuals of the used stars on one axis, in units of the stars' variances."""
+    """Mean square of the residuals of the used stars on one axis, in units of their variances."""
     weights = [
         frame.axis_sigmas[used].ravel() ** -2.0 for frame, used in zip(frames, result.used, strict=True)
     ]
@@ -299,7 +301,7 @@ def _variance_factor(result: Calibration, frames: Sequence[CalibrationFrame]) ->
 
 
 def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], variance: float) -> float:
-    """Sum of squared residuals in units of `variance` times the stars' own variances, each star's share bounded."""
+    """Sum of bounded squared residuals, in units of `variance` times the variance of each star."""
     total = 0.0
     for residual, frame in zip(result.residual_px, frames, strict=True):
         squares = ((residual / frame.axis_sigmas) ** 2).sum(axis=1) / variance
@@ -307,8 +309,8 @@ def _misfit(result: Calibration, frames: Sequence[CalibrationFrame], variance: f
     return total
 
 
-def _map_alike(first: Calibration, second: Calibration) -> bool:
-    """Whether two calibrations map the image alike to a thousandth of a pixel."""
+def _maps_equally(first: Calibration, second: Calibration) -> bool:
+    """Whether two calibrations map the image to within a thousandth of a pixel of each other."""
     if first.estimated != second.estimated:
         return False
     grid = second.camera.border(9)

@@ -25,10 +25,10 @@ from starid.solution import Reason, Solution
 _log = logging.getLogger(__name__)
 
 _FEW: Final = 8
-"""Least number of matched stars for the estimation of the lens."""
+"""Smallest number of matched stars for estimating the lens."""
 
 _ROUNDS: Final = ((ALL_ROUNDS[:2], None), (ALL_ROUNDS[2:3], 4), (ALL_ROUNDS[3:], 1))
-"""Rounds of the search, and the number of views they are run on; None for all views, which the first entry makes."""
+"""Rounds of the search, and the number of views for each; None for all views, made by the first entry."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +40,13 @@ class ImageSolution:
     solution : Solution
         Attitude and matches; indices refer to `detections` and the catalogue.
     detections : Detections
-        All stars found on the image.
+        All stars found in the image.
     camera : Camera
         The camera, or its estimate from this image.
     stars : StarCatalog
-        Catalogue stars as the camera resolves them, with aberration where it was corrected.
+        Catalogue stars as the camera resolves them, aberrated if aberration was corrected.
     mirrored : bool
-        The image shows the sky mirrored; attitude, camera and detections are those of the image flipped left
-        to right.
+        The image is a mirror image; attitude, camera and detections refer to the image flipped left to right.
     """
 
     solution: Solution
@@ -70,29 +69,29 @@ def solve_image(
     settings: DetectionSettings | None = None,
     observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
-    """Find the stars on an image and the attitude of the camera.
+    """Find the stars in an image and the attitude of the camera.
 
     Parameters
     ----------
     image : ndarray (h, w) of uint8 or uint16
-        Grey.
+        The image.
     camera : Camera, optional
         By default `DEFAULT_CAMERA`.
     catalog : StarCatalog, optional
-        By default the whole of Hipparcos at its default epoch.
+        By default all of Hipparcos at its default epoch.
     fov_tolerance : float
-        Relative uncertainty of the camera's field of view. If it is not 0, the image may come from any camera:
-        focal length and, with enough stars, distortion are estimated from it, and other views are tried where
-        the plain one fails (`starid.photograph.views`, `starid.photograph.rough_search`).
+        Relative uncertainty of the camera's field of view. If it is not 0, the image may come from any
+        camera: focal length and, with enough stars, distortion are estimated from it, and other views are
+        tried if the plain one fails (`starid.photograph.views`, `starid.photograph.rough_search`).
     settings : DetectionSettings, optional
-        For the detection.
+        Settings of the detection.
     observer_velocity : array (3,), optional
-        As in `starid.interface.StarIdentifier.identify`.
+        See `starid.interface.StarIdentifier.identify`.
 
     Raises
     ------
     StaridError
-        The image does not have the camera's size, or is invalid for detection.
+        The image does not have the size of the camera, or is not valid for detection.
     """
     nominal = DEFAULT_CAMERA if camera is None else camera
     height, width = image.shape[:2]
@@ -147,7 +146,7 @@ def refine_solution(
     begin: float,
     observer_velocity: ArrayLike | None = None,
 ) -> ImageSolution:
-    """Estimate the lens from the matched stars, where they suffice, and refine the solution with it.
+    """Estimate the lens from the matched stars, if there are enough, and refine the solution with it.
 
     Parameters
     ----------
@@ -162,7 +161,7 @@ def refine_solution(
     begin : float
         Value of the performance counter at the start.
     observer_velocity : array (3,), optional
-        As in `starid.interface.StarIdentifier.identify`.
+        See `starid.interface.StarIdentifier.identify`.
     """
     identifier = search.identifier
     found = view.detections
@@ -185,7 +184,7 @@ def refine_solution(
 def _refined(
     stars: Stars, solution: Solution, found: Camera, nominal: Camera, catalog: StarCatalog
 ) -> Camera:
-    """Camera calibrated on an identified image; `found` where the calibration fails."""
+    """Calibrate the camera on an identified image; return `found` if that fails."""
     try:
         outcome = calibrate_identified([stars], {0: solution}, nominal, catalog, models=IMAGE_MODELS)
     except StaridError as error:

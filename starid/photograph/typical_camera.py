@@ -9,20 +9,21 @@ from starid.camera import Camera
 from starid.geometric.pattern_index import field_solid_angle
 
 FIELD_STEP: Final = 1.2
-"""Ratio of the sides of two neighbouring typical fields."""
+"""Ratio of the widths of two adjacent typical fields."""
 
 WIDTHS_PX: Final = (500, 1000, 2000)
-"""Sides of the typical images: the index merges doubles that the pixels of the image cannot resolve."""
+"""Sides of the typical images; they determine which doubles the index merges."""
 
 WIDEST_SR: Final = 1.5
-"""Fields beyond this solid angle differ too much by the lens: each gets a separate index."""
+"""Largest solid angle of a typical field; wider lenses differ too much and get an index each."""
 
 
 def typical_camera(camera: Camera) -> Camera | None:
-    """Camera with a square image of a rounded size whose index suits a camera; None for the widest fields.
+    """Camera with a square image of a rounded size to share an index with; None for the widest fields.
 
-    Its pixels are no finer than the camera's, so that the index covers the camera's matching windows. Only for images
-    smaller than about 590 pixels are they finer; the windows are then limited to those of the index.
+    Its pixels are no finer than the pixels of the given camera, so that the index covers that camera's
+    matching windows. They are finer only for images smaller than about 590 pixels, whose windows are then
+    limited to those of the index.
     """
     area = field_solid_angle(camera)
     if not area < WIDEST_SR:

@@ -1,8 +1,8 @@
 """Preprocessed views of a photograph of unknown origin, the plain one first.
 
-Detection expects a star sensor's image: round spots of a pixel or two on a smooth, dark sky. A photograph may be out of
-focus, grainy or compressed, show nebulae or twilight, or be a negative or mirrored. Each view compensates for one of
-these; positions always refer to the image itself.
+Detection expects an image from a star sensor: round spots a pixel or two wide on a smooth, dark sky. A
+photograph may be out of focus, grainy or compressed, show nebulae or twilight, or be a negative or mirrored.
+Each view compensates for one of these; positions always refer to the original image.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from starid.arrays import GreyImage
 from starid.imaging.detection import Detections, DetectionSettings, detect
 
 MAX_STARS: Final = 2000
-"""Most detections of each view."""
+"""Largest number of detections in a view."""
 
 FACTORS: Final = (2, 4)
-"""Pixels along each axis that are averaged for the coarser views."""
+"""Number of pixels averaged along each axis for the coarser views."""
 
 MIN_SIDE_PX: Final = 180
-"""Least side of a coarser view."""
+"""Smallest side of a coarser view."""
 
 _FAR_SIGMAS: Final = 4.0
 _LONGER: Final = 2
@@ -31,21 +31,21 @@ _MAD_TO_SIGMA: Final = 1.4826
 
 
 class View(NamedTuple):
-    """Detections of one view, and whether their positions must be mirrored left to right."""
+    """Detections in one view, and whether to mirror their positions left to right."""
 
     detections: Detections
     mirrored: bool = False
 
 
 def views(image: GreyImage, settings: DetectionSettings | None = None) -> Iterator[View]:
-    """Detect stars on the image as it is, on its negative, on coarser images, and mirrored.
+    """Detect stars in the image, its negative, coarser versions and its mirror image.
 
     Parameters
     ----------
     image : ndarray (h, w) of uint8 or uint16
-        Grey.
+        The image.
     settings : DetectionSettings, optional
-        For the detection; by default `max_stars` is `MAX_STARS`.
+        Settings of the detection; by default `max_stars` is `MAX_STARS`.
     """
     chosen = settings or DetectionSettings(max_stars=MAX_STARS)
     plain = detect(image, chosen)
@@ -68,9 +68,9 @@ def has_dark_tail(image: GreyImage) -> bool:
 
 
 def _coarser(image: GreyImage, factor: int, settings: DetectionSettings) -> Detections:
-    """Detections on the means of blocks of pixels, in the pixels and counts of the image itself.
+    """Detect stars in an image of block means; positions and counts refer to the original image.
 
-    The noise per pixel assumes that the noise of different pixels is independent.
+    The noise per pixel is computed as if the noise of different pixels were independent.
     """
     height, width = (side // factor * factor for side in image.shape)
     blocks = image[:height, :width].reshape(height // factor, factor, width // factor, factor)

@@ -1,1 +1,1 @@
-"""The identification stack of the thesis: features, database, LSI, FSF, CME, RSI and its simulator."""
+"""The identification algorithms of the thesis: features, database, LSI, FSF, CME and RSI; its simulator."""

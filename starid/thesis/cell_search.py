@@ -1,10 +1,10 @@
-"""Nearest neighbours among the stored feature vectors of a database, exactly, in microseconds.
+"""Exact nearest neighbours among the stored feature vectors of a database, in microseconds.
 
-The 8-bit vectors are sorted into the buckets of an implicit binary tree: each level halves the rank of one feature,
-so that a bucket is a prefix of interleaved bits and the tree needs no nodes. A search descends it depth first and cuts
-every branch whose box is farther than the best found. Full-precision answers come from the same tree: a stored code
-gives each feature to half a step, so that a cell can be passed over unless its box comes nearer than the best exact
-distance; only what is left is computed from the stars.
+The 8-bit vectors are sorted into the buckets of an implicit binary tree: each level halves the rank of one
+feature, so that a bucket is a prefix of interleaved bits and the tree needs no nodes. A search descends depth
+first and prunes every branch whose box is farther than the best vector found. Full-precision results use the
+same tree. A stored code determines a feature to within half a step, so a cell is skipped unless its box is
+nearer than the best exact distance; only the remaining cells are computed from the stars.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from starid.arrays import Array, Indices, Indices32
 from starid.jit import compiled
 from starid.thesis.database import CODE_MAX, FeatureDatabase
 from starid.thesis.features import FEATURE_COUNT
-from starid.thesis.frame_grid import GridArrays, cell_place
+from starid.thesis.frame_grid import GridArrays, cell_centre
 from starid.thesis.frame_sky import SkyArrays, cell_features
 
 MAX_DEPTH: Final = 22
-"""Most levels of the tree: four million buckets."""
+"""Largest number of levels of the tree: four million buckets."""
 
 BINS_PER_FEATURE: Final = 32
-"""Ranks that a feature is cut into at most."""
+"""Largest number of ranks per feature."""
 
 _CELLS_PER_BUCKET: Final = 4
 _SCAN: Final = 24
@@ -40,15 +40,15 @@ class CellIndex(NamedTuple):
     Attributes
     ----------
     codes
-        Stored vectors, (m, 5) uint8, in tree order; cells without stars are left out.
+        Stored vectors, (m, 5) uint8, in tree order; without cells that hold no star.
     cells
-        Cell of each, (m,) int32.
+        Cell of each vector, (m,) int32.
     start
         First vector of each bucket, (2^depth + 1,) int32.
     low, high
-        Least code at or above, and greatest code at or below, each rank of each feature, (5, 32).
+        Smallest code at or above, and largest code at or below, each rank of each feature, (5, 32).
     depth
-        Levels of the tree.
+        Number of levels of the tree.
     """
 
     codes: NDArray[np.uint8]
@@ -69,7 +69,7 @@ class CellArrays(NamedTuple):
 
 
 def cell_arrays(database: FeatureDatabase) -> CellArrays:
-    """Gather the arrays of a database."""
+    """Collect the arrays of a database."""
     return CellArrays(database.sky.arrays, database.grid.arrays, database.minimum, database.scale)
 
 
@@ -112,7 +112,7 @@ def _fill_buckets(
 
 
 def make_cell_index(database: FeatureDatabase) -> CellIndex:
-    """Sort the stored vectors of a database into the buckets of the tree (a tenth of a second for five million)."""
+    """Sort the stored vectors of a database into the buckets of the tree (0.1 s for five million)."""
     codes, theta = database.features, database.theta
     filled = int(np.count_nonzero(theta != CODE_MAX))
     levels = math.ceil(math.log2(max(filled / _CELLS_PER_BUCKET, 2.0)))
@@ -141,7 +141,7 @@ def make_cell_index(database: FeatureDatabase) -> CellIndex:
 
 @compiled
 def _box_distance(index: CellIndex, prefix: int, level: int, query: Array, slack: float) -> float:
-    """Squared distance in code steps from the query to the box of a branch, less the slack on each side."""
+    """Squared distance, in code steps, from the query to the box of a branch, minus the slack per side."""
     total = 0.0
     for feature in range(5):
         bits = (level - feature + 4) // 5
@@ -170,7 +170,7 @@ def _push_children(
     stack: Array,
     top: int,
 ) -> int:
-    """Push the halves of a branch that hold vectors within the limit, the nearer one last; return the new top."""
+    """Push the halves of a branch that are within the limit, the nearer one last; return the new top."""
     rest = index.depth - level - 1
     left = 2 * prefix
     distances = (math.inf, math.inf)
@@ -192,7 +192,7 @@ def _push_children(
 
 @compiled
 def _sift_down(distances: Array, cells: Indices, size: int) -> None:
-    """Restore the heap (greatest distance, then greatest cell, on top) after its top was replaced."""
+    """Restore the heap (largest distance, then largest cell, on top) after its top was replaced."""
     at = 0
     while True:
         child = 2 * at + 1
@@ -210,9 +210,9 @@ def _sift_down(distances: Array, cells: Indices, size: int) -> None:
 
 @compiled
 def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: Indices) -> None:
-    """Find the k stored vectors nearest to the query, as the arrays are long, in no particular order.
+    """Find the k stored vectors nearest to the query, in no particular order.
 
-    Of equal distances the lower cell is taken. Places that are not filled keep an infinite distance and cell −1.
+    At equal distances the lower cell is taken. Unfilled entries have an infinite distance and cell −1.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
     query
         Observation in code steps (normalised value / 100 · 255), (5,).
     distances, cells
-        Output (k,): squared distance in code steps, cell.
+        Output (k,): squared distance in code steps, and cell.
     """
     size = cells.size
     for i in range(size):
@@ -254,8 +254,8 @@ def stored_neighbours(index: CellIndex, query: Array, distances: Array, cells: I
 
 @compiled
 def exact_vector(arrays: CellArrays, cell: int, sums: Array, out: Array) -> float:
-    """Write the normalised features of a cell in full precision to `out`; return its polar angle in radians."""
-    ra, dec = cell_place(arrays.grid, cell)
+    """Write the normalised full-precision features of a cell to `out`; return its polar angle in radians."""
+    ra, dec = cell_centre(arrays.grid, cell)
     theta = cell_features(arrays.sky, ra % 360.0, dec, sums, out)
     for f in range(5):
         out[f] = (out[f] - arrays.minimum[f]) * arrays.scale[f]
@@ -264,16 +264,16 @@ def exact_vector(arrays: CellArrays, cell: int, sums: Array, out: Array) -> floa
 
 @compiled
 def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, found: Array) -> int:
-    """Find the cell whose features in full precision are nearest to the observation; −1 in an empty database.
+    """Find the cell whose full-precision features are nearest to the observation; −1 in an empty database.
 
     Parameters
     ----------
     index, arrays
-        Of the same database.
+        Index and arrays of the same database.
     observation
         Normalised observation, (5,).
     found
-        Output (2,): the distance on the normalised scale, and how many cells had to be computed from the stars.
+        Output (2,): the distance on the normalised scale, and the number of cells computed from the stars.
     """
     query = observation * 2.55
     distances = np.empty(1)
@@ -321,7 +321,7 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
 
 @compiled
 def _exact_distance(arrays: CellArrays, cell: int, observation: Array, sums: Array, vector: Array) -> float:
-    """Squared distance in code steps between the observation and a cell in full precision."""
+    """Squared distance, in code steps, between the observation and the full-precision features of a cell."""
     exact_vector(arrays, cell, sums, vector)
     total = 0.0
     for f in range(5):

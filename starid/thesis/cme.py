@@ -1,7 +1,7 @@
-"""Camera motion between two frames: a transformation of the matched stars, by maximum likelihood (MLESAC).
+"""Camera motion between two frames, fitted to the matched stars by maximum likelihood (MLESAC).
 
-The thesis fits an affine transformation, which has six degrees of freedom; a camera's motion has three, and the rigid
-transformation that is fitted unless asked otherwise uses the stars for these alone.
+The thesis fits an affine transformation, which has six degrees of freedom. The motion of a camera has three,
+so the default is a rigid transformation.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from starid.thesis.false_stars import FilterError, ObservedFrame
 MotionModel = Literal["rigid", "affine"]
 
 MAX_TRIALS: Final = 300
-"""Most pairs (affine: triples) of stars that hypotheses are drawn from; fewer pairs are all tried."""
+"""Largest number of hypotheses: random pairs (affine: triples) of stars, or all pairs if there are fewer."""
 
 LIKELY_FLOOR_DEG: Final = 1e-3
-"""Least standard deviation assumed of a star's displacement in the likelihood, degrees."""
+"""Smallest standard deviation of a star's displacement assumed in the likelihood, degrees."""
 
 _EM_ROUNDS: Final = 3
 _SEED: Final = 20_221_017
@@ -33,22 +33,22 @@ _IN_A_LINE: Final = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class CameraMotion:
-    """How the stars moved from the earlier frame to the later one.
+    """Motion of the stars from the earlier frame to the later one.
 
     Attributes
     ----------
     matrix
         Transformation matrix H, (3, 3), of homogeneous positions in degrees: c' = H·c, eq. 3.2.
     rotation_deg
-        Rotation angle γ̃ of its rotation matrix (eq. 3.12), of an affine one the rotation nearest to it, degrees.
+        Rotation angle γ̃ (eq. 3.12), degrees; for an affine transformation, of the nearest rotation matrix.
     translation_deg
         Translation ρ̃, (2,), degrees.
     mean_distance_deg
         Mean distance μ_d of the transformed stars from the stars, eq. 6.3, degrees.
     sigma_distance_deg
-        Standard deviation σ_d of these distances, degrees; eq. 6.4 prints the variance.
+        Standard deviation σ_d of these distances, degrees; eq. 6.4 is printed for the variance.
     inliers
-        Which of the matches the motion explains, (m,).
+        The matches that the motion explains, (m,).
     """
 
     matrix: Array
@@ -59,13 +59,13 @@ class CameraMotion:
     inliers: Mask
 
     def apply(self, positions: Array) -> Array:
-        """Where objects at these positions of the earlier frame are in the later one, (n, 2)."""
+        """Transform positions (n, 2) in the earlier frame to positions in the later one."""
         return np.asarray(positions @ self.matrix[:2, :2].T + self.matrix[:2, 2], dtype=np.float64)
 
 
 @compiled
 def _mean_positions(before: Array, now: Array, chosen: Mask, centre: Array) -> int:
-    """Fill in the mean positions (x, y before; x, y now) of the chosen stars; return how many there are."""
+    """Fill in the mean positions (x, y before; x, y now) of the chosen stars; return their number."""
     count = 0
     for i in range(chosen.size):
         if chosen[i]:
@@ -81,7 +81,7 @@ def _mean_positions(before: Array, now: Array, chosen: Mask, centre: Array) -> i
 
 @compiled
 def rigid_fit(before: Array, now: Array, chosen: Mask, motion: Array) -> bool:
-    """Least-squares rotation and translation of the chosen stars into `motion` (cos, sin, x, y); False below two."""
+    """Fit a rigid motion (cos, sin, x, y) to the chosen stars; False if there are fewer than two."""
     centre = np.zeros(4)
     if _mean_positions(before, now, chosen, centre) < 2:
         return False
@@ -108,7 +108,7 @@ def rigid_fit(before: Array, now: Array, chosen: Mask, motion: Array) -> bool:
 
 @compiled
 def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
-    """Least-squares affine transformation of the chosen stars into `matrix` (2, 3); False below three, or in a line."""
+    """Fit an affine transformation, `matrix` (2, 3), to the chosen stars; False if too few or collinear."""
     centre = np.zeros(4)
     if _mean_positions(before, now, chosen, centre) < _AFFINE_SAMPLE:
         return False
@@ -140,7 +140,7 @@ def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
 
 @compiled
 def fit(before: Array, now: Array, chosen: Mask, affine: bool, matrix: Array) -> bool:
-    """Least-squares transformation of the chosen stars, rigid or affine, into `matrix` (2, 3); False with too few."""
+    """Fit a rigid or affine transformation, `matrix` (2, 3), to the chosen stars; False if too few."""
     if affine:
         return affine_fit(before, now, chosen, matrix)
     motion = np.empty(4)
@@ -157,7 +157,7 @@ def fit(before: Array, now: Array, chosen: Mask, affine: bool, matrix: Array) ->
 
 @compiled
 def transform_distances(before: Array, now: Array, matrix: Array, distances: Array) -> None:
-    """Write the distance of each transformed star from where it was seen."""
+    """Fill in the distance of each transformed star from its observed position."""
     for i in range(distances.size):
         x = matrix[0, 0] * before[i, 0] + matrix[0, 1] * before[i, 1] + matrix[0, 2] - now[i, 0]
         y = matrix[1, 0] * before[i, 0] + matrix[1, 1] * before[i, 1] + matrix[1, 2] - now[i, 1]
@@ -166,9 +166,9 @@ def transform_distances(before: Array, now: Array, matrix: Array, distances: Arr
 
 @compiled
 def _negative_log_likelihood(distances: Array, sigma: float) -> float:
-    """Cost of a hypothesis: a mixture of a normal error and a uniform one, its share found by expectation maximisation.
+    """Cost of a hypothesis: a mixture of normal and uniform errors, its share found by EM.
 
-    It takes the place of the sum of distances below η of eq. 3.11, which MLESAC minimises in its simplest form.
+    It replaces the sum of distances below η of eq. 3.11, which MLESAC in its simplest form minimises.
     """
     share = 0.5
     wide = 1.0 / (_OUTLIER_SPAN_DEG * _OUTLIER_SPAN_DEG)
@@ -187,7 +187,7 @@ def _negative_log_likelihood(distances: Array, sigma: float) -> float:
 
 @compiled
 def _draw(stars: int, affine: bool, every: bool, trial: int, state: int, chosen: Mask) -> int:
-    """Choose the stars of a hypothesis, the next pair in order or some at random; return the generator's state."""
+    """Choose the stars of a hypothesis, in order or at random; return the state of the generator."""
     chosen[:] = False
     if every:
         first = 0
@@ -220,7 +220,7 @@ def mlesac(
     matrix: Array,
     inliers: Mask,
 ) -> bool:
-    """Find the transformation of greatest likelihood and refit it to its inliers; False if there is none.
+    """Find the most likely transformation and refit it to its inliers; False if there is none.
 
     Parameters
     ----------
@@ -229,13 +229,13 @@ def mlesac(
     threshold
         Distance η up to which a star is an inlier, degrees.
     trials
-        Most hypotheses; all pairs are tried if they are fewer.
+        Largest number of hypotheses; all pairs are tried if there are fewer.
     seed
-        Of the draws.
+        Seed of the random choices.
     affine
-        Fit an affine transformation to three stars or more, not a rigid one to two or more.
+        Fit an affine transformation (at least three stars) instead of a rigid one (at least two).
     matrix, inliers
-        Output: transformation (2, 3) and (m,).
+        Output: transformation (2, 3), and mask of inliers (m,).
     """
     m = before.shape[0]
     if m < (_AFFINE_SAMPLE if affine else 2):
@@ -284,16 +284,16 @@ def estimate_motion(
     Parameters
     ----------
     before, now
-        Positions of the same stars in the earlier and the later frame, (m, 2), degrees.
+        Positions of the same stars in the earlier and in the later frame, (m, 2), degrees.
     threshold_deg
         Distance η beyond which a match is an outlier.
     model
-        "rigid": rotation and translation. "affine": any 2×2 matrix and translation, as the thesis has it.
+        "rigid": rotation and translation. "affine": any 2×2 matrix and translation, as in the thesis.
 
     Raises
     ------
     FilterError
-        If there are fewer than two matches (affine: three), or all of them fall together (affine: in a line).
+        There are fewer than two matches (affine: three), or all coincide (affine: are collinear).
     """
     if model not in ("rigid", "affine"):
         raise FilterError(f"motion: model must be rigid or affine, not {model!r}")
@@ -329,7 +329,7 @@ def matched_motion(
     threshold_deg: float = 1.0,
     model: MotionModel = "rigid",
 ) -> CameraMotion | None:
-    """Estimate the camera motion from the matches (m, 2) of two frames; None where there are too few for it."""
+    """Estimate the camera motion from the matches (m, 2) of two frames; None if there are too few."""
     first, second = before.positions[matches[:, 0]], now.positions[matches[:, 1]]
     try:
         return estimate_motion(first, second, threshold_deg=threshold_deg, model=model)

@@ -1,8 +1,9 @@
-"""From a coarse boresight to matched stars: distances from the centre vote for the roll, then the stars are paired.
+"""From a coarse boresight to matched stars: the stars vote for the roll and are then paired.
 
-A cell of the database says where the boresight is to half a cell and nothing certain about roll. A star's distance from
-the centre does not change with roll, so that every pair of an observed and a catalogue star alike in that distance and
-in brightness votes for the roll between them. The true cell makes a peak that chance does not.
+A cell of the database gives the boresight to within half a cell, and no reliable roll. The distance of a star
+from the centre does not depend on roll, so every pair of an observed and a catalogue star with similar
+distance and brightness votes for the roll between them. The true cell has a peak that chance does not
+produce.
 """
 
 from __future__ import annotations
@@ -17,10 +18,10 @@ from starid.jit import compiled
 from starid.thesis.frame_sky import SkyArrays, stars_near
 
 MAX_STARS: Final = 256
-"""Most catalogue stars of a cell that are considered."""
+"""Largest number of catalogue stars considered per cell."""
 
 ROLL_BINS: Final = 180
-"""Bins of 2° that the votes for the roll fall into."""
+"""Number of bins, 2° wide, for the votes for the roll."""
 
 _REFITS: Final = 4
 _INNERMOST: Final = 4.0
@@ -36,20 +37,20 @@ def vote_roll(
     magnitude_gate: float,
     votes: Array,
 ) -> tuple[float, float]:
-    """Let the stars vote; return the best turn from catalogue to image in radians, and its votes.
+    """Find the rotation from catalogue to image with the most votes, radians; return it and its votes.
 
     Parameters
     ----------
     observed, polar
         Observed stars: x, y, magnitude (n, 3), and distance and angle from the centre (n, 2).
     near, count
-        Catalogue stars with north up as `stars_near` lists them.
+        Catalogue stars with north up, from `stars_near`.
     offset_px
-        Greatest error of the boresight, pixels.
+        Largest error of the boresight, pixels.
     magnitude_gate
-        Greatest difference of magnitudes.
+        Largest difference of magnitudes.
     votes
-        Work space (`ROLL_BINS`,).
+        Workspace (`ROLL_BINS`,).
     """
     votes[:] = 0.0
     width = 2.0 * math.pi / ROLL_BINS
@@ -85,9 +86,9 @@ def pair_stars(
     magnitude_gate: float,
     pairs: Indices,
 ) -> int:
-    """Pair observed and catalogue stars from a first turn on, refitting turn and shift; return the number of pairs.
+    """Pair observed and catalogue stars, refitting rotation and shift; return the number of pairs.
 
-    `pairs` (n, 2) receives the observed star and the place in `near`.
+    `pairs` (n, 2) receives the observed star and the index in `near`.
     """
     c, s, x, y = math.cos(turn), math.sin(turn), 0.0, 0.0
     found = 0
@@ -146,7 +147,7 @@ def next_candidate(
     settings: Array,
     matched: Indices,
 ) -> tuple[int, int]:
-    """Find the next boresight from place `start` on that the stars vote for; return its place (−1: none) and pairs.
+    """Find the next candidate, from `start` on, with enough votes; return its index or −1, and its pairs.
 
     Parameters
     ----------
@@ -157,10 +158,10 @@ def next_candidate(
     candidates
         Right ascension and declination, degrees, (k, 2).
     settings
-        Greatest error of a boresight in pixels, greatest difference of magnitudes, share of the stars and number of
-        stars that must vote for one turn.
+        Largest error of a boresight in pixels, largest difference of magnitudes, and the share and the number
+        of stars that must vote for one rotation.
     matched
-        Output (n, 2): observed star, row in the table of stars.
+        Output (n, 2): observed star, and row in the table of stars.
     """
     n = observed.shape[0]
     polar = np.empty((n, 2))

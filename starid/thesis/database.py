@@ -1,4 +1,4 @@
-"""The feature database: one 8-bit feature vector for every frame of a grid, built in parallel from the stars."""
+"""The feature database: an 8-bit feature vector for each frame of a grid, computed from the stars."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ CODE_MAX: Final = 255
 """Largest code of a stored feature; codes span 0 … 100 of the normalised scale."""
 
 THESIS_FRAME_DEG: Final = 40.0
-"""Frame width of every published number (the text says 42°)."""
+"""Frame width, degrees, of all published figures (the text says 42°)."""
 
 THESIS_KAPPA: Final = 11.5
-"""Brightness limit of every published number, on the Hp magnitude, keeping the stars that are fainter."""
+"""Brightness limit, in Hp, of all published figures; the stars that are *fainter* are kept."""
 
 _ROWS_PER_BLOCK: Final = 8
 _WIDEST_HALF_FIELD: Final = math.radians(60.0)
 
 Progress = Callable[[int, int], None]
-"""Called with cells done and cells in all, both passes counted."""
+"""Called with the number of cells done and the total, over both passes."""
 
 
 class DatabaseError(StaridError):
-    """A database that cannot be built, read, or used for what it is asked for."""
+    """A database that cannot be built, read, or used with this identifier."""
 
 
 @dataclass(frozen=True, slots=True)
 class DatabaseParameters:
-    """What a database depends on beside the stars.
+    """What a database depends on besides the stars.
 
     Attributes
     ----------
@@ -56,11 +56,11 @@ class DatabaseParameters:
     fov_deg
         Width φ of a frame, degrees.
     kappa, direction, band
-        Brightness limit, which side of it is kept, and the magnitude it is put on.
+        Brightness limit, which side of it is kept, and the magnitude band.
     full_field
-        Square frames instead of circles (not invariant to roll).
+        Square frames instead of circular ones (not invariant to roll).
     focal_px, half_width_px
-        Focal length and half the frame's width in pixels of a gnomonic image; spherical only.
+        Focal length and half-width of a frame in pixels of a gnomonic image; spherical only.
     """
 
     geometry: Geometry = "planar"
@@ -84,7 +84,7 @@ class DatabaseParameters:
         band: Band = "v",
         full_field: bool = False,
     ) -> Self:
-        """Spherical parameters for the largest circle (or square) about the boresight that fits the camera's image."""
+        """Spherical parameters for the largest circle (or square) about the boresight that fits the image."""
         (cx, cy), focal = camera.centre_px, camera.focal_px[0]
         half = 0.5 + min(cx, camera.width - 1 - cx, cy, camera.height - 1 - cy)
         edge = np.array([[cx + half, cy]])
@@ -92,7 +92,7 @@ class DatabaseParameters:
         angle = math.atan2(math.hypot(direction_of_edge[0], direction_of_edge[1]), direction_of_edge[2])
         if not (half > 0.0 and angle < _WIDEST_HALF_FIELD):
             raise DatabaseError(
-                "database: features are gnomonic and need a camera with less than 120° of field"
+                "database: features are gnomonic and need a camera with a field of less than 120°"
             )
         return cls(
             "spherical",
@@ -108,7 +108,7 @@ class DatabaseParameters:
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Self:
-        """Read parameters back from a file's header."""
+        """Read the parameters from the header of a file."""
         names = {field.name for field in dataclasses.fields(cls)}
         if set(values) != names:
             raise DatabaseError(
@@ -118,7 +118,7 @@ class DatabaseParameters:
 
     @property
     def half_width(self) -> float:
-        """Half the frame's width in the unit of the offsets: degrees (planar) or pixels (spherical)."""
+        """Half-width of a frame in the unit of the offsets: degrees (planar) or pixels (spherical)."""
         return self.half_width_px if self.geometry == "spherical" else 0.5 * self.fov_deg
 
 
@@ -129,13 +129,13 @@ class FeatureDatabase:
     Attributes
     ----------
     parameters, grid, sky
-        What the database was made with, its grid, and its stars.
+        Parameters, grid and stars of the database.
     features
         Stored normalised features, (N, 5) uint8, read-only; 255 is 100 on the normalised scale.
     theta
-        Stored polar angles, (N,) uint8, 255 for a cell without stars.
+        Stored polar angles, (N,) uint8; 255 for a cell without stars.
     minimum, maximum
-        Extremes of each feature over the cells that hold a star, (5,).
+        Extremes of each feature over the cells with stars, (5,).
     catalog_identity
         Checksum of the stars.
     """
@@ -160,7 +160,7 @@ class FeatureDatabase:
         return int(self.features.nbytes)
 
     def normalise(self, features: FeatureVector | Array) -> Array:
-        """Normalised feature vector, eq. 2.11: 100·(f − min)/(max − min) for each feature over the database, (5,)."""
+        """Normalise features (5,), eq. 2.11: 100·(f − min)/(max − min) over the database."""
         vector = (
             features.vector if isinstance(features, FeatureVector) else np.asarray(features, dtype=np.float64)
         )
@@ -168,16 +168,16 @@ class FeatureDatabase:
 
     @cached_property
     def scale(self) -> Array:
-        """Normalised units per unit of each feature, (5,); 0 for a feature that is the same everywhere."""
+        """Normalised units per unit of each feature, (5,); 0 for a constant feature."""
         return normalising_scale(self.minimum, self.maximum)
 
     def exact_features(self, cell: int) -> FeatureVector:
-        """Features of a cell in full precision, computed from the stars."""
+        """Full-precision features of a cell, computed from the stars."""
         return self.sky.features(*self.grid.centre(cell))
 
 
 def normalising_scale(minimum: Array, maximum: Array) -> Array:
-    """100/(max − min) for each feature, 0 where the extremes agree."""
+    """100/(max − min) for each feature; 0 if the extremes are equal."""
     span = maximum - minimum
     return np.asarray(np.where(span > 0.0, 100.0 / np.where(span > 0.0, span, 1.0), 0.0), dtype=np.float64)
 
@@ -223,7 +223,7 @@ def _store_rows(
 
 
 def sky_of(catalog: StarCatalog, parameters: DatabaseParameters) -> FrameSky:
-    """Stars of a catalogue as the frames of such a database see them."""
+    """Stars of a catalogue, as projected into the frames of a database."""
     return make_frame_sky(
         np.degrees(catalog.ra_rad),
         np.degrees(catalog.dec_rad),
@@ -246,24 +246,25 @@ def build_database(
 ) -> FeatureDatabase:
     """Compute the features of every frame of the grid.
 
-    Two passes over the grid, the extremes first and the codes second, so that full-precision features are never held:
-    memory is what the database itself takes. Threads share the rows; the result does not depend on their number.
+    There are two passes over the grid, first the extremes and then the codes, so that full-precision features
+    are never stored and memory is limited to the database itself. Threads share the rows; the result does not
+    depend on their number.
 
     Parameters
     ----------
     catalog
-        Stars; the published numbers need the catalogue epoch J1991.25 without proper motion.
+        The stars; the published figures need the catalogue epoch J1991.25 without proper motion.
     parameters
         Geometry, grid and brightness limit.
     progress
-        Called from this thread as blocks of rows are done.
+        Called from this thread after each block of rows.
     threads
-        Worker threads; default: the processors at hand.
+        Number of worker threads; by default the available processors.
 
     Raises
     ------
     DatabaseError, StaridError
-        If the parameters make no grid or leave no star.
+        The parameters do not define a grid, or no star is left.
     """
     grid = make_grid(parameters.geometry, parameters.fov_deg, parameters.overlap)
     sky = sky_of(catalog, parameters)
@@ -298,7 +299,7 @@ def build_database(
         run(find_extremes)
         minimum, maximum = low.min(axis=0), high.max(axis=0)
         if not np.isfinite(minimum).all():
-            raise DatabaseError("database: no frame of the grid holds a star; change the brightness limit")
+            raise DatabaseError("database: no frame of the grid has a star; change the brightness limit")
         scale = normalising_scale(minimum, maximum)
         run(store)
     features.setflags(write=False)

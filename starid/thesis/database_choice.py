@@ -1,4 +1,4 @@
-"""Which feature database an identifier works with: a file that it was given, or its camera's own from the cache."""
+"""Choice of the feature database of an identifier: a given file, or the camera's database from the cache."""
 
 from __future__ import annotations
 
@@ -17,27 +17,27 @@ from starid.thesis.database import DatabaseError, DatabaseParameters, FeatureDat
 from starid.thesis.database_file import load_database, save_database
 
 DATABASE_VERSION: Final = 1
-"""Part of the name of a cached database; raised when its contents change."""
+"""Part of the name of a cached database; incremented when its contents change."""
 
 _log = logging.getLogger(__name__)
 
 
 def given_database(path: Path, parameters: DatabaseParameters, stars: Collection[str]) -> FeatureDatabase:
-    """Load a database file, if it fits.
+    """Load a database file, if it fits the identifier.
 
     Parameters
     ----------
     path
         File written by `save_database`.
     parameters
-        What the identifier would build for itself; grid and brightness limit may differ.
-    stars
-        Identities of the star lists that it may have been made from.
+            Parameters of the database that the identifier would build; grid and brightness limit may differ.
+        stars
+            Identities of the star lists from which the file may have been made.
 
     Raises
     ------
     DatabaseError
-        If the file cannot be used, or belongs to another camera, catalogue, band or geometry.
+        The file cannot be used, or belongs to another camera, catalogue, band or geometry.
     """
     database = load_database(path)
     made = database.parameters
@@ -65,19 +65,19 @@ def given_database(path: Path, parameters: DatabaseParameters, stars: Collection
 
 
 def obtain_database(stars: StarCatalog, parameters: DatabaseParameters, *, cache: bool) -> FeatureDatabase:
-    """Map the database from the cache, or build it and, where the folder can be written, keep it there.
+    """Map the database from the cache, or build it and, if possible, cache it.
 
     Parameters
     ----------
     stars, parameters
-        What to build.
+        Stars and parameters of the database.
     cache
         Use the cache folder.
 
     Raises
     ------
     DatabaseError, StaridError
-        If the parameters make no grid or leave no star.
+        The parameters do not define a grid, or no star is left.
     """
     if not cache:
         return build_database(stars, parameters)
@@ -98,7 +98,7 @@ def obtain_database(stars: StarCatalog, parameters: DatabaseParameters, *, cache
 
 
 def _load(path: Path) -> FeatureDatabase | None:
-    """Database of a cached file; None where there is none or, with a warning in the log, it cannot be used."""
+    """Load a cached database; None if there is none or, with a warning in the log, it cannot be used."""
     try:
         if not path.is_file():
             return None

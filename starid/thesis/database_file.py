@@ -1,4 +1,4 @@
-"""The file of a feature database: header with parameters, catalogue identity and checksum; mapped, not read."""
+"""The file of a feature database: a header with parameters and checksums, then memory-mapped arrays."""
 
 from __future__ import annotations
 
@@ -47,15 +47,16 @@ def _payload_start(header_length: int) -> int:
 
 
 def save_database(database: FeatureDatabase, path: Path) -> int:
-    """Write a database to `path` in one step (written beside it, then moved); return the file's size in bytes.
+    """Write a database atomically; return the size of the file in bytes.
 
-    Layout: 16 bytes "starhil features", header length (uint32, little-endian), header (JSON), padding to 64 bytes,
-    features (N, 5) uint8, polar angles (N,) uint8, stars (n, 3) float64 little-endian (magnitude, α, δ in degrees).
+    Layout: 16 bytes "starhil features", header length (uint32, little-endian), header (JSON), padding to 64
+    bytes, features (N, 5) uint8, polar angles (N,) uint8, stars (n, 3) float64 little-endian (magnitude, α, δ
+    in degrees).
 
     Raises
     ------
     DatabaseError
-        If the file cannot be written.
+        The file cannot be written.
     """
     table = database.sky.stars[:, [BRIGHTNESS, RIGHT_ASCENSION, DECLINATION]]
     stars = np.ascontiguousarray(table, dtype="<f8")
@@ -87,12 +88,12 @@ def save_database(database: FeatureDatabase, path: Path) -> int:
 
 
 def read_header(path: Path) -> dict[str, Any]:
-    """Header of a database file.
+    """Read the header of a database file.
 
     Raises
     ------
     DatabaseError
-        If there is no such file or it is not a feature database of this version.
+        There is no such file, or it is not a feature database of this version.
     """
     try:
         with open_regular(path) as file:
@@ -102,13 +103,13 @@ def read_header(path: Path) -> dict[str, Any]:
                     f"database: {path} is not a feature database; build one with `starhil database build`"
                 )
             if len(start) < len(MAGIC) + _LENGTH.size:
-                raise DatabaseError(f"database: {path} is truncated in its header; build it again")
+                raise DatabaseError(f"database: {path} has a truncated header; build it again")
             (length,) = _LENGTH.unpack(start[len(MAGIC) :])
             text = file.read(min(length, _MAX_HEADER))
     except OSError as error:
         raise DatabaseError(f"database: {path} cannot be read ({error.strerror or error})") from error
     if len(text) < length:
-        raise DatabaseError(f"database: {path} is truncated in its header; build it again")
+        raise DatabaseError(f"database: {path} has a truncated header; build it again")
     try:
         header = json.loads(text)
     except ValueError as error:
@@ -129,12 +130,13 @@ def load_database(path: Path, *, verify: bool = True) -> FeatureDatabase:
     path
         File written by `save_database`.
     verify
-        Check the checksum over all of it (a 30 MB file takes about 40 ms).
+        Verify the checksum of the whole file (about 40 ms for 30 MB).
 
     Raises
     ------
     DatabaseError
-        If the file is missing, foreign, truncated, damaged or of another version; the text names the file.
+        The file is missing, truncated, damaged, of another version, or not a database; the message names the
+        file.
     """
     header = read_header(path)
     start = int(header.pop("payload_start"))
@@ -156,11 +158,11 @@ def load_database(path: Path, *, verify: bool = True) -> FeatureDatabase:
     ends = np.cumsum((start, *sizes)).tolist()
     features, theta, stars = (view[a:b] for a, b in itertools.pairwise(ends))
     if verify and _checksum(header, features, theta, stars) != checksum:
-        raise DatabaseError(f"database: {path} is damaged: its checksum does not fit; build it again")
+        raise DatabaseError(f"database: {path} is damaged: its checksum does not match; build it again")
     grid = make_grid(parameters.geometry, parameters.fov_deg, parameters.overlap)
     if grid.cells != cells:
         raise DatabaseError(
-            f"database: {path} has {cells} cells where its parameters make {grid.cells}; build it again"
+            f"database: {path} has {cells} cells, but its parameters define {grid.cells}; build it again"
         )
     table = np.frombuffer(stars, dtype="<f8").reshape(star_count, _STAR_COLUMNS)
     sky = make_frame_sky(

@@ -1,4 +1,4 @@
-"""What false-star filters share: two frames of objects in, which objects are true stars and which belong together out."""
+"""Interface of the false-star filters: two frames of objects in; true stars and matches out."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from starid.errors import StaridError
 
 
 class FilterError(StaridError):
-    """Frames that a false-star filter cannot work on."""
+    """Frames that a false-star filter cannot process."""
 
 
 @dataclass(frozen=True, eq=False)
 class ObservedFrame:
-    """The objects of one frame as they were measured.
+    """The measured objects in one frame.
 
     Attributes
     ----------
     brightness
         Magnitudes, (n,).
     positions
-        Offsets from the frame's centre, (n, 2), degrees.
+        Offsets from the centre of the frame, (n, 2), degrees.
     """
 
     brightness: Array
@@ -38,7 +38,7 @@ class ObservedFrame:
             )
         if not (np.isfinite(self.brightness).all() and np.isfinite(self.positions).all()):
             raise FilterError(
-                "frame: an object's brightness or position is not finite; drop such objects first"
+                "frame: the brightness or position of an object is not finite; remove such objects first"
             )
 
     def __len__(self) -> int:
@@ -47,12 +47,12 @@ class ObservedFrame:
 
 @dataclass(frozen=True, eq=False)
 class FilterResult:
-    """Which objects are true stars.
+    """Which objects are true stars, and which belong together.
 
     Attributes
     ----------
     true_before, true_now
-        For each object of the earlier and of the later frame whether it is taken for a true star.
+        Whether each object in the earlier and in the later frame is taken for a true star.
     matches
         Pairs of objects (earlier, later) that are the same star, (m, 2).
     """
@@ -63,13 +63,13 @@ class FilterResult:
 
     @property
     def matched(self) -> Mask:
-        """Which objects of the later frame belong to one of the earlier."""
+        """Which objects in the later frame are matched to one in the earlier frame."""
         return np.isin(np.arange(self.true_now.size), self.matches[:, 1])
 
 
 class FalseStarFilter(Protocol):
-    """What separates true stars from false ones in two successive frames."""
+    """A filter that separates true from false stars in two successive frames."""
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
-        """Compare two successive frames; with nothing to go by every object is taken for a false star."""
+        """Compare two successive frames; without evidence every object is taken for a false star."""
         ...

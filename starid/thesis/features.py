@@ -1,4 +1,4 @@
-"""The frame object of the thesis: all stars of a circular or square frame condensed into five features and an angle."""
+"""The frame object of the thesis: five features and an angle of the stars in a frame."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from starid.errors import StaridError
 from starid.jit import compiled
 
 FEATURE_COUNT: Final = 5
-"""Components of a feature vector; the polar angle is kept beside it."""
+"""Number of components of a feature vector; the polar angle is separate."""
 
 SUM_COUNT: Final = 8
 """Length of the accumulator of `add_star`."""
 
 
 class FeatureError(StaridError):
-    """Stars from which no feature vector can be made."""
+    """Stars from which no feature vector can be computed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class FeatureVector:
     A
         Mean brightness in magnitudes, eq. 2.3.
     r
-        Distance of the frame object from the frame's centre in the unit of the offsets, eq. 2.4.
+        Distance of the frame object from the centre of the frame, in the unit of the offsets, eq. 2.4.
     sigma_A
         Standard deviation of the brightness in magnitudes (0 for a single star).
     sigma_r
@@ -67,14 +67,14 @@ class FeatureVector:
 
 @compiled
 def clear_sums(sums: Array) -> None:
-    """Empty the accumulator of one frame, (8,)."""
+    """Clear the accumulator of one frame, (8,)."""
     for i in range(SUM_COUNT):
         sums[i] = 0.0
 
 
 @compiled
 def add_star(sums: Array, brightness: float, x: float, y: float, pivot: float) -> None:
-    """Add one star to the accumulator; `pivot` is a brightness near the mean, against cancellation."""
+    """Add a star to the accumulator; `pivot`, a brightness near the mean, avoids cancellation."""
     q = x * x + y * y
     da = brightness - pivot
     sums[0] += 1.0
@@ -89,12 +89,12 @@ def add_star(sums: Array, brightness: float, x: float, y: float, pivot: float) -
 
 @compiled
 def finish_features(sums: Array, pivot: float, out: Array) -> float:
-    """Turn an accumulator into the five features in `out` and return the polar angle in radians.
+    """Convert an accumulator to the five features in `out`; return the polar angle in radians.
 
-    The frame object is X = Σ a·x / Σ a and Y = Σ a·y / Σ a; eq. 2.5 prints a division by n, while the published
-    numbers were made with the weighted mean. The deviations are σ_A, eq. 2.6, about the mean brightness μ_A, eq. 2.7,
-    and σ_r, eq. 2.8, about the mean distance μ_r, eq. 2.9: square roots of the variances over n − 1 (the thesis prints
-    the variances over n). An accumulator without stars gives zeros.
+    The frame object is X = Σ a·x / Σ a and Y = Σ a·y / Σ a; eq. 2.5 is printed with a division by n, but the
+    published numbers were computed with the weighted mean. The deviations are σ_A, eq. 2.6, about the mean
+    brightness μ_A, eq. 2.7, and σ_r, eq. 2.8, about the mean distance μ_r, eq. 2.9: square roots of the
+    variances over n − 1 (the thesis prints the variances over n). An accumulator without stars gives zeros.
     """
     n = sums[0]
     if n < 1.0:
@@ -121,7 +121,7 @@ def finish_features(sums: Array, pivot: float, out: Array) -> float:
 
 @compiled
 def frame_features(brightness: Array, x: Array, y: Array, out: Array) -> float:
-    """Write the features of a list of stars to `out` (5,) and return the polar angle in radians."""
+    """Write the features of a list of stars to `out` (5,); return the polar angle in radians."""
     sums = np.zeros(SUM_COUNT)
     pivot = brightness[0] if brightness.size > 0 else 0.0
     for i in range(brightness.size):
@@ -132,9 +132,9 @@ def frame_features(brightness: Array, x: Array, y: Array, out: Array) -> float:
 def extract_features(
     brightness: Array, offsets: Array, *, half_width: float | None = None, full_field: bool = False
 ) -> FeatureVector:
-    """Condense the stars of one frame into its feature vector (function F_ψ of algorithm 1).
+    """Compute the feature vector of the stars in one frame (function F_ψ of algorithm 1).
 
-    The published worked example, eq. 5.1, is the frame with lower-left corner (95°, −85°): 26 stars,
+    The published worked example, eq. 5.1, has the frame with lower-left corner (95°, −85°): 26 stars,
     A = 11.96, r = 2.95, σ_A = 0.37, σ_r = 5.35.
 
     Parameters
@@ -142,16 +142,17 @@ def extract_features(
     brightness
         Magnitudes of the stars, (n,).
     offsets
-        Positions relative to the frame's centre, (n, 2), in degrees of the flat (α, δ) plane or in pixels.
+        Positions relative to the centre of the frame, (n, 2), in degrees of the flat (α, δ) plane or in
+        pixels.
     half_width
-        Half the frame's width in the unit of the offsets; stars outside are left out. None keeps all of them.
+        Half-width of the frame in the unit of the offsets; stars outside are ignored. None uses all stars.
     full_field
-        Keep the whole square instead of the inscribed circle. The features of a square depend on roll.
+        Use the whole square instead of the inscribed circle. The features of a square depend on roll.
 
     Raises
     ------
     FeatureError
-        If no star is in the frame, a value is not finite, or the shapes disagree.
+        No star is in the frame, a value is not finite, or the shapes disagree.
     """
     a = np.ascontiguousarray(brightness, dtype=np.float64)
     xy = np.ascontiguousarray(offsets, dtype=np.float64)
@@ -161,7 +162,7 @@ def extract_features(
         )
     if not (np.isfinite(a).all() and np.isfinite(xy).all()):
         raise FeatureError(
-            "features: a star's brightness or position is not a finite number; drop such stars first"
+            "features: the brightness or position of a star is not finite; remove such stars first"
         )
     x, y = np.ascontiguousarray(xy[:, 0]), np.ascontiguousarray(xy[:, 1])
     if half_width is not None:
@@ -178,7 +179,7 @@ def extract_features(
 
 
 def feature_vector(numbers: Array, theta_rad: float) -> FeatureVector:
-    """Feature vector of the numbers that `finish_features` writes and the angle that it returns."""
+    """Make a feature vector from the output of `finish_features`."""
     n, mean, r, sigma_a, sigma_r = numbers.tolist()
     x, y = r * math.cos(theta_rad), r * math.sin(theta_rad)
     return FeatureVector(int(n), mean, r, sigma_a, sigma_r, theta_rad, x, y)

@@ -1,4 +1,4 @@
-"""The grid of frames that a feature database is made of: a flat one as the thesis has it, and one on the sphere."""
+"""The grid of frames of a feature database: flat as in the thesis, or on the sphere."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from starid.jit import compiled
 Geometry = Literal["planar", "spherical"]
 
 DICTIONARY_SIDE: Final = 3
-"""Cells along one side of a dictionary."""
+"""Number of cells along one side of a dictionary."""
 
 DICTIONARY_SIZE: Final = DICTIONARY_SIDE * DICTIONARY_SIDE
-"""Cells in a dictionary: the nearest one and its neighbours."""
+"""Number of cells in a dictionary: the nearest cell and its neighbours."""
 
 MAX_CELLS: Final = 200_000_000
-"""Most frames of a grid, counted as if no circle of declination were shorter than the equator: 1.2 GB of features."""
+"""Largest number of frames in a grid (planar, over the whole sky): 1.2 GB of features."""
 
 _FULL_TURN: Final = 360.0
 _PLANAR_DECLINATION_SPAN: Final = 140.0
@@ -29,11 +29,11 @@ _ROUNDING: Final = 1e-9
 
 
 class GridError(StaridError):
-    """A grid that cannot be laid out."""
+    """A grid that cannot be made."""
 
 
 class GridArrays(NamedTuple):
-    """What the kernels read of a `FrameGrid`, or of some of its rows."""
+    """Arrays of a `FrameGrid`, or of some of its rows, for the kernels."""
 
     row_start: Indices
     row_columns: Indices
@@ -42,7 +42,7 @@ class GridArrays(NamedTuple):
     first_ra: float
 
     def rows(self, chosen: slice) -> GridArrays:
-        """Only some of the rows; their cells keep their numbers."""
+        """Select some of the rows; the cell numbers do not change."""
         start = self.row_start[chosen.start : chosen.stop + 1]
         return GridArrays(
             start, self.row_columns[chosen], self.row_dec[chosen], self.row_ra_step[chosen], self.first_ra
@@ -51,19 +51,20 @@ class GridArrays(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class FrameGrid:
-    """Frame centres in rows of constant declination; cells count row by row, from the south, from 0.
+    """Frame centres in rows of constant declination; cells are numbered row by row from the south, from 0.
 
     Attributes
     ----------
     geometry
-        "planar": the flat (α, δ) plane of the thesis, as many columns in every row. "spherical": rows half a step
-        off the poles and as many columns as keep the cells alike in area, at least three.
+        "planar": the flat (α, δ) plane of the thesis, with the same number of columns in every row.
+        "spherical": the rows start half a step off the poles, and the number of columns, at least three,
+        keeps the cells similar in area.
     step_deg
-        Distance of two cells, φ·(1 − p), degrees.
+        Distance between two cells, φ·(1 − p), degrees.
     first_ra_deg
         Right ascension of the centre of column 0, degrees.
     row_dec_deg, row_ra_step_deg
-        Declination of each row and distance of its columns, degrees, (rows,).
+        Declination of each row, and distance between its columns, degrees, (rows,).
     row_columns, row_start
         Number of columns (rows,), and the first cell of each row (rows + 1,).
     """
@@ -88,23 +89,24 @@ class FrameGrid:
 
     @property
     def arrays(self) -> GridArrays:
-        """What the kernels read."""
+        """Arrays for the kernels."""
         return GridArrays(
             self.row_start, self.row_columns, self.row_dec_deg, self.row_ra_step_deg, self.first_ra_deg
         )
 
     def centre(self, cell: int) -> tuple[float, float]:
-        """Right ascension (0 … 360) and declination of a cell's centre, degrees."""
+        """Right ascension (0 … 360) and declination of the centre of a cell, degrees."""
         if not 0 <= cell < self.cells:
-            raise GridError(f"grid: cell {cell} does not exist; there are {self.cells}, counted from 0")
-        ra, dec = cell_place(self.arrays, cell)
+            raise GridError(f"grid: cell {cell} does not exist; there are {self.cells}, numbered from 0")
+        ra, dec = cell_centre(self.arrays, cell)
         return float(ra) % _FULL_TURN, float(dec)
 
     def dictionary(self, cell: int) -> Indices:
         """Cells of the 3×3 neighbourhood, (9,), row by row: the dictionary T of eq. 2.30 in terms of cells.
 
-        Right ascension wraps. At the first and the last row the block is moved inwards as a whole, so that it has
-        nine different cells always; on the sphere the three columns of a row are those nearest in right ascension.
+        Right ascension wraps. At the first and last row the block is moved inwards as a whole, so that it
+        always has nine different cells; on the sphere the three columns of a row are the nearest in right
+        ascension.
         """
         cells = np.empty(DICTIONARY_SIZE, dtype=np.int64)
         turns = np.empty(DICTIONARY_SIZE)
@@ -114,7 +116,7 @@ class FrameGrid:
 
 @compiled
 def cell_row(row_start: Indices, cell: int) -> int:
-    """Row of a cell, by bisection."""
+    """Find the row of a cell by bisection."""
     low = 0
     high = row_start.size - 1
     while high - low > 1:
@@ -128,7 +130,7 @@ def cell_row(row_start: Indices, cell: int) -> int:
 
 @compiled
 def dictionary_cells(grid: GridArrays, cell: int, cells: Indices, right_ascension: Array) -> int:
-    """Write the nine cells and their right ascensions (degrees, not wrapped); return the first of the three rows."""
+    """Fill in the nine cells and their right ascensions (degrees, not wrapped); return the first row."""
     row = cell_row(grid.row_start, cell)
     centre = (cell - grid.row_start[row]) * grid.row_ra_step[row]
     first_row = min(max(row - 1, 0), grid.row_columns.size - 3)
@@ -143,17 +145,17 @@ def dictionary_cells(grid: GridArrays, cell: int, cells: Indices, right_ascensio
 
 
 @compiled
-def cell_place(grid: GridArrays, cell: int) -> tuple[float, float]:
-    """Right ascension (not wrapped) and declination of a cell's centre, degrees."""
+def cell_centre(grid: GridArrays, cell: int) -> tuple[float, float]:
+    """Right ascension (not wrapped) and declination of the centre of a cell, degrees."""
     row = cell_row(grid.row_start, cell)
     return grid.first_ra + (cell - grid.row_start[row]) * grid.row_ra_step[row], grid.row_dec[row]
 
 
 def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
-    """Lay out the grid for a frame width φ and an overlap ratio p.
+    """Make the grid for a frame width φ and an overlap ratio p.
 
-    The planar grid is the one that the published database sizes belong to: step 40°·(1 − p), 360°/step columns whose
-    lower-left corner starts at α = 0°, and ⌈140°/step⌉ rows whose corner starts at δ = −90°.
+    The planar grid has the published database sizes: step 40°·(1 − p), 360°/step columns whose lower-left
+    corner starts at α = 0°, and ⌈140°/step⌉ rows whose corner starts at δ = −90°.
 
     Parameters
     ----------
@@ -167,18 +169,18 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
     Raises
     ------
     GridError
-        If the values are out of range or leave fewer than three rows or columns.
+        A value is out of range, or there would be fewer than three rows or columns.
     """
     if not (math.isfinite(overlap) and 0.0 <= overlap < 1.0):
         raise GridError(
             f"grid: overlap ratio {overlap} is not in [0, 1); 0.995 means that frames overlap by 99.5 %"
         )
     if not (math.isfinite(fov_deg) and 0.0 < fov_deg <= 120.0):
-        raise GridError(f"grid: a frame {fov_deg}° wide is not possible; give more than 0° and at most 120°")
+        raise GridError(f"grid: frames cannot be {fov_deg}° wide; give more than 0° and at most 120°")
     step = fov_deg * (1.0 - overlap)
     if not MAX_CELLS * step**2 >= _FULL_TURN * 180.0:
         raise GridError(
-            f"grid: frames {fov_deg}° wide that overlap by {100.0 * overlap:.9g} % are more than {MAX_CELLS} all over the "
+            f"grid: frames {fov_deg}° wide that overlap by {100.0 * overlap:.9g} % number more than {MAX_CELLS} over the whole "
             "sky; give less overlap or wider frames"
         )
     if geometry == "planar":
@@ -197,20 +199,20 @@ def make_grid(geometry: Geometry, fov_deg: float, overlap: float) -> FrameGrid:
     else:
         raise GridError(f"grid: geometry must be planar or spherical, not {geometry!r}")
     if rows < DICTIONARY_SIDE or int(row_columns.min()) < DICTIONARY_SIDE:
-        raise GridError(f"grid: overlap {overlap} leaves {rows} rows of frames; at least three are needed")
+        raise GridError(f"grid: overlap {overlap} gives {rows} rows of frames; at least three are needed")
     row_dec = np.asarray(dec, dtype=np.float64)
     row_start = np.concatenate([[0], np.cumsum(row_columns)]).astype(np.int64)
     return FrameGrid(geometry, step, first_ra, row_dec, ra_step, row_columns, row_start)
 
 
 def nominal_cells(fov_deg: float, overlap: float) -> float:
-    """Nominal number of feature vectors N = 2π² / (φ_x·φ_y·(1 − p)²), eq. 2.23, with φ_x = φ_y = `fov_deg`."""
+    """Nominal number of cells N = 2π² / (φ_x·φ_y·(1 − p)²), eq. 2.23, with φ_x = φ_y = `fov_deg`."""
     fov = math.radians(fov_deg)
     return 2.0 * math.pi**2 / (fov * (1.0 - overlap)) ** 2
 
 
 def circle_intrusion(radius: float) -> float:
-    """How far neighbouring circles must overlap to leave no gap, in the unit of the radius.
+    """Overlap of neighbouring circles, in the unit of the radius, that leaves no gap.
 
     Diagonal neighbours touch when 2·(2r − x)² = 4r², eq. 2.24, so that x = (2 − √2)·r, eq. 2.25.
     """
@@ -218,5 +220,5 @@ def circle_intrusion(radius: float) -> float:
 
 
 def minimum_overlap() -> float:
-    """Least overlap ratio that loses no star: p = x/φ, eq. 2.26, with r = φ/2 gives p_min = 0.2929, eq. 2.27."""
+    """Smallest overlap ratio that loses no star: p = x/φ, eq. 2.26; with r = φ/2, 0.2929, eq. 2.27."""
     return circle_intrusion(0.5)

@@ -1,4 +1,4 @@
-"""Motion between two frames of hundreds of unmatched objects: pairs vote, the best candidates are counted out."""
+"""Motion between two frames of unmatched objects: pairs vote, and the best candidates are scored."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from starid.arrays import Array, Indices
 from starid.jit import compiled
 
 MAX_VOTERS: Final = 48
-"""Most objects of a frame whose pairs vote."""
+"""Largest number of objects per frame whose pairs vote."""
 
 _MAX_COUPLES: Final = 40_000
 _MAX_HYPOTHESES: Final = 300
@@ -31,10 +31,10 @@ def nearest_objects(
     gate: float,
     partner: Indices,
 ) -> int:
-    """Match predictions and objects that are each other's nearest within the gate; return how many.
+    """Match predictions and objects that are mutual nearest neighbours within the gate; return their number.
 
-    The distance is (Δx² + Δy²)/variance + (Δm)²/(2σ_m²); `gate` is its greatest value. `partner` (n,) receives the
-    object of each prediction, −1 for none.
+    The distance is (Δx² + Δy²)/variance + (Δm)²/(2σ_m²); `gate` is its largest value. `partner` (n,) receives
+    the object of each prediction, or −1.
     """
     n, m = predicted.shape[0], positions.shape[0]
     best_of_object = np.full(m, math.inf)
@@ -72,7 +72,7 @@ def nearest_objects(
 def _pairs(
     positions: Array, brightness: Array, least: float, separation: Array, slope: Array, members: Indices
 ) -> int:
-    """Separations and directions of all pairs, brighter object first; return their number."""
+    """Compute the separations and directions of all pairs, brighter object first; return their number."""
     k = 0
     for i in range(positions.shape[0]):
         for j in range(i + 1, positions.shape[0]):
@@ -99,7 +99,7 @@ def _score(
     gate2: float,
     faint: float,
 ) -> float:
-    """How many objects a motion explains, less a little for the distances that it leaves."""
+    """Number of objects that a motion explains, minus a small penalty for the residuals."""
     total = 0.0
     for i in range(before.shape[0]):
         x = motion[0] * before[i, 0] - motion[1] * before[i, 1] + motion[2]
@@ -127,7 +127,7 @@ def _pair_hypotheses(
     max_rotation: float,
     couples: Indices,
 ) -> int:
-    """List couples of pairs alike in separation and brightness, turned by no more than allowed; longest pairs first."""
+    """List pairs of pairs similar in separation, brightness and direction, longest first."""
     order1 = np.argsort(-first[0][: counts[0]])
     order2 = np.argsort(second[0][: counts[1]])
     lengths = second[0][order2]
@@ -166,16 +166,16 @@ def find_motion(
     max_shift: float,
     motion: Array,
 ) -> float:
-    """Find the rigid motion that explains most objects; return its score, about the number of objects explained.
+    """Find the rigid motion that explains most objects; return its score, about the number of objects.
 
     Parameters
     ----------
     before, now
-        Positions of at most `MAX_VOTERS` objects of each frame, degrees; their magnitudes beside them.
+        Positions of at most `MAX_VOTERS` objects in each frame, degrees; their magnitudes are separate.
     sigma, brightness_sigma
         One-sigma errors of a position per axis (degrees) and of a magnitude.
     max_rotation, max_shift
-        Greatest rotation in radians and greatest shift per axis in degrees.
+        Largest rotation in radians, and largest shift per axis in degrees.
     motion
         In: a first guess; out: cosine, sine, shift x, shift y.
     """

@@ -1,4 +1,4 @@
-"""The catalogue stars as the frames of a database see them: features of any frame, straight from the stars."""
+"""Catalogue stars for the frames of a database: features of any frame, computed from the stars."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from starid.thesis.frame_grid import Geometry
 Direction = Literal["faintest", "brightest"]
 
 BIN_DEG: Final = 5.0
-"""Side of the bins in which stars are looked up, degrees."""
+"""Side of the bins for looking up stars, degrees."""
 
 DEC_BINS: Final = 36
 RA_BINS: Final = 72
@@ -34,16 +34,19 @@ BRIGHTNESS, RIGHT_ASCENSION, DECLINATION, UX, UY, UZ = range(6)
 """Columns of the star table: magnitude, degrees, degrees, unit vector."""
 
 SPHERICAL, HALF_WIDTH, FULL_FIELD, FOCAL, REACH, PIVOT = range(6)
-"""Places in the frame's numbers: 1 on the sphere, half width (degrees or pixels), 1 for the whole square, focal length
-in pixels, greatest angle of a star from the centre in degrees, brightness to sum about."""
+"""Indices into `SkyArrays.frame`.
+
+1 on the sphere; half-width (degrees or pixels); 1 for the whole square; focal length in pixels; largest angle
+of a star from the centre in degrees; brightness to sum about.
+"""
 
 
 class SkyError(StaridError):
-    """Stars or a frame that no database can be made of."""
+    """Stars or a frame from which no database can be made."""
 
 
 class SkyArrays(NamedTuple):
-    """What the kernels read of a `FrameSky`: its table of stars, the first star of each bin, and the frame's numbers."""
+    """Arrays of a `FrameSky` for the kernels: stars, first star of each bin, numbers of the frame."""
 
     stars: Array
     bin_start: Indices
@@ -52,7 +55,7 @@ class SkyArrays(NamedTuple):
 
 @compiled
 def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) -> tuple[int, int, int, int]:
-    """Bins that stars within reach of a place lie in: first and last band, first bin along α, and how many of these."""
+    """Bins within reach of a position: first and last band, first bin in α, and number of bins."""
     low = max(math.floor((dec_deg - reach_deg + 90.0) / BIN_DEG), 0)
     high = min(math.floor((dec_deg + reach_deg + 90.0) / BIN_DEG), DEC_BINS - 1)
     window = reach_deg
@@ -68,7 +71,7 @@ def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) 
 
 @compiled
 def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: int) -> tuple[int, int]:
-    """First star, and one past the last, of the bins of a band: up to the end of the band (part 0), or beyond (part 1)."""
+    """Range of the stars in bins of a band, up to the end of the band (part 0) or wrapped (part 1)."""
     end = min(first + count, RA_BINS)
     start = band * RA_BINS + (first if part == 0 else 0)
     stop = band * RA_BINS + (end if part == 0 else first + count - RA_BINS)
@@ -78,8 +81,8 @@ def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: i
 
 
 @compiled
-def turn_to(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
-    """Cosine and sine of a place's α and of its δ."""
+def position_cosines(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
+    """Cosines and sines of α and δ of a position."""
     a, d = math.radians(ra_deg), math.radians(dec_deg)
     return math.cos(a), math.sin(a), math.cos(d), math.sin(d)
 
@@ -88,7 +91,7 @@ def turn_to(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
 def gnomonic(
     ux: float, uy: float, uz: float, turn: tuple[float, float, float, float], focal: float
 ) -> tuple[float, float]:
-    """Offset of a star in the frame at a place (`turn_to`), north up, +x right, +y down; infinite behind the camera."""
+    """Offset of a star in a frame (`position_cosines`), north up, +x right, +y down; infinite behind the camera."""
     cos_a, sin_a, cos_d, sin_d = turn
     level = cos_a * ux + sin_a * uy
     depth = cos_d * level + sin_d * uz
@@ -111,14 +114,14 @@ def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) 
 
 @compiled
 def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> None:
-    """Add up the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
+    """Accumulate the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
     stars, bin_start, frame = sky
     clear_sums(sums)
     half = frame[HALF_WIDTH]
     half2 = half * half
     spherical = frame[SPHERICAL] > 0.5
     full = frame[FULL_FIELD] > 0.5
-    turn = turn_to(ra_deg, dec_deg) if spherical else (1.0, 0.0, 1.0, 0.0)
+    turn = position_cosines(ra_deg, dec_deg) if spherical else (1.0, 0.0, 1.0, 0.0)
     low, high, first, count = bins_near(ra_deg, dec_deg, frame[REACH], spherical)
     for band in range(low, high + 1):
         for part in range(2):
@@ -136,9 +139,10 @@ def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> Non
 def stars_near(
     sky: SkyArrays, ra_deg: float, dec_deg: float, margin: float, found: Array, rows: Indices
 ) -> int:
-    """List the stars of a circular frame with north up and a margin around it; return how many.
+    """List the stars of a circular frame with north up, and a margin around it; return their number.
 
-    `found` (n, 3) receives x, y in the frame's unit and the magnitude, `rows` (n,) the stars' rows in the table.
+    `found` (n, 3) receives x, y in the unit of the frame and the magnitude, `rows` (n,) the rows in the table
+    of stars.
     """
     stars, bin_start, frame = sky
     spherical = frame[SPHERICAL] > 0.5
@@ -146,7 +150,7 @@ def stars_near(
     reach = frame[HALF_WIDTH] + margin
     if spherical:
         reach = math.degrees(math.atan(reach / frame[FOCAL]))
-    turn = turn_to(ra_deg, dec_deg)
+    turn = position_cosines(ra_deg, dec_deg)
     low, high, first, bins = bins_near(ra_deg, dec_deg, reach, spherical)
     count = 0
     for band in range(low, high + 1):
@@ -175,15 +179,15 @@ def cell_features(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array, ou
 
 @dataclass(frozen=True, eq=False)
 class FrameSky:
-    """Stars within the brightness limit, binned by place, and the shape of a frame.
+    """Stars within the brightness limit, binned by position, and the shape of a frame.
 
     Attributes
     ----------
     geometry
-        "planar" (offsets x = α − α_c, y = δ − δ_c in degrees) or "spherical" (gnomonic offsets in pixels, +x right
-        and +y down for a camera with north up).
+        "planar" (offsets x = α − α_c, y = δ − δ_c in degrees) or "spherical" (gnomonic offsets in pixels, +x
+        right and +y down for a camera with north up).
     half_width
-        Half the frame's width: degrees for planar, pixels for spherical.
+        Half-width of a frame: degrees for planar, pixels for spherical.
     full_field
         The whole square (True) or the inscribed circle.
     focal_px
@@ -193,7 +197,7 @@ class FrameSky:
     bin_start
         First star of each bin, (36·72 + 1,).
     source
-        Row of each star in the arrays that the sky was made of, (n,).
+        Row of each star in the arrays from which the sky was made, (n,).
     """
 
     geometry: Geometry
@@ -206,7 +210,7 @@ class FrameSky:
 
     @cached_property
     def frame(self) -> Array:
-        """The frame's numbers for the kernels, (6,)."""
+        """Numbers that describe a frame, for the kernels, (6,)."""
         reach = self.half_width
         corner = math.sqrt(2.0) if self.full_field else 1.0
         if self.geometry == "spherical":
@@ -225,7 +229,7 @@ class FrameSky:
 
     @cached_property
     def arrays(self) -> SkyArrays:
-        """What the kernels read."""
+        """Arrays for the kernels."""
         return SkyArrays(self.stars, self.bin_start, self.frame)
 
     def features(self, ra_deg: float, dec_deg: float) -> FeatureVector:
@@ -234,7 +238,7 @@ class FrameSky:
         Raises
         ------
         SkyError
-            If no star lies in that frame.
+            No star is in the frame.
         """
         out = np.empty(5)
         theta = float(cell_features(self.arrays, ra_deg, dec_deg, np.empty(SUM_COUNT), out))
@@ -245,7 +249,7 @@ class FrameSky:
         return feature_vector(out, theta)
 
     def stars_in_frame(self, ra_deg: float, dec_deg: float) -> tuple[Array, Array, Indices]:
-        """Brightness (n,), offsets (n, 2) and source rows (n,) of the stars in the frame centred at (ra, dec)."""
+        """Brightness (n,), offsets (n, 2), source rows (n,) of the stars in the frame at (ra, dec)."""
         x, y = self.offsets(ra_deg, dec_deg)
         if self.full_field:
             inside = np.maximum(abs(x), abs(y)) <= self.half_width
@@ -286,25 +290,25 @@ def make_frame_sky(
     Parameters
     ----------
     ra_deg, dec_deg, brightness
-        Stars, (n,): degrees, degrees, magnitudes. Stars without a finite value are left out.
+        Stars, (n,): degrees, degrees, magnitudes. Stars with a value that is not finite are left out.
     geometry, half_width, full_field, focal_px
-        As in `FrameSky`.
+        See `FrameSky`.
     kappa
         Brightness limit κ.
     direction
-        "faintest" keeps a ≥ κ, as every published number does; "brightest" keeps a ≤ κ, as a sensor does.
+        "faintest" keeps a ≥ κ, as in all published numbers; "brightest" keeps a ≤ κ, as a sensor does.
 
     Raises
     ------
     SkyError
-        If no star is left or the frame makes no sense.
+        No star is left, or the frame is not valid.
     """
     if direction not in ("faintest", "brightest"):
         raise SkyError(f"sky: brightness direction must be faintest or brightest, not {direction!r}")
     if geometry == "spherical" and not focal_px > 0.0:
-        raise SkyError("sky: the spherical geometry needs the camera's focal length in pixels")
+        raise SkyError("sky: the spherical geometry needs the focal length of the camera in pixels")
     if not half_width > 0.0:
-        raise SkyError(f"sky: half the frame's width is {half_width}; it must be positive")
+        raise SkyError(f"sky: half-width of the frame must be positive, not {half_width}")
     keep = (brightness >= kappa) if direction == "faintest" else (brightness <= kappa)
     source = np.flatnonzero(keep & np.isfinite(ra_deg) & np.isfinite(dec_deg) & np.isfinite(brightness))
     if source.size == 0:

@@ -1,7 +1,7 @@
-"""The thesis's false-star filter: pairs of objects in two frames, and the cluster of their differences (algorithm 2).
+"""The thesis's false-star filter (algorithm 2): differences between pairs in two frames cluster.
 
-The list of differences grows with the fourth power of the number of objects; beyond four dozen objects the filter of
-`starid.thesis.scalable_filter` takes its place.
+The number of differences grows with the fourth power of the number of objects; for more than four dozen
+objects use `starid.thesis.scalable_filter`.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from starid.jit import compiled
 from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 
 EPSILON: Final = 0.4
-"""Radius of the neighbourhood: magnitudes, degrees and degrees alike."""
+"""Radius of the neighbourhood, the same in magnitudes and in degrees."""
 
 MIN_SAMPLES_SHARE: Final = 0.5
-"""Least number of members of a neighbourhood, as a share of the number of objects."""
+"""Smallest number of points in the neighbourhood of a core point, as a share of the number of objects."""
 
 MAX_OBJECTS: Final = 48
-"""Most objects in a frame: 1 128 pairs, 1 272 384 disparities."""
+"""Largest number of objects in a frame: 1 128 pairs, 1 272 384 disparities."""
 
 _MAX_BINS: Final = 1_048_576
 
@@ -35,10 +35,10 @@ def pair_count(objects: int) -> int:
 
 @compiled
 def pair_features(brightness: Array, positions: Array, vectors: Array, members: Indices) -> None:
-    """Write the set of feature vectors of a frame (eq. 3.8), one v = (A_ij, d_ij, m_ij) (eq. 3.3) for each pair i < j.
+    """Write the feature vectors of a frame (eq. 3.8), v = (A_ij, d_ij, m_ij) (eq. 3.3) for each pair i < j.
 
-    A_ij is the mean brightness, eq. 3.4, d_ij the separation in degrees, eq. 3.5, and m_ij the slope of the line
-    between the two in degrees, 0 ≤ m < 180, eq. 3.6.
+    A_ij is the mean brightness, eq. 3.4, d_ij the separation in degrees, eq. 3.5, and m_ij the slope of the
+    line between the two in degrees, 0 ≤ m < 180, eq. 3.6.
     """
     k = 0
     for i in range(brightness.size):
@@ -54,7 +54,7 @@ def pair_features(brightness: Array, positions: Array, vectors: Array, members: 
 
 
 def pairs_of(frame: ObservedFrame) -> Array:
-    """The feature vectors of a frame's pairs, (L, 3)."""
+    """Feature vectors of the pairs in a frame, (L, 3)."""
     vectors = np.empty((pair_count(len(frame)), 3))
     pair_features(frame.brightness, frame.positions, vectors, np.empty((len(vectors), 2), dtype=np.int64))
     return vectors
@@ -62,10 +62,10 @@ def pairs_of(frame: ObservedFrame) -> Array:
 
 @compiled
 def disparity_list(before: Array, now: Array, disparities: Array) -> None:
-    """Write all differences d = v_i − v_j (eq. 3.9), D = L₁·L₂ rows (eq. 3.10), the later frame's pairs running fastest.
+    """Write all differences d = v_i − v_j (eq. 3.9): D = L₁·L₂ rows (eq. 3.10).
 
-    The slope's difference is taken on the circle of 180°, −90 < Δm ≤ 90, so that a line near the horizontal is like
-    any other.
+    The pairs of the later frame vary fastest. The difference of slopes is taken modulo 180°, −90 < Δm ≤ 90,
+    so that a nearly horizontal line is not special.
     """
     k = 0
     for i in range(before.shape[0]):
@@ -79,10 +79,10 @@ def disparity_list(before: Array, now: Array, disparities: Array) -> None:
 
 @compiled
 def _bin_points(points: Array, side: float, order: Indices, shape: Indices) -> tuple[Indices, Indices]:
-    """Sort points into square bins of their second and third coordinate.
+    """Sort points into square bins in their second and third coordinate.
 
-    `order` (n,) receives the points bin by bin, in their own order within each, and `shape` (2,) the number of bins.
-    Returned are the bin of each point in the new order and the first point of each bin.
+    `order` (n,) receives the points bin by bin, in their original order within each, and `shape` (2,) the
+    number of bins. Returns the bin of each sorted point and the first point of each bin.
     """
     n = points.shape[0]
     low = np.array([points[:, 1].min(), points[:, 2].min()])
@@ -108,9 +108,10 @@ def _bin_points(points: Array, side: float, order: Indices, shape: Indices) -> t
 def _neighbours(
     points: Array, bins: tuple[Indices, Indices, Indices], here: int, epsilon: float, found: Indices
 ) -> int:
-    """Write all points within ε of one, itself included; return how many.
+    """List all points within ε of a point, including itself; return their number.
 
-    The points are in the order of the bins (shape, bin of each point, first point of each bin), none narrower than ε.
+    The points are sorted by bin; bins (shape, bin of each point, first point of each bin) are at least ε
+    wide.
     """
     shape, where, start = bins
     count = 0
@@ -133,9 +134,9 @@ def _neighbours(
 def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indices:
     """Label the density-based clusters of a list of points (n, 3); −1 is an outlier (eq. 3.1).
 
-    The same labels as scikit-learn's DBSCAN: clusters are numbered by their first core point, a border point goes to
-    the first cluster that reaches it. Neighbours are sought in bins of the second and third coordinate, the separation
-    and the slope, which spread most.
+    The labels equal those of scikit-learn's DBSCAN: clusters are numbered by their first core point, and a
+    border point belongs to the first cluster that reaches it. Neighbours are looked up in bins of the second
+    and third coordinate, separation and slope, which vary most.
     """
     n = points.shape[0]
     labels = np.full(n, -1, dtype=np.int64)
@@ -143,7 +144,7 @@ def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indic
         return labels
     width = points[:, 1].max() - points[:, 1].min()
     height = points[:, 2].max() - points[:, 2].min()
-    # a little wider than ε, as the quotient of a point on a bin's edge may round either way
+    # a little wider than ε, because the quotient of a point on the edge of a bin may round either way
     side = max(1.000001 * epsilon, math.sqrt((width + epsilon) * (height + epsilon) / _MAX_BINS))
     side = max(side, max(width, height) / _MAX_BINS)
     order = np.empty(n, dtype=np.int64)
@@ -182,7 +183,7 @@ def density_clusters(points: Array, epsilon: float, min_samples: float) -> Indic
 
 @compiled
 def main_cluster(labels: Indices) -> int:
-    """Label of the cluster with most members, the first of several; −1 without any."""
+    """Label of the largest cluster, the first of equal ones; −1 if there is none."""
     clusters = 0
     for i in range(labels.size):
         clusters = max(clusters, labels[i] + 1)
@@ -199,7 +200,7 @@ def main_cluster(labels: Indices) -> int:
 def trace_back(
     labels: Indices, main: int, members_before: Indices, members_now: Indices, votes: Indices
 ) -> None:
-    """Count for each object of the earlier and of the later frame how often the main cluster lets them correspond."""
+    """Count how often each object of the earlier and of the later frame correspond in the main cluster."""
     width = members_now.shape[0]
     for k in range(labels.size):
         if labels[k] == main:
@@ -212,7 +213,7 @@ def trace_back(
 
 @compiled
 def _mutual_matches(votes: Indices, matches: Indices) -> int:
-    """Write the pairs of objects that vote for each other most, each at least twice; return how many."""
+    """List the pairs of objects that vote for each other most, at least twice each; return their number."""
     count = 0
     for i in range(votes.shape[0]):
         j = int(np.argmax(votes[i]))
@@ -267,14 +268,15 @@ def filter_kernel(
 
 @dataclass(frozen=True, slots=True)
 class ClusterFilter:
-    """The thesis's filter as a `FalseStarFilter`: objects that appear in the main cluster are true stars.
+    """The thesis's filter as a `FalseStarFilter`: objects in the main cluster are true stars.
 
     Attributes
     ----------
     epsilon
         Radius ε of the neighbourhood.
     min_samples
-        Least number of members of a neighbourhood; None takes `MIN_SAMPLES_SHARE` of the later frame's objects.
+        Smallest number of points in the neighbourhood of a core point; by default `MIN_SAMPLES_SHARE` of the
+        objects in the later frame.
     """
 
     epsilon: float = EPSILON
@@ -286,13 +288,13 @@ class ClusterFilter:
         Raises
         ------
         FilterError
-            If a frame holds more than `MAX_OBJECTS` objects.
+            A frame has more than `MAX_OBJECTS` objects.
         """
         largest = max(len(before), len(now))
         if largest > MAX_OBJECTS:
             raise FilterError(
                 f"filter: {largest} objects in a frame, at most {MAX_OBJECTS} for the cluster filter; "
-                "take the scalable filter"
+                "use the scalable filter"
             )
         least = MIN_SAMPLES_SHARE * len(now) if self.min_samples is None else self.min_samples
         true_before = np.zeros(len(before), dtype=np.bool_)

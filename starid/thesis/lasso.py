@@ -1,10 +1,11 @@
-"""The LASSO path of a dictionary, eq. 2.34: all regularisation parameters at once, exactly, in microseconds.
+"""The LASSO path of a dictionary, eq. 2.34: exact solutions for all regularisation parameters.
 
-The solution of min 1/(2M)·‖ψ̂ − Tω‖² + λ‖ω‖₁ is piecewise linear in λ. With five features and nine columns it has a
-dozen or two breakpoints, which the least-angle regression of Efron et al. (2004) with the LASSO modification finds one
-by one; between them the solution is interpolated. Neighbouring cells look nearly alike, so that the columns are nearly
-parallel: the solution at the path's end, where its errors have added up, is checked against the optimality conditions,
-and where it fails them (columns that are exactly alike, as stored codes can be) coordinate descent takes over.
+The solution of min 1/(2M)·‖ψ̂ − Tω‖² + λ‖ω‖₁ is piecewise linear in λ. With five features and nine columns it
+has one or two dozen breakpoints, which are found one by one with the least-angle regression of Efron et al.
+(2004) and its LASSO modification; between them the solution is interpolated. Neighbouring cells have similar
+features, so the columns are nearly parallel. The solution at the end of the path, where errors have
+accumulated, is therefore checked against the optimality conditions; if it fails (columns can be equal, as
+stored codes are coarse), coordinate descent takes over.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ LAMBDAS: Final[Array] = np.arange(1, 101, dtype=np.float64) * np.float64(0.05)
 LAMBDAS.setflags(write=False)
 
 MAX_STEPS: Final = 96
-"""Most breakpoints followed before coordinate descent takes over."""
+"""Largest number of breakpoints before coordinate descent takes over."""
 
 _MAX_SWEEPS: Final = 2000
 _SINGULAR: Final = 1e-11
@@ -62,7 +63,7 @@ def _solve_active(
 
 @compiled
 def _slope(gram: Array, j: int, active: Indices, size: int, direction: Array) -> float:
-    """How fast the correlation of column j falls along the path."""
+    """Rate at which the correlation of column j falls along the path."""
     value = 0.0
     for k in range(size):
         value += gram[j, active[k]] * direction[k]
@@ -81,7 +82,7 @@ def _next_joining(
     dropped: int,
     length: float,
 ) -> tuple[int, float]:
-    """Column that first reaches the correlation of the active ones within `length`, and where; −1 if none does."""
+    """First column to reach the active ones' correlation within `length`, and where; −1 if none does."""
     joining = -1
     for j in range(rest.size):
         if not idle[j]:
@@ -102,7 +103,7 @@ def _next_joining(
 def _next_dropping(
     omega: Array, active: Indices, size: int, direction: Array, length: float
 ) -> tuple[int, float]:
-    """Place among the active columns whose weight first reaches zero within `length`, and where; −1 if none does."""
+    """First active column whose weight reaches zero within `length`, and where; −1 if none does."""
     dropping = -1
     for k in range(size):
         if direction[k] != 0.0:
@@ -115,16 +116,16 @@ def _next_dropping(
 
 @compiled
 def lars_path(gram: Array, correlation: Array, end: float, breaks: Array, weights: Array) -> int:
-    """Follow the LASSO path down to λ = `end`; return the number of breakpoints, 0 if the path could not be followed.
+    """Follow the LASSO path down to λ = `end`; return the number of breakpoints, or 0 on failure.
 
     Parameters
     ----------
     gram, correlation
         TᵀT/M (n, n) and Tᵀψ̂/M (n,).
     end
-        Least λ wanted.
+        Smallest λ required.
     breaks, weights
-        Output: λ of each breakpoint, falling, and ω there, (MAX_STEPS,) and (MAX_STEPS, n).
+        Output: λ of each breakpoint, decreasing, (MAX_STEPS,), and ω there, (MAX_STEPS, n).
     """
     n = correlation.size
     rest = correlation.copy()
@@ -183,7 +184,7 @@ def lars_path(gram: Array, correlation: Array, end: float, breaks: Array, weight
 
 @compiled
 def coordinate_descent(gram: Array, correlation: Array, penalty: float, omega: Array) -> int:
-    """Solve one LASSO problem from the start value in `omega`, in place; return the number of sweeps."""
+    """Solve a LASSO problem in place, starting from `omega`; return the number of sweeps."""
     n = correlation.size
     for sweep in range(_MAX_SWEEPS):
         change = 0.0
@@ -206,7 +207,7 @@ def coordinate_descent(gram: Array, correlation: Array, penalty: float, omega: A
 
 @compiled
 def optimality_gap(gram: Array, correlation: Array, penalty: float, omega: Array) -> float:
-    """How far ω is from the optimality conditions of the LASSO, relative to the greatest correlation."""
+    """Violation of the optimality conditions of the LASSO by ω, relative to the largest correlation."""
     n = correlation.size
     worst = 0.0
     scale = penalty
@@ -226,9 +227,10 @@ def optimality_gap(gram: Array, correlation: Array, penalty: float, omega: Array
 
 @compiled
 def lasso_path(dictionary: Array, observation: Array, lambdas: Array, weights: Array) -> bool:
-    """Solve the LASSO for all λ; return whether the path was followed (False: coordinate descent).
+    """Solve the LASSO for all λ; return False if coordinate descent was needed.
 
-    It is the least-squares problem of eq. 2.31 with the elastic-net penalty of eq. 2.32, P_a of eq. 2.33, at a = 1.
+    This is the least-squares problem of eq. 2.31 with the elastic-net penalty of eq. 2.32, P_a of eq. 2.33,
+    at a = 1.
 
     Parameters
     ----------
@@ -237,7 +239,7 @@ def lasso_path(dictionary: Array, observation: Array, lambdas: Array, weights: A
     observation
         ψ̂, (M,).
     lambdas
-        λ, rising, (k,).
+        λ, increasing, (k,).
     weights
         Output: ω for each λ, (k, n).
     """
@@ -279,10 +281,11 @@ def lasso_path(dictionary: Array, observation: Array, lambdas: Array, weights: A
 
 @compiled
 def choose_lambdas(dictionary: Array, observation: Array, weights: Array, error: Array) -> tuple[int, int]:
-    """Pick the λ of least mean squared error and the largest λ within one standard error of it.
+    """Choose the λ of the least mean squared error, and the largest λ within one standard error of it.
 
-    The error is the mean over the M features of the squared residual ψ̂ − Tω, its standard error their standard
-    deviation (over M − 1) divided by √M, at the least error. `error` (k,) is filled with the mean squared errors.
+    The error is the mean over the M features of the squared residual ψ̂ − Tω; its standard error is their
+    standard deviation (over M − 1) divided by √M, at the least error. `error` (k,) is filled with the mean
+    squared errors.
     """
     features, n = dictionary.shape
     squared = np.empty(features)

@@ -1,4 +1,4 @@
-"""Lost in space: the LSI algorithm of the thesis, from one feature vector to boresight and roll (its algorithm 1)."""
+"""The LSI algorithm of the thesis (algorithm 1): boresight and roll from one feature vector."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ _RESULT_SIZE: Final = 16
 _MIN_WEIGHT: Final = 1e-3
 
 RA, DEC, THETA, ERROR, LAMBDA, BORESIGHT, POINTER = 1, 2, 3, 4, 5, 6, 9
-"""Places in a row of results after Σω: α, δ (degrees), θ (radians), ε_ψ, λ, boresight and pointer vectors."""
+"""Indices in a row of results, after Σω: α, δ (°), θ (rad), ε_ψ, λ, boresight and pointer vectors."""
 
 
 class SearchedCells(NamedTuple):
-    """A database for the kernels: its cells as the stars make them, the codes stored of them, and which of the two count.
+    """A database for the kernels: stars, stored codes, and which of the two to use.
 
     Attributes
     ----------
     arrays
         Stars, grid and normalisation.
     features, theta
-        Stored codes, (m, 5) and (m,); a cell without stars has the polar angle 255.
+        Stored codes, (m, 5) and (m,); a cell without stars has polar angle 255.
     exact
-        Distances and dictionaries in full precision, not from the codes.
+        Use full-precision distances and dictionaries instead of the codes.
     matlab
-        The LASSO as MATLAB's function `lasso` solves it, not its exact path.
+        Solve the LASSO as MATLAB's function `lasso` does, not exactly.
     """
 
     arrays: CellArrays
@@ -63,18 +63,18 @@ class SearchedCells(NamedTuple):
 
 
 class LsiWork(NamedTuple):
-    """What the kernels fill in; made by `lsi_work`.
+    """Arrays that the kernels fill in; made by `lsi_work`.
 
     Attributes
     ----------
     cells, dictionary
         Cells of the dictionary (9,) and their normalised features T, (5, 9).
     places
-        Their right ascensions and declinations, degrees, and polar angles, radians, (3, 9).
+        Right ascensions and declinations, degrees, and polar angles, radians, of these cells, (3, 9).
     weights, results
-        Weights and numbers of the two estimates, (2, 9) and (2, 16).
+        Weights and results of the two estimates, (2, 9) and (2, 16).
     found
-        Distance of the nearest cell and number of cells looked at, (2,).
+        Distance of the nearest cell, and number of cells compared, (2,).
     """
 
     cells: Indices
@@ -86,7 +86,7 @@ class LsiWork(NamedTuple):
 
 
 def lsi_work() -> LsiWork:
-    """Room for one estimate."""
+    """Allocate the arrays for one estimate."""
     nine = DICTIONARY_SIZE
     return LsiWork(
         np.empty(nine, dtype=np.int64),
@@ -100,27 +100,27 @@ def lsi_work() -> LsiWork:
 
 @dataclass(frozen=True, slots=True)
 class LsiEstimate:
-    """One estimate of the boresight and of what the frame looks like there.
+    """An estimate of the boresight and the reconstructed features.
 
     Attributes
     ----------
     right_ascension_deg, declination_deg
-        Estimated boresight f = (α̃, δ̃), eq. 2.14: the centre of the frame, degrees. For the lower-left corner that
-        the thesis tabulates subtract half a frame.
-    theta_rad
-        Estimated polar angle of the frame object for a camera with north up, eq. 2.17 with the angles averaged on the
-        circle; the roll is what the observed polar angle differs from it by.
+            Estimated boresight f = (α̃, δ̃), eq. 2.14: the centre of the frame, degrees. Subtract half a
+            frame for the lower-left corner, which the thesis tabulates.
+        theta_rad
+            Estimated polar angle of the frame object for a camera with north up, eq. 2.17 with a circular
+            mean of the angles. The roll is the difference between the observed and this polar angle.
     omega
         Weights ω of the nine dictionary cells, (9,).
     penalty
-        The λ that they belong to.
+        The λ of these weights.
     error_psi
         Error of the reconstruction ε_ψ = ‖ψ̂ − Tω‖, eq. 2.20, on the normalised scale.
     reconstruction
         Reconstructed observation T·ω, eq. 2.19, on the normalised scale, (5,).
     boresight, pointer
-        Spherical geometry: unit vectors (ICRS) of the boresight and, at right angles to it, of the direction in which
-        the frame object lies; zeros in the planar geometry.
+        Spherical geometry: unit vectors (ICRS) of the boresight and, perpendicular to it, of the direction of
+        the frame object; zeros in the planar geometry.
     """
 
     right_ascension_deg: float
@@ -136,22 +136,22 @@ class LsiEstimate:
 
 @dataclass(frozen=True, eq=False)
 class LsiSolution:
-    """What the LSI algorithm makes of one observation.
+    """The result of the LSI algorithm for one observation.
 
     Attributes
     ----------
     observation
         Normalised observation ψ̂, (5,).
     nearest
-        Cell of the nearest neighbour t₅, counted from 0; the thesis counts from 1.
+        Cell of the nearest neighbour t₅, numbered from 0 (in the thesis from 1).
     distance
         Its distance on the normalised scale.
     cells
         Cells of the dictionary, (9,).
     dictionary
-        T of eq. 2.13: normalised features of these cells in columns, (5, 9).
+        T of eq. 2.13: normalised features of these cells as columns, (5, 9).
     weights, results
-        Weights and numbers of the two estimates, (2, 9) and (2, 16).
+        Weights and results of the two estimates, (2, 9) and (2, 16).
     """
 
     observation: Array
@@ -164,12 +164,12 @@ class LsiSolution:
 
     @cached_property
     def mse(self) -> LsiEstimate:
-        """Estimate at the λ of least mean squared error."""
+        """Estimate at the λ of the least mean squared error."""
         return self._estimate(0)
 
     @cached_property
     def one_se(self) -> LsiEstimate:
-        """Estimate at the largest λ within one standard error of the least."""
+        """Estimate at the largest λ within one standard error of the least error."""
         return self._estimate(1)
 
     def _estimate(self, row: int) -> LsiEstimate:
@@ -189,7 +189,7 @@ class LsiSolution:
 
 @compiled
 def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
-    """Set up the dictionary about a cell: its features, the boresights F of eq. 2.16 and the angles Θ of eq. 2.18."""
+    """Fill in the dictionary around a cell: features, boresights F of eq. 2.16 and angles Θ of eq. 2.18."""
     arrays = searched.arrays
     first_row = dictionary_cells(arrays.grid, cell, work.cells, work.places[0])
     sums = np.empty(8)
@@ -208,7 +208,7 @@ def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
 
 @compiled
 def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
-    """Combine boresights and angles in the flat plane, with weights scaled to a sum of one."""
+    """Combine boresights and angles in the flat plane, with weights normalised to a sum of one."""
     cos_sum = 0.0
     sin_sum = 0.0
     ra = 0.0
@@ -225,7 +225,7 @@ def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
 
 @compiled
 def _sphere_estimate(omega: Array, work: LsiWork, result: Array) -> None:
-    """Combine boresights and frame-object directions as vectors, so that poles and 0°/360° are like any other place."""
+    """Combine boresights and frame-object directions as vectors, without singularities."""
     boresight = np.zeros(3)
     pointer = np.zeros(3)
     for j in range(9):
@@ -268,10 +268,11 @@ def estimate_from_path(
     chosen: tuple[int, int],
     work: LsiWork,
 ) -> None:
-    """Estimates from the weights at two λ of a LASSO path.
+    """Compute the estimates from the weights at two λ of a LASSO path.
 
-    The boresight is F·ω (eq. 2.15, printed again as eq. 2.36) and the angle Θ·ω (eq. 2.37) with weights scaled to a
-    sum of one; the reconstruction is T·ω (eq. 2.35). Should the weights cancel, the cell itself is the estimate.
+    The boresight is F·ω (eq. 2.15, printed again as eq. 2.36) and the angle Θ·ω (eq. 2.37), with weights
+    normalised to a sum of one; the reconstruction is T·ω (eq. 2.35). If the weights cancel, the cell itself
+    is the estimate.
     """
     for row in range(2):
         omega = work.weights[row]
@@ -302,7 +303,7 @@ def estimate_from_path(
 def estimate_from_cell(
     searched: SearchedCells, cell: int, observation: Array, lambdas: Array, work: LsiWork
 ) -> None:
-    """Dictionary, LASSO and estimates about a cell."""
+    """Compute dictionary, LASSO and estimates for a cell."""
     fill_dictionary(searched, cell, work)
     path = np.empty((lambdas.size, 9))
     error = np.empty(lambdas.size)
@@ -318,7 +319,7 @@ def estimate_from_cell(
 def lsi_kernel(
     index: CellIndex, searched: SearchedCells, observation: Array, lambdas: Array, work: LsiWork
 ) -> int:
-    """Search and estimate in one go; return the nearest cell, −1 if there is none."""
+    """Search and estimate; return the nearest cell, −1 if there is none."""
     if searched.exact:
         cell = exact_nearest(index, searched.arrays, observation, work.found)
     else:
@@ -334,7 +335,7 @@ def lsi_kernel(
 
 @compiled
 def _angle_gap(code: float, other: float, slack: float) -> float:
-    """Difference of two polar angles on the circle of 255 code steps, less what a stored code leaves open."""
+    """Circular difference of two polar angles in code steps (255 per turn), minus a slack."""
     turn = (code - other) / 255.0
     return max(255.0 * abs(turn - round(turn)) - slack, 0.0)
 
@@ -349,18 +350,20 @@ def region_nearest(
     theta: float,
     found: Array,
 ) -> int:
-    """Find the nearest neighbour among the cells of a square region of search; −1 if the region holds no cell.
+    """Find the nearest neighbour among the cells of a square search region; −1 if the region has no cell.
 
-    The cells are looked at one by one, as in the thesis; a side of 720° takes in the whole database.
+    The cells are compared one by one, as in the thesis; a side of 720° includes the whole database.
 
     Parameters
     ----------
     ra_deg, dec_deg, side_deg
-        Centre and side Γ of the square, degrees; it wraps in right ascension and is cut off at the grid's edges.
+        Centre and side Γ of the square, degrees; it wraps in right ascension and is cut off at the edges of
+        the grid.
     theta
-        Polar angle of the frame object, radians, to count as a sixth feature with 100 for a full turn; NaN leaves it out.
+        Polar angle of the frame object, radians, as a sixth feature with 100 for a full turn; NaN to ignore
+        it.
     found
-        Output (2,): distance on the normalised scale and number of cells in the region.
+        Output (2,): distance on the normalised scale, and number of cells in the region.
     """
     arrays, grid = searched.arrays, searched.arrays.grid
     sums = np.empty(8)
@@ -417,25 +420,26 @@ def region_nearest(
 class LostInSpace:
     """The LSI algorithm on one database.
 
-    The nearest neighbour t₅ is the cell of least distance ‖ψ̂ − t̂‖ (eq. 2.12) of all d_i (eq. 2.28), eq. 2.29; its
-    3×3 neighbourhood is the dictionary, the LASSO gives the weights, and the weights give the answer.
+    The nearest neighbour t₅ is the cell of least distance ‖ψ̂ − t̂‖ (eq. 2.12) of all d_i (eq. 2.28),
+    eq. 2.29. Its 3×3 neighbourhood is the dictionary, and the boresight is the mean of its cells with the weights
+    from the LASSO.
 
     Parameters
     ----------
     database
         Feature database.
     precision
-        "exact": distances and dictionaries in full precision, computed from the stars where the stored codes leave a
-        doubt; this is what the published accuracy was made with. "stored": the 8-bit codes as they are.
-    solver
-        "exact": the LASSO's path, exactly. "matlab": as MATLAB's function `lasso` solves it by default, which is what
-        the published accuracy was made with. "sklearn": nearest neighbours of the whole database and the LASSO of
-        scikit-learn, the same answers some hundred times slower (`starid.thesis.reference`).
+            "exact": distances and dictionaries in full precision, computed from the stars where the stored
+            codes leave doubt, as for the published accuracy. "stored": the 8-bit codes only.
+        solver
+            "exact": the exact path of the LASSO. "matlab": as MATLAB's function `lasso` solves it by default,
+            as for the published accuracy. "sklearn": nearest neighbours over the whole database and the LASSO
+            of scikit-learn; the same answers, hundreds of times slower (`starid.thesis.reference`).
 
     Raises
     ------
     DatabaseError
-        If the precision or the solver is unknown.
+        The precision or the solver is unknown.
     """
 
     def __init__(
@@ -454,7 +458,7 @@ class LostInSpace:
         self._reference = ReferenceSearch(database) if solver == "sklearn" else None
 
     def solve(self, features: FeatureVector) -> LsiSolution:
-        """Estimate boresight and roll from the features of one frame, searching the whole database."""
+        """Estimate boresight and roll from the features of a frame, searching the whole database."""
         return self.solve_normalised(self.database.normalise(features))
 
     def solve_normalised(self, observation: Array) -> LsiSolution:
@@ -463,7 +467,7 @@ class LostInSpace:
         Raises
         ------
         DatabaseError
-            If the observation is not five finite numbers.
+            The observation is not five finite numbers.
         """
         if self._reference is not None:
             return self.estimate(observation, *self.nearest(observation))
@@ -473,9 +477,9 @@ class LostInSpace:
         return _solution(observation, nearest, float(work.found[0]), work)
 
     def nearest(self, observation: Array, *, theta_rad: float = math.nan) -> tuple[int, float]:
-        """Nearest cell of the whole database and its distance, for a normalised observation; the search alone.
+        """Find the nearest cell of the whole database, and its distance, for a normalised observation.
 
-        With a polar angle that counts as a sixth feature, 100 for a full turn; the answer then depends on the roll.
+        A polar angle counts as a sixth feature, with 100 for a full turn; the answer then depends on roll.
         """
         self._check(observation)
         found = np.empty(2)
@@ -490,7 +494,7 @@ class LostInSpace:
         return int(cells[0]), float(distances[0])
 
     def neighbours(self, observation: Array, count: int) -> tuple[Array, Indices]:
-        """Distances (count,) of the nearest cells by their stored codes, in any order, and these cells; −1 where there are fewer."""
+        """Find the nearest cells by stored codes: distances and cells (count,), unordered; −1 if fewer."""
         if self._reference is not None:
             return self._reference.nearest(observation, count)
         distances, cells = np.empty(count), np.empty(count, dtype=np.int64)
@@ -506,7 +510,7 @@ class LostInSpace:
         *,
         theta_rad: float = math.nan,
     ) -> tuple[int, float, int]:
-        """Nearest cell of a square region, its distance, and how many cells the region holds; cell −1 if none.
+        """Find the nearest cell of a square region, or −1, its distance, and the number of cells.
 
         A polar angle counts as in `nearest`.
         """
@@ -516,7 +520,7 @@ class LostInSpace:
         return cell, float(found[0]), int(found[1])
 
     def estimate(self, observation: Array, cell: int, distance: float) -> LsiSolution:
-        """Dictionary, LASSO and estimates about a given cell."""
+        """Compute dictionary, LASSO and estimates for a given cell."""
         self._check(observation)
         work = lsi_work()
         if self._reference is None:
@@ -530,7 +534,9 @@ class LostInSpace:
 
     def _check(self, observation: Array) -> None:
         if observation.shape != (5,) or not np.isfinite(observation).all():
-            raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
+            raise DatabaseError(
+                "LSI: an observation must be five finite numbers; check the stars of the frame"
+            )
 
 
 def _solution(observation: Array, nearest: int, distance: float, work: LsiWork) -> LsiSolution:

@@ -1,9 +1,10 @@
-"""The LSI algorithm for a real sensor: features on the sphere, many neighbours, and no answer that is not verified.
+"""The LSI algorithm for a real sensor: features on the sphere, many neighbours, and only verified answers.
 
-Off the plane of the thesis its nearest neighbour is right in a third of the frames only: stars near the brightness
-limit come and go with the noise of their magnitudes. So the nearest neighbours are tried one after the other: the stars
-of each vote for a roll (`starid.thesis.coarse_match`), a clear peak is paired star by star, and the attitude that follows is
-refined and verified by the geometric identifier's tracking stage. What does not pass is invalid.
+Outside the plane of the thesis its nearest neighbour is right in only a third of the frames, because stars
+near the brightness limit come and go with the noise of their magnitudes. The nearest neighbours are therefore
+tried one after the other: the stars of each vote for a roll (`starid.thesis.coarse_match`), a clear peak is
+paired star by star, and the resulting attitude is refined and verified by the tracking stage of the geometric
+identifier. What fails is invalid.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
-from starid.geometric.pattern_index import seen_stars
+from starid.geometric.pattern_index import resolved_stars
 from starid.geometric.verified import VerifiedIdentifier
-from starid.single_camera import Measured
+from starid.single_camera import CheckedDetections
 from starid.solution import Reason, Solution
 from starid.thesis.coarse_match import next_candidate
 from starid.thesis.database import DatabaseParameters
@@ -36,7 +37,7 @@ from starid.thesis.lsi import LostInSpace, Solver
 from starid.wahba import solve_wahba
 
 STARS_PER_FIELD: Final = 60
-"""Stars in a field that the default brightness limit of the features aims at."""
+"""Number of stars per field for the default brightness limit of the features."""
 
 WINDOW_PX: Final = 12.0
 """Window in which a candidate is verified, pixels."""
@@ -57,7 +58,7 @@ _MIN_VOTES: Final = 6.0
 
 @dataclass(frozen=True, eq=False)
 class FieldStars:
-    """The detections as the features see them.
+    """The detections used for the features.
 
     Attributes
     ----------
@@ -66,7 +67,7 @@ class FieldStars:
     magnitude
         Magnitudes, (n,), brightest first.
     row
-        Row of each in the detections given, (n,).
+        Row of each star in the detections given, (n,).
     """
 
     place: Array
@@ -76,18 +77,19 @@ class FieldStars:
 
 @dataclass(frozen=True, slots=True)
 class LsiReport:
-    """What the last call did, for statistics.
+    """Statistics of the last call.
 
     Attributes
     ----------
     coarse
-        Attitude of the thesis's answer: one nearest neighbour, LASSO, roll from the polar angle. None without one.
+        Attitude as in the thesis: one nearest neighbour, LASSO, roll from the polar angle. None if there is
+        none.
     tried
-        Candidates that voted.
+        Number of candidates for which the stars voted.
     verified
-        Candidates that were put to the verification.
+        Number of candidates passed to the verification.
     zero_point
-        Magnitude of one unit of flux that was used.
+        Magnitude of unit flux, as used.
     """
 
     coarse: Attitude | None
@@ -103,22 +105,24 @@ class LsiOptions:
     Attributes
     ----------
     feature_limit
-        Faintest V whose stars make features; by default what gives some 60 stars a field. The sensor must see deeper.
+        Faintest V of the stars in the features; by default for about 60 stars per field. The sensor must see
+        deeper.
     overlap
         Overlap ratio of the database.
     neighbours
-        Most neighbours tried, the nearest first.
+        Largest number of neighbours tried, nearest first.
     zero_point
-        Magnitude V of one unit of flux, where it is known. Where it is not it is found: every answer shows it, the next
-        frame is tried with that first, and then with what its own brightnesses suggest.
+        V magnitude of unit flux, if it is known. Otherwise it is learned: each answer determines it, and for
+        the next frame that value is tried first, and then values suggested by the brightness of the frame's
+        stars.
     limiting_magnitude
-        Faintest V of the verification, as `Identifier` takes it.
+        Faintest V of the verification (see `Identifier`).
     database
         Feature database to use instead of the cached one.
     cache
-        Keep database and index in the cache folder.
+        Keep the database and the index in the cache folder.
     solver
-        Solver of nearest neighbour and LASSO: "exact", "matlab", or "sklearn" for scikit-learn's (`LostInSpace`).
+        Solver of nearest neighbour and LASSO: "exact", "matlab" or "sklearn" (see `LostInSpace`).
     """
 
     feature_limit: float | None = None
@@ -141,20 +145,20 @@ class LsiIdentifier(VerifiedIdentifier):
     Parameters
     ----------
     camera
-        What the detections were taken with.
+        The camera that took the image.
     catalog
-        Default: the whole of Hipparcos at its default epoch.
+        By default all of Hipparcos at its default epoch.
     options
-        Default: `LsiOptions()`.
+        By default `LsiOptions()`.
     **changes
-        Fields of `LsiOptions` that are to differ from it.
+        Fields of `LsiOptions` to change.
 
     Raises
     ------
     DatabaseError
-        If the database given belongs to another camera, catalogue, band or geometry.
+        The database given belongs to another camera, catalogue, band or geometry.
     StaridError
-        If the catalogue is empty.
+        The catalogue is empty.
     """
 
     def __init__(
@@ -172,7 +176,7 @@ class LsiIdentifier(VerifiedIdentifier):
         share = 0.5 * (1.0 - math.cos(math.radians(0.5 * probe.fov_deg)))
         limit = self._limit_for(share) if options.feature_limit is None else options.feature_limit
         parameters = dataclasses.replace(probe, kappa=limit)
-        seen = seen_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
+        seen = resolved_stars(self._catalog, limit + 1.0, _BLEND_PX / camera.focal_px[0])
         self.database = (
             obtain_database(seen, parameters, cache=options.cache)
             if options.database is None
@@ -191,21 +195,21 @@ class LsiIdentifier(VerifiedIdentifier):
 
     @property
     def verifier(self) -> Identifier:
-        """What verifies and tracks."""
+        """The geometric identifier that verifies answers and tracks."""
         return self._verifier
 
     @property
     def zero_point(self) -> float | None:
-        """Magnitude V of one unit of flux, as given or as the last answer showed it; None before either."""
+        """V magnitude of unit flux, as given or as learned from the last answer; None if neither."""
         return self._zero_point
 
     @property
     def database_bytes(self) -> int:
-        """Size of the feature database, five bytes a cell, and of the index for verification, bytes."""
+        """Size of the feature database (five bytes per cell) and of the index for verification, bytes."""
         return 5 * self.database.cells + self.verifier.database_bytes
 
     def reset(self) -> None:
-        """Forget what frames have shown: the zero point is again the one given, or none."""
+        """Forget the learned zero point; the given one, if any, is used again."""
         self._zero_point = self._given_zero_point
 
     def _limit_for(self, share: float) -> float:
@@ -214,26 +218,26 @@ class LsiIdentifier(VerifiedIdentifier):
         return math.ceil(10.0 * float(v[row])) / 10.0
 
     def _magnitude_of_rank(self, share: float) -> float:
-        """V of the star of rank `_ZERO_POINT_STAR` in an average field."""
+        """V magnitude of the star of rank `_ZERO_POINT_STAR` in an average field."""
         v = np.sort(self._catalog.v)
         return float(v[min(int(_ZERO_POINT_STAR / share), v.size - 1)])
 
     def warm_up(self) -> None:
-        """Compile, or load, the kernels, so that the first real frame is not late."""
+        """Compile or load the kernels, so that the first frame is not late."""
         self.verifier.warm_up()
         xy = self._camera.border(4)[:_MIN_STARS] * 0.25 + 0.375 * np.array(
             [self._camera.width, self._camera.height]
         )
-        self._first_verified(Measured.of(xy, np.ones(len(xy))), [0.0])
+        self._first_verified(CheckedDetections.of(xy, np.ones(len(xy))), [0.0])
 
-    def _identify(self, measured: Measured) -> Solution:
+    def _identify(self, measured: CheckedDetections) -> Solution:
         solution = self._first_verified(measured, self._zero_points(measured.flux))
         if solution.valid:
             self.learn(solution, measured.flux)
         return solution
 
-    def _first_verified(self, measured: Measured, zero_points: Sequence[float]) -> Solution:
-        """First verified answer of the zero points, tried in their order."""
+    def _first_verified(self, measured: CheckedDetections, zero_points: Sequence[float]) -> Solution:
+        """Try the zero points in order; return the first verified answer."""
         tried = verified = 0
         coarse: Attitude | None = None
         enough = False
@@ -258,7 +262,7 @@ class LsiIdentifier(VerifiedIdentifier):
         return Solution.invalid(Reason.NO_MATCH if enough else Reason.TOO_FEW_STARS)
 
     def _zero_points(self, flux: Array) -> list[float]:
-        """Zero points to try: the one given, or what the last answer showed and then guesses from the frame."""
+        """Zero points to try: the given one, or the learned one and then guesses from the frame."""
         if self._given_zero_point is not None:
             return [self._given_zero_point]
         shown = [] if self._zero_point is None else [self._zero_point]
@@ -270,7 +274,7 @@ class LsiIdentifier(VerifiedIdentifier):
         return shown + [guess + step for step in _ZERO_POINT_STEPS]
 
     def learn(self, solution: Solution, flux: Array) -> None:
-        """Take the zero point that the matched stars of a valid answer show, where none was given."""
+        """Learn the zero point from the matched stars of a valid answer, if none was given."""
         if self._given_zero_point is None and solution.star_count >= _MIN_STARS:
             magnitudes = self._catalog.v[solution.catalog_index]
             found = magnitudes + 2.5 * np.log10(np.maximum(flux[solution.detection_index], 1e-30))
@@ -296,7 +300,7 @@ class LsiIdentifier(VerifiedIdentifier):
         return extract_features(field.magnitude[bright], field.place[bright])
 
     def _coarse(self, features: FeatureVector) -> tuple[Attitude, Array]:
-        """Attitude in the thesis's form, one neighbour and LASSO, and its boresight (1, 2) in degrees."""
+        """Attitude as in the thesis, from one neighbour and LASSO, and its boresight (1, 2) in degrees."""
         solution = self.lost_in_space.solve(features).mse
         x, y = math.cos(features.theta_rad), math.sin(features.theta_rad)
         across = np.cross(solution.boresight, solution.pointer)
@@ -305,7 +309,7 @@ class LsiIdentifier(VerifiedIdentifier):
         return Attitude.from_matrix(np.stack(rows)), place
 
     def _candidates(self, features: FeatureVector) -> Iterator[Array]:
-        """Boresights (k, 2) in degrees to try: centres of the nearest cells in growing numbers, none twice."""
+        """Yield boresights (k, 2), degrees: centres of growing numbers of nearest cells, none twice."""
         observation = self.database.normalise(features)
         most = min(self._neighbours, self.database.cells)
         tried = np.empty(0)
@@ -320,7 +324,7 @@ class LsiIdentifier(VerifiedIdentifier):
             yield centres[new]
 
     def _spots(self, places: Array) -> Array:
-        """Number of the spot that each place (n, 2) lies in, on a grid just fine enough for the votes."""
+        """Number the cells, of a grid just fine enough for the votes, that contain positions (n, 2)."""
         step = math.degrees(_SPREAD * self._offset_px / self.database.parameters.focal_px)
         band = np.floor((places[:, 1] + 90.0) / step)
         columns = np.maximum(np.rint(360.0 * np.cos(np.radians((band + 0.5) * step - 90.0)) / step), 1.0)
@@ -341,9 +345,9 @@ class LsiIdentifier(VerifiedIdentifier):
         return np.column_stack([ra % 360.0, grid.row_dec_deg[row]])
 
     def attitudes(self, field: FieldStars, candidates: Array) -> Iterator[tuple[Attitude | None, int]]:
-        """Attitudes of the candidate boresights (k, 2) that the stars vote for, and how many were tried since the last.
+        """Yield attitudes with enough votes, from boresights (k, 2), and the number tried since the last.
 
-        The last item has no attitude unless the last candidate gave one.
+        The last item has no attitude unless the last candidate has one.
         """
         voters = min(field.magnitude.size, _MAX_VOTERS)
         observed = np.column_stack([field.place[:voters], field.magnitude[:voters]])

@@ -1,10 +1,11 @@
-"""The LASSO as MATLAB's function `lasso` solves it by default, which is what the published numbers were made with.
+"""The LASSO as MATLAB's function `lasso` solves it, with which the published numbers were computed.
 
-The function removes the mean of the observation and the means of the columns (`Intercept`), divides the columns by
-their standard deviation over the rows (`Standardize`, divisor M), and solves for one λ after another from the greatest
-down by coordinate descent over the active set. Each λ starts from the weights of the one before and ends as soon as no
-weight changes by more than `RelTol` = 1e-4 of one plus its size. With five rows and nine columns that are nearly
-alike this stops far from the minimum, near the weights of the greater λ: the published accuracy is this rounding's.
+The function removes the mean of the observation and the means of the columns (`Intercept`), divides the
+columns by their standard deviation over the rows (`Standardize`, divisor M), and solves for one λ after
+another, from the largest down, by coordinate descent over the active set. Each λ starts from the weights of
+the previous one and ends as soon as no weight changes by more than `RelTol` = 1e-4 of one plus its size. With
+five rows and nine nearly equal columns this stops far from the minimum, near the weights of the larger λ: the
+published accuracy is due to this early stop.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from starid.arrays import Array, Mask
 from starid.jit import compiled
 
 RELATIVE_TOLERANCE: Final = 1e-4
-"""`RelTol` of MATLAB's `lasso`: greatest change of a weight at which a sweep is the last."""
+"""`RelTol` of MATLAB's `lasso`: the descent ends when no weight changes by more."""
 
 MAX_SWEEPS: Final = 100_000
 """`MaxIter` of MATLAB's `lasso`."""
@@ -26,9 +27,9 @@ MAX_SWEEPS: Final = 100_000
 
 @compiled
 def standardise(dictionary: Array, columns: Array, deviation: Array) -> None:
-    """Write the columns with mean 0 and standard deviation 1 over the rows (divisor M), and their deviations.
+    """Standardise the columns to mean 0 and standard deviation 1 (divisor M); also return the deviations.
 
-    A column that is the same in every row becomes zero and has the deviation 0.
+    A constant column becomes zero, with deviation 0.
     """
     rows, n = dictionary.shape
     for j in range(n):
@@ -50,7 +51,7 @@ def standardise(dictionary: Array, columns: Array, deviation: Array) -> None:
 
 @compiled
 def sweep(columns: Array, rest: Array, weights: Array, active: Mask, penalty: float) -> float:
-    """Set each active weight to its minimum in turn; return the greatest change relative to one plus its size.
+    """Set each active weight to its minimum in turn; return the largest change relative to one plus its size.
 
     `rest` is the residual of the observation; a weight that becomes zero leaves the active set.
     """
@@ -86,7 +87,7 @@ def _residual(columns: Array, centred: Array, weights: Array, rest: Array) -> No
 def _descend(
     columns: Array, centred: Array, weights: Array, active: Mask, usable: Mask, penalty: float
 ) -> None:
-    """Solve for one λ from the weights at hand: sweeps over the active set until they settle, then one over all."""
+    """Solve for one λ: sweep over the active set until the weights settle, then once over all."""
     rows, n = columns.shape
     rest = np.empty(rows)
     wider = np.empty(n, dtype=np.bool_)
@@ -117,7 +118,7 @@ def _descend(
 
 @compiled
 def matlab_path(dictionary: Array, observation: Array, lambdas: Array, weights: Array) -> None:
-    """Weights of the LASSO for all λ as MATLAB's `lasso(T, ψ̂, 'Lambda', λ)` returns them, without the intercept.
+    """Solve the LASSO for all λ as MATLAB's `lasso(T, ψ̂, 'Lambda', λ)` does, without the intercept.
 
     Parameters
     ----------
@@ -126,9 +127,9 @@ def matlab_path(dictionary: Array, observation: Array, lambdas: Array, weights: 
     observation
         ψ̂, (M,).
     lambdas
-        λ, rising, (k,).
+        λ, increasing, (k,).
     weights
-        Output: ω for each λ in the scale of the dictionary, (k, n).
+        Output: ω for each λ, in the scale of the dictionary, (k, n).
     """
     rows, n = dictionary.shape
     columns = np.empty((rows, n))

@@ -1,4 +1,4 @@
-"""The measures by which the thesis judges its algorithms."""
+"""The metrics with which the thesis evaluates its algorithms."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from starid.arrays import Array, Indices, Mask
 def boresight_error(
     ra_deg: ArrayLike, dec_deg: ArrayLike, true_ra_deg: ArrayLike, true_dec_deg: ArrayLike
 ) -> Array:
-    """Error of the boresight ε_f = ‖f − f̃‖, eq. 2.21, degrees of the flat plane, with α on the circle."""
+    """Error of the boresight ε_f = ‖f − f̃‖, eq. 2.21, degrees in the flat plane; differences in α wrap."""
     east = (np.asarray(ra_deg) - np.asarray(true_ra_deg) + 180.0) % 360.0 - 180.0
     north = np.asarray(dec_deg) - np.asarray(true_dec_deg)
     return np.asarray(np.hypot(east, north), dtype=np.float64)
 
 
 def rotation_error(angle_deg: ArrayLike, true_angle_deg: ArrayLike) -> Array:
-    """Error of the rotation angle ε_θ = |θ − θ̃|, eq. 2.22, degrees on the circle, 0 … 180."""
+    """Error of the rotation angle ε_θ = |θ − θ̃|, eq. 2.22, degrees, 0 … 180."""
     turn = (np.asarray(angle_deg) - np.asarray(true_angle_deg) + 180.0) % 360.0 - 180.0
     return np.asarray(np.abs(turn), dtype=np.float64)
 
 
 def error_colours(error: ArrayLike, greatest: float) -> Array:
-    """Colours of an error map, eq. 6.1: from green at 0 to red at `greatest` and beyond, RGB 0 … 1, (…, 3)."""
+    """Colours of an error map, eq. 6.1: from green at 0 to red from `greatest` on, RGB 0 … 1, (…, 3)."""
     share = np.clip(np.asarray(error, dtype=np.float64) / greatest, 0.0, 1.0)
     return np.stack([share, 1.0 - share, np.zeros_like(share)], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)
 class Confusion:
-    """Confusion matrix of a false-star filter, and the indicators of eq. 6.2 made of it.
+    """Confusion matrix of a false-star filter, and the indicators of eq. 6.2.
 
     Attributes
     ----------
@@ -59,7 +59,7 @@ class Confusion:
         return np.array(dataclasses.astuple(self), dtype=np.int64)
 
     def percent(self, indicator: str) -> float:
-        """An indicator by its name, percent."""
+        """An indicator by name, percent."""
         return 100.0 * float(getattr(self, indicator))
 
     @classmethod
@@ -70,18 +70,18 @@ class Confusion:
 
     @property
     def accuracy(self) -> float:
-        """Share of right decisions."""
+        """Share of correct decisions."""
         right = self.true_positive + self.true_negative
         return _share(right, right + self.false_positive + self.false_negative)
 
     @property
     def precision(self) -> float:
-        """Share of true stars among those taken for true."""
+        """Share of true stars among those taken for true stars."""
         return _share(self.true_positive, self.true_positive + self.false_positive)
 
     @property
     def recall(self) -> float:
-        """Share of the true stars that were taken for true."""
+        """Share of true stars that are taken for true stars."""
         return _share(self.true_positive, self.true_positive + self.false_negative)
 
     @property

@@ -1,10 +1,11 @@
-"""Stars that a frame lacks: put back from the frame before, or left out of account by dividing the field (section 7.2).
+"""Missing stars: restored from the previous frame, or avoided by dividing the field (section 7.2).
 
-The thesis names both as what is to be done, and does neither; this is our form of it. One missing star changes all five
-features of a frame. A star that the frame before had, and that the camera's motion carries to a place inside the field
-where nothing is seen now, is missing: it is put back there. Lost in space there is no frame before; there the field is
-divided into smaller overlapping circles, each with a database of that width, and the circles whose answers agree
-about the boresight of the whole field are believed: those that the missing stars belong to agree with nothing.
+The thesis suggests both as future work; this is our implementation. A single missing star changes all five
+features of a frame. A star of the previous frame that the camera motion carries to a position in the field
+where nothing is detected is missing, and is restored there. Lost in space there is no previous frame. The
+field is then divided into smaller overlapping circles, each with a database of that width, and the answer is
+the boresight of the whole field on which several circles agree: circles with missing stars agree with no
+other.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from starid.thesis.features import extract_features
 from starid.thesis.lsi import LostInSpace
 from starid.thesis.metrics import boresight_error
 
-GREATEST_ERROR_PSI: Final = 2.0
-"""ε_ψ beyond which a circle has no vote: its features fit no cell."""
+MAX_ERROR_PSI: Final = 2.0
+"""Largest ε_ψ of a circle that votes; beyond it, its features fit no cell."""
 
 SUBFIELD_OFFSET: Final = 0.3
-"""Distance of the outer circles' centres from the middle of the field, in parts of its half width."""
+"""Distance of the centres of the outer circles from the centre of the field, as a share of its half-width."""
 
 
 def restore_missing(
@@ -40,16 +41,16 @@ def restore_missing(
     radius_deg: float,
     margin_deg: float,
 ) -> ObservedFrame:
-    """The true stars of the later frame, and those of the earlier one that it should hold and does not.
+    """Return the true stars of the later frame, and those of the earlier one that it lacks.
 
     Parameters
     ----------
     before, now, result, motion
-        Two frames, what a filter made of them, and how the stars moved.
+        Two frames, the result of a filter for them, and the motion of the stars.
     radius_deg
-        Radius of the field of the features.
+        Radius of the field of the features, degrees.
     margin_deg
-        A star that is predicted nearer to the rim than this may have left the field, and is not put back.
+        A star predicted nearer to the rim than this may have left the field and is not restored, degrees.
     """
     matched = np.zeros(len(before), dtype=np.bool_)
     matched[result.matches[:, 0]] = True
@@ -64,16 +65,16 @@ def restore_missing(
 
 @dataclass(frozen=True, slots=True)
 class SubfieldAnswer:
-    """What one circle of a divided field, or several that agree, say of the boresight of the whole field.
+    """Boresight of the whole field, from one circle of a divided field or several that agree.
 
     Attributes
     ----------
     right_ascension_deg, declination_deg, roll_deg
-        Boresight and angle by which the frame is turned, degrees.
+        Boresight and roll of the whole field, degrees.
     error_psi
-        ε_ψ of the circle, of several the least.
+        ε_ψ of the circle, or the least of several.
     votes
-        How many circles agree.
+        Number of circles that agree.
     """
 
     right_ascension_deg: float
@@ -84,21 +85,21 @@ class SubfieldAnswer:
 
 
 class DividedField:
-    """Lost in space by overlapping circles of the field, of which two or more must agree.
+    """Lost-in-space identification by overlapping circles of the field, of which at least two must agree.
 
     Parameters
     ----------
     lost_in_space
         LSI on a planar database whose frames are narrower than the field.
     half_width_deg
-        Half the width of the whole field.
+        Half-width of the whole field, degrees.
     agreement_deg
-        Distance within which two circles agree on the boresight.
+        Distance within which two circles agree on the boresight, degrees.
 
     Raises
     ------
     DatabaseError
-        If the database is not planar, or its circles do not fit into the field.
+        The database is not planar, or its circles do not fit into the field.
     """
 
     def __init__(
@@ -116,13 +117,13 @@ class DividedField:
         self._agreement = agreement_deg
 
     def centres(self) -> Array:
-        """Centres of the circles, (9, 2) degrees: the middle and eight around it."""
+        """Centres of the circles, (9, 2) degrees: the middle, and eight around it."""
         turns = np.arange(8) * (math.pi / 4.0)
         ring = self._offset * np.column_stack([np.cos(turns), np.sin(turns)])
         return np.concatenate([np.zeros((1, 2)), ring])
 
     def answers(self, frame: ObservedFrame) -> list[SubfieldAnswer]:
-        """The answer of every circle that holds a star."""
+        """Estimates from all circles that contain a star."""
         found = []
         for centre in self.centres():
             places = frame.positions - centre
@@ -146,9 +147,9 @@ class DividedField:
         return found
 
     def solve(self, frame: ObservedFrame) -> SubfieldAnswer | None:
-        """The boresight that most circles agree on, their median; None when no two of them do."""
+        """Return the median boresight on which most circles agree; None if no two agree."""
         answers = self.answers(frame)
-        answers = [answer for answer in answers if answer.error_psi <= GREATEST_ERROR_PSI]
+        answers = [answer for answer in answers if answer.error_psi <= MAX_ERROR_PSI]
         groups = [self._agreeing(answer, answers) for answer in answers]
         best = max(groups, key=lambda group: (len(group), -min(a.error_psi for a in group)), default=[])
         return _median(best) if len(best) > 1 else None

@@ -1,10 +1,11 @@
-"""The thesis's three methods as printed, on scikit-learn: short, slow, and the reference for the compiled code.
+"""The thesis's three methods as printed, with scikit-learn: the reference for the compiled code.
 
-Nearest neighbour, LASSO and density-based clustering are written here as in their equations. The compiled code
-(`starid.thesis.cell_search`, `.lasso`, `.matlab_lasso`, `.fsf`) gives the same answers a hundred times faster; the tests
-compare the two. Read this module to see what the thesis does, or use it to verify an answer of the compiled code:
-`LostInSpace(database, solver="sklearn")`, `solver = "sklearn"` in the table `[identifier]` of a profile, the solver
-`lsi-sklearn` of `starhil bench identify`, and `ReferenceFilter` as the filter of `starid.thesis.rsi`.
+Nearest neighbour, LASSO and density-based clustering follow their equations. The compiled code
+(`starid.thesis.cell_search`, `.lasso`, `.matlab_lasso`, `.fsf`) gives the same answers a hundred times
+faster; the tests compare the two. Read this module to see what the thesis does, or use it to check an answer
+of the compiled code with `LostInSpace(database, solver="sklearn")`, `solver = "sklearn"` in the table
+`[identifier]` of a profile, the solver `lsi-sklearn` of `starhil bench identify`, or `ReferenceFilter` as the
+filter of `starid.thesis.rsi`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from starid.thesis.fsf import EPSILON, MIN_SAMPLES_SHARE
 from starid.thesis.lasso import LAMBDAS
 
 CODES_PER_UNIT: Final = 2.55
-"""Codes of a stored feature per unit of the normalised scale."""
+"""Code steps of a stored feature per unit of the normalised scale."""
 
 NO_STAR: Final = 255
 """Stored polar angle of a cell without stars."""
@@ -32,14 +33,14 @@ NO_STAR: Final = 255
 
 @dataclass(frozen=True, eq=False)
 class ReferenceAnswer:
-    """What `ReferenceLostInSpace` makes of one frame.
+    """The result of `ReferenceLostInSpace` for one frame.
 
     Attributes
     ----------
     right_ascension_deg, declination_deg, theta_rad
         Boresight F·ω, eq. 2.36, and polar angle, degrees and radians.
     nearest, distance
-        Nearest cell, counted from 0, and its distance on the normalised scale.
+        Nearest cell, numbered from 0, and its distance on the normalised scale.
     omega, penalty
         Weights ω, (9,), and their λ.
     error_psi
@@ -57,12 +58,12 @@ class ReferenceAnswer:
 
 
 class ReferenceSearch:
-    """Nearest cells of a database by scikit-learn's `NearestNeighbors`, on the stored codes.
+    """Search for the nearest cells of a database with scikit-learn's `NearestNeighbors` on the stored codes.
 
     Parameters
     ----------
     database
-        Feature database; cells without a star are left out.
+        Feature database; cells without stars are ignored.
     """
 
     def __init__(self, database: FeatureDatabase) -> None:
@@ -73,7 +74,7 @@ class ReferenceSearch:
         self._tree: Any = NearestNeighbors().fit(database.features[self._cells] / CODES_PER_UNIT)
 
     def nearest(self, observation: Array, count: int) -> tuple[Array, Indices]:
-        """Distances of the nearest cells, growing, and these cells, (count,) each; ∞ and −1 beyond the last."""
+        """Increasing distances of the nearest cells, and these cells, (count,); ∞ and −1 if fewer."""
         most = min(count, self._cells.size)
         found = self._tree.kneighbors(observation[None, :], n_neighbors=most)
         distances, cells = np.full(count, np.inf), np.full(count, -1, dtype=np.int64)
@@ -81,9 +82,9 @@ class ReferenceSearch:
         return distances, cells
 
     def exact_nearest(self, observation: Array) -> tuple[int, float]:
-        """Cell nearest in full precision and its distance, eqs 2.12 and 2.29, of those whose codes leave it open."""
+        """Nearest cell in full precision, eqs 2.12 and 2.29, and its distance."""
         distances, _ = self.nearest(observation, 1)
-        # a code is off by half a step at most in each of five features: so are both distances that are compared
+        # a code is off by at most half a step in each of five features, and so are both distances compared
         reach = distances[0] + 2.0 * np.sqrt(5.0) * (0.5 / CODES_PER_UNIT) + 1e-9
         rows = self._tree.radius_neighbors(observation[None, :], radius=reach, return_distance=False)[0]
         cells = np.sort(self._cells[rows])
@@ -94,16 +95,16 @@ class ReferenceSearch:
 
 
 def reference_path(dictionary: Array, observation: Array, *, intercept: bool = False) -> Array:
-    """Weights ω of eq. 2.34 for each λ of `LAMBDAS`, (k, 9), by scikit-learn's coordinate descent.
+    """Weights ω of eq. 2.34 for each λ in `LAMBDAS`, (k, 9), by scikit-learn's coordinate descent.
 
-    Columns that are nearly alike keep it from the last digit of the minimum; its warning of that is not passed on.
+    With nearly equal columns it does not reach the last digit of the minimum; its warning is suppressed.
 
     Parameters
     ----------
     dictionary, observation
         T, (5, 9), and ψ̂, (5,).
     intercept
-        False: eq. 2.34 as printed. True: means and deviations of the columns taken out first, as MATLAB's `lasso` does.
+        False: eq. 2.34 as printed. True: the columns are standardised first, as in MATLAB's `lasso`.
     """
     from sklearn.exceptions import ConvergenceWarning
     from sklearn.linear_model import lasso_path
@@ -132,7 +133,7 @@ class ReferenceLostInSpace:
     database
         Planar database.
     intercept
-        As in `reference_path`; solved to the end, where MATLAB stops early.
+        See `reference_path`; unlike MATLAB's, the descent runs to convergence.
     """
 
     database: FeatureDatabase
@@ -143,7 +144,7 @@ class ReferenceLostInSpace:
         return ReferenceSearch(self.database)
 
     def solve(self, features: FeatureVector) -> ReferenceAnswer:
-        """Estimate boresight and polar angle from the features of one frame."""
+        """Estimate boresight and polar angle from the features of a frame."""
         observation = self.database.normalise(features)
         nearest, distance = self._search.exact_nearest(observation)  # eqs 2.12, 2.29
         grid = self.database.grid
@@ -170,7 +171,7 @@ class ReferenceLostInSpace:
         )
 
     def regularise(self, dictionary: Array, observation: Array) -> tuple[Array, float]:
-        """ω of least mean squared error among the λ of eq. 2.34, (9,), and its λ."""
+        """Return the ω (9,) of least mean squared error among the λ of eq. 2.34, and its λ."""
         path = reference_path(dictionary, observation, intercept=self.intercept)
         residuals = observation - path @ dictionary.T
         if self.intercept:
@@ -181,19 +182,19 @@ class ReferenceLostInSpace:
 
 @dataclass(frozen=True, slots=True)
 class ReferenceFilter:
-    """Algorithm 2 up to the false stars: pairs, disparities, scikit-learn's DBSCAN, objects of the main cluster.
+    """Algorithm 2 up to the false stars: pairs, disparities, scikit-learn's DBSCAN, main cluster.
 
     Attributes
     ----------
     epsilon, share
-        ε, and min_samples as a share of the objects of the later frame.
+        ε, and min_samples as a share of the number of objects in the later frame.
     """
 
     epsilon: float = EPSILON
     share: float = MIN_SAMPLES_SHARE
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
-        """Compare two frames; whoever appears in the main cluster is a star."""
+        """Compare two frames; every object in the main cluster is a star."""
         from sklearn.cluster import DBSCAN
 
         votes = np.zeros((len(before), len(now)), dtype=np.int64)
@@ -222,7 +223,7 @@ class ReferenceFilter:
 
 
 def _pairs(frame: ObservedFrame) -> tuple[Array, Indices]:
-    """Mean brightness, separation and slope of all pairs, eqs 3.3 to 3.6, (n, 3), and their objects, (n, 2)."""
+    """Mean brightness, separation and slope of all pairs (n, 3), eqs 3.3–3.6, and their objects (n, 2)."""
     i, j = np.triu_indices(len(frame), 1)
     away = frame.positions[j] - frame.positions[i]
     slope = np.degrees(np.arctan2(away[:, 1], away[:, 0])) % 180.0

@@ -1,4 +1,4 @@
-"""Recursive star identification: filter, motion, a small region of search, and the whole sky when that fails (algorithm 3)."""
+"""Recursive star identification (algorithm 3): filter, motion, search region or whole sky."""
 
 from __future__ import annotations
 
@@ -35,20 +35,21 @@ class RsiSettings:
     tau
         Threshold τ on ε_ψ beyond which the whole database is searched.
     invalid_factor
-        K: an estimate with ε_ψ > K·τ is invalid.
+        Factor K: an estimate with ε_ψ > K·τ is invalid.
     gamma_min_deg, gamma_scale, gamma_lsi_deg
-        Γ_min, the factor of its growth, and the side from which on the whole database is searched at once.
+        Γ_min, its scale factor, and the side from which the whole database is searched at once.
     motion_threshold_deg
         Distance beyond which a match is not used for the motion.
     motion_model
-        Transformation that models the camera's motion; the thesis uses an affine one.
+        Transformation that models the camera motion; the thesis uses an affine one.
     angle_in_search
-        Count the polar angle as a sixth feature of the search, as the thesis's worked example does. The frame must then
-        not be turned by more than a few degrees.
+        Use the polar angle as a sixth feature of the search, as in the thesis's worked example. The frame
+        must then not be rotated by more than a few degrees.
     memory, agreement_deg
-        0: the thesis's algorithm, in which each answer is the centre of the next region of search. Otherwise our addition: this
-        many previous answers, carried forward with the motion, vote; two agree if they are within `agreement_deg`. The answer
-        that most agree on is the result and the centre of the next region.
+        0: the thesis's algorithm, in which each answer is the centre of the next search region. Otherwise our
+        addition: this many previous answers, carried forward with the motion, vote; two agree if they are
+        within `agreement_deg`. The answer on which most agree is the result and the centre of the next
+        region.
     """
 
     tau: float = 0.5
@@ -77,30 +78,30 @@ class RsiSettings:
 
 @dataclass(frozen=True, eq=False)
 class RsiStep:
-    """Result of one image.
+    """The result for one frame.
 
     Attributes
     ----------
     true_stars
-        Which objects the features were computed from.
+        The objects from which the features were computed.
     motion
-        Camera motion since the previous image, if it is known.
+        Camera motion since the previous frame, if it is known.
     estimate
         Boresight and polar angle; None if no star remained.
     roll_deg
-        Roll of the image: observed polar angle less the estimated one, −180 … 180.
+        Roll: observed minus estimated polar angle, −180 … 180.
     valid
-        False for no estimate or ε_ψ > K·τ.
+        False if there is no estimate or ε_ψ > K·τ.
     mode
-        First search: in the region ("rsi") or in the whole database ("lsi").
+        Where the first search was: in the region ("rsi") or in the whole database ("lsi").
     triggered
-        The region's answer exceeded τ, and the whole database was searched as well.
+        The answer from the region exceeded τ, so the whole database was searched too.
     exceeded
         ε_ψ of the answer kept exceeds τ.
     region_deg, region_cells
-        Side Γ of the region and number of its cells; NaN and 0 in mode "lsi".
+        Side Γ of the region, and its number of cells; NaN and 0 in mode "lsi".
     search_s, lasso_s
-        Time of the nearest-neighbour searches and of the regularisation, seconds.
+        Time of the nearest-neighbour searches and of the LASSO, seconds.
     """
 
     true_stars: Mask
@@ -118,10 +119,10 @@ class RsiStep:
 
 
 def region_side(mean_distance_deg: float, sigma_distance_deg: float, settings: RsiSettings) -> float:
-    """Side of the region of search: Γ = Γ_min + scale·√(μ_d·σ_d), the reading taken of eq. 6.5, degrees.
+    """Side of the search region, degrees: Γ = Γ_min + scale·√(μ_d·σ_d), as eq. 6.5 is interpreted here.
 
-    The thesis prints Γ_min + 110^(−log10(μ_d)/2)·110^(−log10(σ_d)/2)·σ_d·μ_d. With "1·10" for "110" the powers are
-    1/√μ_d and 1/√σ_d, and the product is √(μ_d·σ_d).
+    The thesis prints Γ_min + 110^(−log10(μ_d)/2)·110^(−log10(σ_d)/2)·σ_d·μ_d. With "1·10" instead of "110"
+    the powers are 1/√μ_d and 1/√σ_d, and the product is √(μ_d·σ_d).
     """
     return settings.gamma_min_deg + settings.gamma_scale * math.sqrt(mean_distance_deg * sigma_distance_deg)
 
@@ -132,7 +133,7 @@ def region_cells(side_deg: float, fov_deg: float, overlap: float) -> float:
 
 
 def correlation(first: Array, second: Array) -> tuple[float, float]:
-    """Correlation coefficient ρ(μ_d, σ_d) of eq. 4.2, and the probability of as much by chance."""
+    """Correlation coefficient ρ(μ_d, σ_d) of eq. 4.2, and its p-value."""
     from scipy.stats import pearsonr
 
     result = pearsonr(first, second)
@@ -140,21 +141,21 @@ def correlation(first: Array, second: Array) -> tuple[float, float]:
 
 
 class RecursiveIdentification:
-    """The recursive algorithm on one database; feed it frame after frame.
+    """The recursive algorithm on one database, for frames in sequence.
 
     Parameters
     ----------
     lost_in_space
         The LSI algorithm on a planar database.
     false_star_filter
-        Compares the previous frame with the current one; None trusts every object.
+        Compares the previous frame with the current one; None accepts every object.
     settings
-        Thresholds and region of search.
+        Thresholds and search region.
 
     Raises
     ------
     RsiError
-        If the database is not planar; the product's recursive identifier works on the sphere.
+        The database is not planar (for the sphere see `starid.thesis.rsi_identifier`).
     """
 
     def __init__(
@@ -174,7 +175,7 @@ class RecursiveIdentification:
         self.reset()
 
     def reset(self) -> None:
-        """Start again: the next frame is the first."""
+        """Start again with the next frame as the first."""
         self._before: ObservedFrame | None = None
         self._memory = AnswerMemory(max(self.settings.memory, 1), self.settings.agreement_deg)
         self._searches_all = True
@@ -182,10 +183,10 @@ class RecursiveIdentification:
     def step(self, frame: ObservedFrame) -> RsiStep:
         """Identify the next frame.
 
-        The first frame, and every frame after one whose ε_ψ stayed above τ, searches the whole database. Any other
-        searches the region about the predicted boresight and, should ε_ψ exceed τ (eq. 4.1), the whole database too,
-        keeping the answer of smaller ε_ψ. With a memory a region that several answers agree on is searched after such
-        a frame as well.
+        The first frame, and every frame after one whose ε_ψ stayed above τ, is searched in the whole
+        database. Any other is searched in the region around the predicted boresight and, if ε_ψ exceeds τ
+        (eq. 4.1), in the whole database too; the answer with the smaller ε_ψ is kept. With a memory, a region
+        on which several answers agree is also searched after a frame above τ.
         """
         true_stars, motion = self._filtered(frame)
         side = math.nan
@@ -239,11 +240,11 @@ class RecursiveIdentification:
         )
 
     def _trusts(self, predicted: Prediction) -> bool:
-        """Whether the region around a prediction is searched: not after a doubtful frame, unless several answers agree."""
+        """Whether to search the predicted region: not after a doubtful frame unless answers agree."""
         return not self._searches_all or predicted.votes >= _MIN_VOTES
 
     def _voted(self, estimate: LsiEstimate, features: FeatureVector) -> tuple[LsiEstimate, float]:
-        """Remember a valid answer; return answer and roll: with a memory, those that most answers agree on."""
+        """Remember a valid answer; return answer and roll, with a memory those with most votes."""
         roll = (features.theta_deg - math.degrees(estimate.theta_rad) + 180.0) % 360.0 - 180.0
         if estimate.error_psi <= self.settings.invalid_factor * self.settings.tau:
             self._memory.add(estimate.right_ascension_deg, estimate.declination_deg, roll)
@@ -273,7 +274,7 @@ class RecursiveIdentification:
         return better, found - start, solved - found
 
     def _filtered(self, frame: ObservedFrame) -> tuple[Mask, CameraMotion | None]:
-        """Return which objects are stars, and their motion; without a previous frame or matches, all and None."""
+        """Return which objects are stars (all without a previous frame), and their motion or None."""
         everything = np.ones(len(frame), dtype=np.bool_)
         if self._before is None or self._filter is None:
             return everything, None

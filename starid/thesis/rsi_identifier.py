@@ -1,7 +1,8 @@
-"""The RSI algorithm for a real sensor: filter, motion, a region of search on the sphere, and LSI when that fails.
+"""The RSI algorithm for a real sensor: filter, motion, a search region on the sphere, and LSI if that fails.
 
-It is the thesis's recursion with one difference: whether the region's answer is good enough is not judged by ε_ψ, which on
-the sphere and with stars near the brightness limit says little, but by the verification that every answer has to pass.
+It is the thesis's recursion with one difference: whether the answer from the region is good enough is decided
+not by ε_ψ, which says little on the sphere and with stars near the brightness limit, but by the verification
+of every answer.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
-from starid.single_camera import Measured, SingleCameraIdentifier
+from starid.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.solution import Reason, Solution
 from starid.thesis.cme import matched_motion
 from starid.thesis.false_stars import ObservedFrame
@@ -31,18 +32,18 @@ _SPOT_DEG: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class RsiStatistics:
-    """Counts since the identifier was made or `reset`.
+    """Counts since the identifier was made or reset.
 
     Attributes
     ----------
     frames
-        Calls of `track`.
+        Number of calls of `track`.
     in_region
-        Frames answered from the region of search.
+        Number of frames answered from the search region.
     triggers
-        Frames in which the region failed and the whole database was searched.
+        Number of frames for which the region failed and the whole database was searched.
     invalid
-        Frames without an answer.
+        Number of frames without an answer.
     region_sum_deg
         Sum of the sides of the regions; divide by `frames` for the mean.
     """
@@ -56,18 +57,18 @@ class RsiStatistics:
 
 @dataclass(frozen=True)
 class RsiOptions(LsiOptions):
-    """Settings of an RSI identifier, in addition to the LSI identifier's.
+    """Settings of an RSI identifier, in addition to those of an LSI identifier.
 
     Attributes
     ----------
     gamma_min_deg
-        Least side of the region of search, degrees.
+        Smallest side of the search region, degrees.
     gamma_scale
-        Factor of its growth with the errors of the motion.
+        Factor by which the side grows with the errors of the motion.
     filter_false_stars
-        Follow the detections from frame to frame and make features of the true stars only.
+        Follow the detections from frame to frame, and use only true stars for the features.
     position_sigma_px
-        One-sigma error of a position per axis that the filter assumes, pixels.
+        One-sigma error of a position per axis, pixels, as assumed by the filter.
     """
 
     gamma_min_deg: float = 2.0
@@ -82,11 +83,11 @@ class RsiIdentifier(SingleCameraIdentifier):
     Parameters
     ----------
     camera, catalog
-        As in `LsiIdentifier`.
+        See `LsiIdentifier`.
     options
-        Default: `RsiOptions()`.
+        By default `RsiOptions()`.
     **changes
-        Fields of `RsiOptions` that are to differ from it.
+        Fields of `RsiOptions` to change.
     """
 
     def __init__(
@@ -123,7 +124,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         return self.lsi.database_bytes
 
     def warm_up(self) -> None:
-        """Compile, or load, the kernels, so that the first real frame is not late."""
+        """Compile or load the kernels, so that the first frame is not late."""
         self.lsi.warm_up()
         xy = self.camera.border(8) * 0.25 + 0.375 * np.array([self.camera.width, self.camera.height])
         for _ in range(2):
@@ -131,19 +132,19 @@ class RsiIdentifier(SingleCameraIdentifier):
         self.reset()
 
     def reset(self) -> None:
-        """Forget the frames, the zero point that they showed, and the statistics."""
+        """Forget previous frames, the learned zero point and the statistics."""
         self.lsi.reset()
         self._before = None
         if self._filter is not None:
             self._filter.reset()
         self.statistics = RsiStatistics()
 
-    def _identify(self, measured: Measured) -> Solution:
+    def _identify(self, measured: CheckedDetections) -> Solution:
         self._follow(measured.xy, measured.flux)
         return self._whole_sky(measured)
 
-    def _whole_sky(self, measured: Measured) -> Solution:
-        """Answer of the LSI algorithm."""
+    def _whole_sky(self, measured: CheckedDetections) -> Solution:
+        """Identify with the LSI algorithm."""
         return self.lsi.identify(
             measured.xy,
             measured.flux,
@@ -151,11 +152,11 @@ class RsiIdentifier(SingleCameraIdentifier):
             observer_velocity=measured.observer_velocity,
         )
 
-    def _track(self, measured: Measured, predicted: Attitude, window_px: float | None) -> Solution:
-        """Attitude from the region of search about a predicted one, or from the whole sky if that fails.
+    def _track(self, measured: CheckedDetections, predicted: Attitude, window_px: float | None) -> Solution:
+        """Find the attitude in the search region around a predicted one, or in the whole sky if that fails.
 
-        A prediction only places the region; its roll, and its error within the region, do not matter. Where the
-        window is wider than the region, the region is widened to it, up to the field of view.
+        The prediction only defines the region; its roll, and its error within the region, do not matter. If
+        the window is wider than the region, the region is widened to it, up to the field of view.
         """
         true_stars, side = self._follow(measured.xy, measured.flux)
         if window_px is not None:
@@ -176,7 +177,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         return solution
 
     def _follow(self, xy: Array, flux: Array) -> tuple[Mask, float]:
-        """Which detections are stars, as far as the previous frames show, and the side of the region of search."""
+        """Return which detections are stars, by previous frames, and the side of the search region."""
         everything = np.ones(flux.size, dtype=np.bool_)
         if self._filter is None:
             return everything, self._settings.gamma_min_deg
@@ -201,9 +202,9 @@ class RsiIdentifier(SingleCameraIdentifier):
         return true_stars, side
 
     def _in_region(
-        self, measured: Measured, true_stars: Mask, predicted: Attitude, side_deg: float
+        self, measured: CheckedDetections, true_stars: Mask, predicted: Attitude, side_deg: float
     ) -> Solution:
-        """Verified answer from the cells of the region, the likeliest first."""
+        """Try the cells of the region, most likely first; return the first verified answer."""
         lsi = self.lsi
         zero_point = lsi.zero_point
         if zero_point is None:
@@ -233,7 +234,7 @@ class RsiIdentifier(SingleCameraIdentifier):
 
 
 def _spots(predicted: Attitude, side_deg: float) -> Array:
-    """Boresights (k, 2) in degrees that cover the region, from its middle outwards."""
+    """Boresights (k, 2) in degrees that cover the region, from the centre outwards."""
     steps = math.ceil(0.5 * side_deg / _SPOT_DEG)
     offsets = np.linspace(-0.5 * side_deg, 0.5 * side_deg, 2 * steps + 1)
     east, north = (grid.ravel() for grid in np.meshgrid(offsets, offsets))

@@ -1,7 +1,8 @@
-"""Prediction of the boresight: a vote of the last answers, carried forward with the measured motion.
+"""Prediction of the boresight by a vote of the last answers, carried forward with the measured motion.
 
-Our addition to the recursive algorithm. The camera's motion is measured to hundredths of a degree, while an answer is
-occasionally wrong by a degree, or by half the sky. Answers that agree once the motion between them is removed are correct.
+This is our addition to the recursive algorithm. The camera's motion is measured to hundredths of a degree,
+while an answer is occasionally wrong by a degree, or by half the sky. Answers that agree once the motion
+between them is removed are correct.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ class Prediction:
 
 
 class AnswerMemory:
-    """The last answers and the motion since each of them.
+    """The last answers, and the motion since each of them.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ class AnswerMemory:
         self._answers = np.empty((0, 6))
 
     def clear(self) -> None:
-        """Discard all answers, for example because the motion since is unknown."""
+        """Discard all answers, for example because the motion since then is unknown."""
         self._answers = np.empty((0, 6))
 
     def add(self, right_ascension_deg: float, declination_deg: float, roll_deg: float) -> None:
@@ -67,9 +68,10 @@ class AnswerMemory:
         answers[:, _X : _Y + 1] = motion.apply(answers[:, _X : _Y + 1])
 
     def prediction(self) -> Prediction | None:
-        """Return the prediction that most answers agree on, of equal ones the latest; None without answers.
+        """Return the prediction on which most answers agree (the latest of equal ones); None without answers.
 
-        The roll comes first, as the motion in the sky depends on it: a median about the roll that is nearest to all others.
+        The roll comes first, because the motion in the sky depends on it: the median relative to the most
+        central roll.
         """
         answers = self._answers
         if answers.shape[0] == 0:
@@ -98,5 +100,5 @@ class AnswerMemory:
 
 
 def _wrapped(angle_deg: Array) -> Array:
-    """Angles into −180 … 180 degrees."""
+    """Wrap angles to −180 … 180 degrees."""
     return np.asarray((angle_deg + 180.0) % 360.0 - 180.0, dtype=np.float64)

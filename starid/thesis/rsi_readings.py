@@ -1,4 +1,4 @@
-"""Readings of the side of the region of search, and of the distances it depends on."""
+"""Interpretations of the side of the search region, and of the distances on which it depends."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def side_as_printed(mean_distance_deg: float, sigma_distance_deg: float, gamma_m
 
 
 def nearest_distances(transformed: Array, seen: Array) -> Array:
-    """Distance of each transformed object, (n, 2), to the nearest that is seen, (m, 2): the "min" in the definition of the distances."""
+    """Distance of each transformed object (n, 2) to the nearest object seen (m, 2): the printed "min"."""
     from scipy.spatial import cKDTree
 
     distances, _ = cKDTree(seen).query(transformed)

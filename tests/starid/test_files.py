@@ -1,4 +1,4 @@
-"""Files that a user names: how they are read, and what is kept when one is written over."""
+"""Files named by the user: reading them, and what is kept when one is overwritten."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_a_pipe_receives_the_file_and_stays_a_pipe(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     seen: list[bytes] = []
-    holder = os.open(pipe, os.O_RDWR)  # so that neither side waits for the other
+    holder = os.open(pipe, os.O_RDWR)  # so that neither end waits for the other
     try:
         write_atomically(pipe, lambda part: part.write_bytes(b"whole"))
         seen.append(os.read(holder, 100))
@@ -45,7 +45,7 @@ def test_a_pipe_receives_the_file_and_stays_a_pipe(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("device", ["/dev/null", "/dev/full"])
-def test_a_device_is_written_into_and_stays_a_device(tmp_path: Path, device: str) -> None:
+def test_a_device_is_written_in_place(tmp_path: Path, device: str) -> None:
     link = tmp_path / "device"
     link.symlink_to(device)
     full = pytest.raises(OSError, match="No space left on device")
@@ -66,13 +66,13 @@ def test_a_link_to_a_file_stays_a_link_and_the_file_is_replaced(tmp_path: Path) 
     assert list(target.parent.iterdir()) == [target]
 
 
-def test_a_folder_is_not_written_over(tmp_path: Path) -> None:
+def test_a_folder_is_not_overwritten(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError):
         write_atomically(tmp_path, lambda part: part.write_bytes(b"whole"))
 
 
 @pytest.mark.parametrize("into_file", [False, True])
-def test_the_standard_output_is_a_file_too(tmp_path: Path, *, into_file: bool) -> None:
+def test_standard_output_is_written_in_place(tmp_path: Path, *, into_file: bool) -> None:
     program = (
         "import sys; from pathlib import Path; from starid.files import write_atomically;"
         "print('before'); write_atomically(Path(sys.argv[1]), lambda part: part.write_text('whole\\n')); print('after')"
@@ -143,7 +143,7 @@ def test_a_file_beyond_the_limit_is_not_read(tmp_path: Path) -> None:
         read_bytes(path, 4)
 
 
-def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
+def test_a_byte_order_mark_is_not_part_of_the_text(tmp_path: Path) -> None:
     path = tmp_path / "camera.toml"
     path.write_bytes(b"\xef\xbb\xbf[camera]\nwidth = 640\nheight = 480\nfov_deg = 20.0\n")
     assert read_text(path).startswith("[camera]")
@@ -151,7 +151,7 @@ def test_a_byte_order_mark_is_no_part_of_the_text(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("text", ["1_0", "nan", "inf", "-inf", "1e999", "", "x", "١", "0x10", "1,5"])
-def test_python_s_own_notation_is_not_a_number(text: str) -> None:
+def test_python_only_notation_is_not_a_number(text: str) -> None:
     with pytest.raises(ValueError, match="not a number"):
         read_number(text)
 
@@ -164,9 +164,9 @@ def test_numbers_as_other_programs_write_them_are_read(text: str, value: float) 
 @pytest.mark.parametrize(
     ("degrees", "said"), [(359.99996, "0.000"), (-1e-17, "0.000"), (359.9994, "359.999"), (360.0, "0.000")]
 )
-def test_a_turn_is_below_360_degrees_after_rounding_too(degrees: float, said: str) -> None:
+def test_a_formatted_angle_is_below_360_degrees_after_rounding(degrees: float, said: str) -> None:
     assert turn_text(degrees, 3) == said
 
 
-def test_an_attitude_a_hair_before_a_whole_turn_is_shown_at_0() -> None:
+def test_angles_just_below_a_full_turn_are_shown_as_0() -> None:
     assert str(Attitude.from_radec_roll(-1e-6, 10.0, -1e-6)) == "RA 0.0000° Dec +10.0000° roll 0.0000°"

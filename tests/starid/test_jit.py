@@ -63,7 +63,7 @@ def run(folder: Path) -> list[str]:
     return done.stdout.split()
 
 
-def test_a_changed_callee_in_another_module_is_noticed(tmp_path: Path) -> None:
+def test_a_changed_callee_in_another_module_is_detected(tmp_path: Path) -> None:
     write_package(tmp_path)
     assert run(tmp_path) == ["2.5", "0"]
     assert run(tmp_path) == ["2.5", "1"], "the second process loads the machine code"
@@ -84,7 +84,7 @@ def test_copies_of_a_package_share_machine_code_while_their_sources_are_equal(tm
     assert not list(tmp_path.glob("*/other_kernels/**/*.nbc")), "nothing is kept beside the sources"
 
 
-def test_machine_code_is_kept_beside_the_sources_where_the_cache_folder_cannot_be_made(
+def test_machine_code_is_cached_beside_the_sources_if_the_cache_folder_cannot_be_made(
     tmp_path: Path, cache_folder: Path
 ) -> None:
     cache_folder.write_text("a file in the way")
@@ -93,7 +93,7 @@ def test_machine_code_is_kept_beside_the_sources_where_the_cache_folder_cannot_b
     assert run(tmp_path) == ["2.5", "1"]
 
 
-def test_kernels_run_where_machine_code_can_be_kept_nowhere(tmp_path: Path, cache_folder: Path) -> None:
+def test_kernels_run_if_machine_code_cannot_be_cached(tmp_path: Path, cache_folder: Path) -> None:
     cache_folder.write_text("a file in the way")
     write_package(tmp_path)
     (tmp_path / "other_kernels" / "__pycache__").write_text("a file in the way")
@@ -148,7 +148,7 @@ def emptied(_data: bytes) -> bytes:
 
 
 def zeroed(data: bytes) -> bytes:
-    """As a file system may leave a file after a power failure: its length, without its content."""
+    """As a file may be after a power failure: the right length, but no content."""
     return data[:-100] + bytes(100)
 
 

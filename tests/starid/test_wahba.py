@@ -1,4 +1,4 @@
-"""The five estimators against each other, scipy and the truth, wherever one of them is known to be weak."""
+"""The five estimators against each other, scipy and the truth, including cases where one is weak."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_estimators_agree_with_each_other_and_scipy(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_perfect_directions_give_the_truth(method: str) -> None:
+def test_exact_directions_give_the_true_attitude(method: str) -> None:
     rng = np.random.default_rng(11)
     for turn in (random_attitude, half_turn, half_turn_about_an_axis, no_turn):
         for n in (2, 3, 30):
@@ -104,7 +104,7 @@ def test_the_answer_minimises_the_loss(method: str) -> None:
         assert loss(best.rotated(1e-4 * rng.standard_normal(3))) > loss(best)
 
 
-def test_weights_pull() -> None:
+def test_larger_weights_have_more_influence() -> None:
     reference = np.eye(3)
     body = np.eye(3)
     body[0] = [1.0, 0.02, 0.0]
@@ -155,7 +155,7 @@ def test_undetermined_and_bad_input_is_rejected(method: str, body, reference, we
         solve_wahba(body, reference, weights, method)
 
 
-def test_unknown_method_is_named() -> None:
+def test_an_unknown_method_is_rejected() -> None:
     with pytest.raises(StaridError, match="'newton'"):
         solve_wahba(np.eye(3), np.eye(3), method="newton")  # type: ignore[arg-type]
 

@@ -1,1 +1,1 @@
-"""The thesis's experiments, made again from the real catalogue, beside what was published."""
+"""The experiments of the thesis, reproduced with the real catalogue."""

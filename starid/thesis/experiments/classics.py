@@ -1,4 +1,4 @@
-"""The algorithms that the thesis compares itself with, run on its frames: figures 6.9–6.11 and table 6.2."""
+"""The algorithms to which the thesis is compared, run on its frames: figures 6.9–6.11 and table 6.2."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ _PUBLISHED: Final = {
     "position-3": {"lsi": 99.41, "improved-grid": 99.40, "pyramid": 98.56},
     "brightness-3": {"lsi": 97.99, "pyramid": 97.80},
 }
-"""Identification rates in the thesis's text, %; its figures show the rest as curves."""
+"""Identification rates in the text of the thesis, %; its figures show the rest as curves."""
 
 TABLE_6_2: Final = {
     "pyramid": (130.57, 27.5),
@@ -71,34 +71,38 @@ _CASES: Final = (
     "none",
     *(f"{kind}-{level}" for kind in ("position", "brightness", "false", "missing") for level in (1, 2, 3)),
 )
-_WORDS: Final = {
+_LABELS: Final = {
     "position": "position noise, σ = {} px",
     "brightness": "brightness noise, σ = {} intensity units",
     "false": "false stars: {}",
     "missing": "missing stars: {}",
 }
 _OWN_SKY: Final = {"lsi": "flat", "geometric": "sphere"}
-"""The sky that an algorithm of this project, or of the thesis, is made for."""
+"""The sky for which an algorithm of this project, or of the thesis, is designed."""
 
-_SKY_WORDS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars on the sphere"}
+_SKY_LABELS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars on the sphere"}
 _SENSOR: Final = (12.0, 1024, 6.0)
-"""Field in degrees, pixels and faintest star of the sensor that most of the papers simulate."""
+"""Sensor that most of the papers simulate: field in degrees, pixels, faintest star."""
 
-_NOTE: Final = """The thesis prints the competitors' figures from two papers, each with its own simulator, sensor and catalogue; it never ran
-them. Here every algorithm is run, as published and without the project's verification, on the frames that the thesis tests itself
-with: its centres, its stars (Hp ≥ 11.5), its noise. A frame counts as identified if the boresight is within {limit}° of the
-truth, as in the thesis; "wrong" are answers farther off, the rest gave none. Each is given the σ of the position noise, as its paper assumes.
-Two skies: the flat (α, δ) plane of the thesis, and the same stars on the true sphere, where its LSI on the flat sky has no place.
+_NOTE: Final = """The thesis takes the competitors' figures from two papers, each with its own simulator,
+sensor and catalogue; it never ran them. Here every algorithm is run, as published and without this project's
+verification, on the frames with which the thesis tests its own algorithm: its centres, its stars (Hp ≥ 11.5),
+its noise. A frame counts as identified if the boresight is within {limit}° of the truth, as in the thesis;
+answers farther off are "wrong", and the remaining frames have no answer. Each algorithm is given the σ of the
+position noise, as its paper assumes. There are two skies: the flat (α, δ) plane of the thesis, and the same
+stars on the true sphere, which the thesis's LSI cannot use.
 
-**What differs, and why.** (1) False stars break the thesis's algorithm, as figure 6.11 shows, since its features depend on every star of a
-frame. None of the classics does: up to three hardly touch them. (2) One unit of brightness noise is {unit:.4f} mag; it hardly touches
-algorithms that look at positions. The curves of the papers fall with σ in *magnitudes*, which carries stars across
-the threshold of detection: the two axes of figure 6.10 are not the same quantity. (3) Pair distances alone (GV, IA, and PA and SGS to a lesser
-degree) stop being unique when the tolerance grows with the noise. How soon depends on tolerance over field width and on the
-number of guide stars, which the papers choose and the thesis does not state. (4) Sizes and times: ours are of up to {stars} faint stars and of
-compiled code; the remark "12° sensor" gives the size for the sensor of most of the papers, 12° and stars to V 6. Times are the
-wall time of one solve on whatever machine made this report. (5) The papers' guide stars are spread evenly. The flat sky's are the fewer to the
-square degree the farther from its equator, so that one frame in sixty has but two of the 15 a field that PA is given:
+**What differs, and why.** (1) False stars break the thesis's algorithm, as figure 6.11 shows, because its
+features depend on every star in a frame. The classic algorithms hardly suffer from up to three of them. (2)
+One unit of brightness noise is {unit:.4f} mag, which hardly affects algorithms that use positions. The curves
+in the papers fall with σ in *magnitudes*, where stars cross the detection threshold: the two axes of figure
+6.10 are not the same quantity. (3) Pair distances alone (GV, IA and, to a lesser degree, PA and SGS) cease to
+be unique when the tolerance grows with the noise. How soon depends on the ratio of tolerance to field width
+and on the number of guide stars, which the papers choose and the thesis does not state. (4) Sizes and times:
+ours are for up to {stars} faint stars and compiled code; the remark "12° sensor" gives the size for the
+sensor of most of the papers, 12° and stars to V 6. Times are the wall time of one solution on the machine
+that made this report. (5) The papers' guide stars are evenly spread. On the flat sky their density falls with
+distance from its equator, so that one frame in sixty has only two of the 15 stars per field that PA is given:
 without noise PA fails there and nowhere else."""
 
 
@@ -124,7 +128,7 @@ def _noise(case: str) -> NoiseModel:
 def _identify_frames(
     context: Context, sky: ThesisSky, name: str, solver: Any, noise: NoiseModel, frames: Array
 ) -> tuple[Array, Array]:
-    """ε_f of each frame, degrees, NaN where there is no answer, and milliseconds."""
+    """ε_f of each frame, degrees, NaN if there is no answer; and times, milliseconds."""
     errors, times = np.full(len(frames), np.nan), np.empty(len(frames))
     rng = context.rng(sky.name, repr(noise))
     for i, (ra, dec) in enumerate(frames):
@@ -143,7 +147,7 @@ def _identify_frames(
 
 
 def _distance(sky: SkyName, found: tuple[float, float], true: tuple[float, float]) -> float:
-    """Error of a boresight, degrees: in the plane, or on the sphere."""
+    """Error of a boresight, degrees, in the plane or on the sphere."""
     if sky == "flat":
         return float(boresight_error(*found, *true))
     a, b = (
@@ -156,7 +160,7 @@ def _distance(sky: SkyName, found: tuple[float, float], true: tuple[float, float
 def _lsi(
     context: Context, rng: np.random.Generator, ra: float, dec: float, noise: NoiseModel
 ) -> tuple[float, float]:
-    """ε_f, degrees, and milliseconds of the thesis's own algorithm on a frame of its flat sky."""
+    """ε_f, degrees, and time, milliseconds, of the thesis's algorithm on a frame of its flat sky."""
     from starid.thesis.features import extract_features
 
     lsi, sky = context.lost_in_space(0.995), context.sky()
@@ -206,9 +210,9 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _kilobytes(context: Context, name: str, solver: Any) -> tuple[float, float, float]:
-    """Size of the database here and for the sensor of the papers, kB, and the seconds to build the latter; NaN where none."""
+    """Size of the database, here and for the papers' sensor, kB, and build time of the latter, s; or NaN."""
     if name == "lsi":
-        # five features of eight bits a cell; coordinates follow from the cell's number
+        # five 8-bit features per cell; the coordinates follow from the number of the cell
         return 5e-3 * context.lost_in_space(0.995).database.cells, math.nan, math.nan
     if name not in CLASSICS:
         return math.nan, math.nan, math.nan
@@ -228,9 +232,9 @@ def _wrong(results: Results, case: str) -> float:
     return 100.0 * float(np.mean(results[f"f_{case}"] > IDENTIFIED_DEG))
 
 
-def _case_words(case: str) -> str:
+def _case_label(case: str) -> str:
     kind, _, level = case.partition("-")
-    return _WORDS[kind].format(level) if level else "no noise"
+    return _LABELS[kind].format(level) if level else "no noise"
 
 
 def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
@@ -243,7 +247,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 name, result = part.values["algorithm"], results[part.key]
                 rows.append(
                     row(
-                        f"{SHORT[name]}, {_SKY_WORDS[sky]}, {_case_words(case)}: identified",
+                        f"{SHORT[name]}, {_SKY_LABELS[sky]}, {_case_label(case)}: identified",
                         published=_PUBLISHED.get(case, {}).get(name),
                         ours=_rate(result, case),
                         unit="%",
@@ -252,7 +256,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                     )
                 )
     first = context.parameters["skies"][0]
-    # the first sky is the thesis's own where both are asked for
+    # the first sky is the flat one if both are selected
     for name, (size, milliseconds) in TABLE_6_2.items():
         key = f"{first}-{name}"
         if key not in results:
@@ -287,7 +291,7 @@ _FLOORS: Final = {
         ("pyramid", "grid", "iterative", "geometric-voting", "log-polar", "vector-pattern", "lsi"), 95.0
     ),
 }
-"""Share of clean frames that an algorithm must identify to count as made as published, %."""
+"""Share of clean frames that a faithful implementation of an algorithm must identify, %."""
 
 
 def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
@@ -323,7 +327,7 @@ def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
                 for value in _PUBLISHED.get(f"{kind}-{level}" if level else "none", {}).values():
                     axis.plot([level], [value], "rx", ms=7)
             axis.set(
-                xlabel=label, ylabel="identified / %", title=_SKY_WORDS[sky], xticks=levels, ylim=(0, 102)
+                xlabel=label, ylabel="identified / %", title=_SKY_LABELS[sky], xticks=levels, ylim=(0, 102)
             )
             axis.legend(ncols=2, fontsize=6)
         files.append(save(fig, context.folder / f"figure_6_{number}_classics.png"))

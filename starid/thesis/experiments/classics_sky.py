@@ -1,8 +1,9 @@
-"""The thesis's frames as an identifier of stars takes them: positions in pixels and fluxes, on its flat sky and on the true sphere.
+"""The frames of the thesis as input of a star identifier, on a flat or a spherical sky.
 
-On the flat sky distances are those of the (α, δ) plane, which no turn of a sphere keeps. The published algorithms work
-with unit vectors; so the plane is laid, small as a stamp, on the sphere, and seen through a lens so long that its frames fill
-the same pixels: curvature is gone, distances are those of the plane, and no algorithm needs to know.
+On the flat sky distances are those in the (α, δ) plane, which no rotation of a sphere preserves. The
+published algorithms use unit vectors, so the plane is mapped to a tiny patch of the sphere and imaged by a
+lens of such long focal length that a frame fills the same pixels. Curvature is then negligible, and the
+algorithms need no change.
 """
 
 from __future__ import annotations
@@ -27,21 +28,21 @@ from starid.thesis.simulation import PIXEL_DEG, NoiseModel, add_noise
 SkyName = Literal["flat", "sphere"]
 
 STAMP: Final = 2e-5
-"""Radians of the sphere that a degree of the flat plane becomes."""
+"""Scale of the patch: radians on the sphere per degree of the flat plane."""
 
 _SIDE_PX: Final = 937
 
 
 @dataclass(frozen=True, eq=False)
 class ThesisSky:
-    """A sky of the thesis's stars, with the camera and the catalogue that belong to it.
+    """A sky with the stars of the thesis, and the camera and catalogue for it.
 
     Attributes
     ----------
     frames
-        Where frames are taken from.
+        The stars from which frames are taken.
     camera, catalog
-        For identifiers; magnitudes are Hp in both bands.
+        Camera and catalogue for identifiers; magnitudes are Hp in both bands.
     """
 
     name: SkyName
@@ -50,13 +51,13 @@ class ThesisSky:
     catalog: StarCatalog
 
     def limit_for(self, per_field: float) -> float:
-        """Magnitude to which a frame holds so many stars on the average; that of the faintest where there are fewer."""
+        """Magnitude limit for a mean number of stars per frame; the faintest star's if there are fewer."""
         row = math.ceil(len(self.catalog) * per_field / self.stars_per_field)
         return float(self.catalog.v[min(row, len(self.catalog)) - 1])
 
     @property
     def stars_per_field(self) -> float:
-        """Stars of the catalogue in a frame on the average."""
+        """Mean number of catalogue stars per frame."""
         share = (
             0.5 * (1.0 - math.cos(math.radians(20.0)))
             if self.name == "sphere"
@@ -67,7 +68,7 @@ class ThesisSky:
     def observe(
         self, rng: np.random.Generator, ra_deg: float, dec_deg: float, noise: NoiseModel
     ) -> tuple[Array, Array]:
-        """Positions (n, 2), pixels, and fluxes (n,), 1 at magnitude 0, of the objects in a frame with north up."""
+        """Positions (n, 2), pixels, and fluxes (n,), 1 at magnitude 0, of a frame with north up."""
         brightness, places, _ = self.frames.stars_in_frame(ra_deg % 360.0, dec_deg)
         to_deg = PIXEL_DEG if self.name == "sphere" else 1.0
         magnitudes, places, _ = add_noise(
@@ -76,7 +77,7 @@ class ThesisSky:
         return places / PIXEL_DEG + np.asarray(self.camera.centre_px), 10.0 ** (-0.4 * magnitudes)
 
     def boresight_deg(self, attitude: Attitude) -> tuple[float, float]:
-        """Right ascension and declination that an attitude of this sky means, degrees."""
+        """Right ascension and declination, degrees, for an attitude on this sky."""
         if self.name == "sphere":
             return attitude.ra_deg, attitude.dec_deg
         x, y, z = attitude.boresight
@@ -85,7 +86,7 @@ class ThesisSky:
 
 @lru_cache(maxsize=2)
 def thesis_sky(name: SkyName) -> ThesisSky:
-    """The sky of the published numbers, flat as the thesis has it, or its stars on the sphere."""
+    """Make the sky of the published figures, flat as in the thesis, or with the same stars on the sphere."""
     catalog = star_catalog()
     faint = catalog.subset(catalog.hp >= THESIS_KAPPA)
     faint = dataclasses.replace(faint, v=faint.hp)
@@ -103,7 +104,7 @@ def thesis_sky(name: SkyName) -> ThesisSky:
 
 
 def _stamp(stars: StarCatalog) -> StarCatalog:
-    """Stars of the flat plane as a small patch of the sphere; it does not wrap, and no frame of the thesis crosses α = 0°."""
+    """Map the flat plane to a small patch of the sphere; it does not wrap, as no frame crosses α = 0°."""
     ra, dec = np.degrees(stars.ra_rad), np.degrees(stars.dec_rad)
     vectors = np.column_stack([STAMP * (ra - 180.0), STAMP * dec, np.ones(len(stars))])
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)

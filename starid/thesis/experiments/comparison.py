@@ -1,4 +1,4 @@
-"""Checks against published numbers: on both sides within a stated tolerance, or on the better side of the number."""
+"""Checks against published numbers: agreement within a stated tolerance, or improvement on the number."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from starid.thesis.experiments.experiment import Kind, ReproduceError, Row, spac
 
 
 class Readings(TypedDict, total=False):
-    """A number as the author ran the algorithm, as the thesis prints it, and ours; keywords of the functions below."""
+    """A number from the author's version of the algorithm, from the printed one, and ours."""
 
     author: float
     printed: float
@@ -19,7 +19,7 @@ class Readings(TypedDict, total=False):
 
 
 Tolerance = tuple[float, str]
-"""Greatest difference from the published number, and where that comes from."""
+"""Largest difference from the published number, and its origin."""
 
 
 def rounding(digits: int, unit: str = "") -> Tolerance:
@@ -28,9 +28,9 @@ def rounding(digits: int, unit: str = "") -> Tolerance:
 
 
 def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
-    """Difference of two shares (percent) that were each counted in so many trials, at so many standard errors.
+    """Tolerance for two shares (percent) counted in equally many trials, as a multiple of the standard error.
 
-    The standard error is that of (k + 1)/(n + 2), which leaves a published 0 or 100 % an uncertainty.
+    The standard error is computed for (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too.
     """
     share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
     error = 100.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
@@ -38,7 +38,7 @@ def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
 
 
 def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
-    """Difference of two means over so many trials each, at so many standard errors, for a standard deviation."""
+    """Tolerance for two means over equally many trials, as a multiple of the standard error."""
     error = sigma * math.sqrt(2.0 / trials)
     return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
 
@@ -54,7 +54,7 @@ def shown(
     digits: int = 2,
     remark: str = "",
 ) -> Row:
-    """Make a row that informs and checks nothing."""
+    """Make a row without a check."""
     return Row(
         quantity,
         value_text(published, unit, digits),
@@ -66,7 +66,7 @@ def shown(
 
 
 def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -> Row:
-    """The row as a check of a class that is passed when all its published numbers match."""
+    """Turn a row into a check that passes if all its published numbers match."""
     met, of = sum(map(bool, matches)), len(matches)
     return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
 
@@ -83,14 +83,15 @@ def agreement(
     digits: int = 2,
     remark: str = "",
 ) -> Row:
-    """Make a check on both sides of a published number.
+    """Make a check for agreement with a published number.
 
-    The value that is checked is that of the algorithm as the author ran it; without one, as printed; without that, ours.
+    The value checked is from the author's version of the algorithm, or else from the printed one, or else
+    ours.
 
     Raises
     ------
     ReproduceError
-        If there is no number to check.
+        There is no number to check.
     """
     checked = author if author is not None else printed if printed is not None else ours
     if checked is None or isinstance(checked, str):
@@ -114,7 +115,7 @@ def same(
     target: str,
     remark: str = "",
 ) -> Row:
-    """Make one row for several published numbers, of which each agrees or not under the rule named by `target`."""
+    """Make one row for several published numbers; `target` names the rule by which each agrees or not."""
     met, of = sum(map(bool, matches)), len(matches)
     remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
     informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
@@ -131,7 +132,7 @@ def improvement(
     digits: int = 2,
     remark: str = "",
 ) -> Row:
-    """Make a check that ours is on the better side of a published number; the remark says by how much."""
+    """Make a check that ours is better than a published number; the remark states by how much."""
     gain = ours - published if larger else published - ours
     better = f"by {value_text(gain, unit, digits)}"
     if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:

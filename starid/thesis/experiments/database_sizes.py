@@ -50,14 +50,15 @@ _NOMINAL: Final = {
 }
 _BYTES: Final = 5
 _INCLUSIVE: Final = (99.75,)
-"""Overlaps of the databases that count both ends of their ranges."""
+"""Overlaps of the databases that include both ends of their ranges."""
 _FILE_LIMIT_BYTES: Final = 32_000_000
 _BUILD_LIMIT_S: Final = 10.0
 _THREADS: Final = 2
 
-_NOTE: Final = """The published sizes are five bytes a frame, at a grid step of 40°·(1 − p) over 140° of declination; eq. 2.23 with
-the φ = 42° of the text gives the nominal N of section 6.1.1, which the tables were not made with. Ours are the cells of the
-grid times five bytes, in kB of 1 000 bytes; the polar angle takes a sixth."""
+_NOTE: Final = """The published sizes are five bytes per frame, at a grid step of 40°·(1 − p) over 140° of
+declination. Eq. 2.23 with φ = 42°, as in the text, gives the nominal N of section 6.1.1, for which the tables
+were not made. Ours are the number of cells times five bytes, in kB of 1 000 bytes; the polar angle takes a
+sixth byte."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -88,7 +89,7 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _inclusive_cells(percent: float) -> float:
-    """Cells of a grid whose rows and columns include both ends of 360° × 140°."""
+    """Number of cells of a grid that includes both ends of 360° and of 140°."""
     step = 40.0 * (1.0 - percent / 100.0)
     return float((round(360.0 / step) + 1) * (round(140.0 / step) + 1))
 

@@ -1,4 +1,4 @@
-"""What an experiment of `starhil reproduce` is: parts that can be computed apart, and an outcome with rows for the report."""
+"""Experiments of `starhil reproduce`: separately computed parts, and an outcome for the report."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ if TYPE_CHECKING:
     from starid.thesis.lsi import LostInSpace, Solver
 
 Results = dict[str, NDArray[Any]]
-"""What one part yields: named arrays."""
+"""Results of a part: named arrays."""
 
 Parameters = Mapping[str, Any]
-"""What an experiment depends on; plain values only, as JSON has them."""
+"""What an experiment depends on; JSON values only."""
 
 EPOCH: Final = 1991.25
-"""The catalogue's own epoch: the published numbers know no proper motion."""
+"""Epoch of the catalogue: the published numbers are without proper motion."""
 
 Kind = Literal["", "agrees", "better", "ours"]
-"""Class of a check: against a published number on both sides, on one side, or against a bound of this project; "" is none."""
+"""Class of a check: agreement with a published number, improvement on it, our own bound, or none ("")."""
 
 
 class ReproduceError(StaridError):
-    """A reproduction that cannot be run as asked for."""
+    """A reproduction that cannot be run as requested."""
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of an experiment that can be computed by itself.
+    """A piece of an experiment that can be computed separately.
 
     Attributes
     ----------
     key
-        Name of the part, unique in its experiment; it names a file too.
+        Name of the part, unique in its experiment; also used as a file name.
     values
-        What sets this part apart from the others.
+        Values that distinguish this part from the others.
     """
 
     key: str
@@ -57,7 +57,7 @@ class Part:
 
 
 def parts_of(key: str, **values: Iterable[Any]) -> list[Part]:
-    """A part for each combination of values, the last running fastest; `key` is a format of their names."""
+    """Make a part for each combination of values, the last varying fastest; `key` is a format string."""
     chosen = [dict(zip(values, line, strict=True)) for line in itertools.product(*values.values())]
     return [Part(key.format(**line), line) for line in chosen]
 
@@ -69,21 +69,21 @@ class Row:
     Attributes
     ----------
     quantity
-        What was measured, with its conditions.
+        What was measured, and under what conditions.
     published, ours
-        The published value and this project's, as they are printed; "—" where there is none.
+        The published value and this project's, as printed in the report; "—" if there is none.
     target
-        What is checked, and the tolerance with its origin; "" without a check.
+        What is checked, and the tolerance and its origin; "" without a check.
     passed
         Outcome of the check; None if there is none.
     remark
-        Why the values differ, or what to know about them.
+        Why the values differ, or how to read them.
     author, printed
-        The value of the algorithm as the thesis's author ran it, and as the thesis prints it; "—" where there is none.
+        Values from the author's version of the algorithm and from the printed one; "—" if there is none.
     kind
         Class of the check.
     met, of
-        How many of the published numbers that the row stands for agree, and how many they are.
+        How many of the published numbers in the row agree, and how many there are.
     """
 
     quantity: str
@@ -101,7 +101,7 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What an experiment adds to the report: rows, the names of its files, and paragraphs of Markdown."""
+    """What an experiment adds to the report: rows, names of files, and paragraphs of Markdown."""
 
     rows: tuple[Row, ...]
     files: tuple[str, ...] = ()
@@ -109,16 +109,16 @@ class Outcome:
 
     @property
     def failed(self) -> tuple[Row, ...]:
-        """Rows whose check was missed."""
+        """Rows whose check failed."""
         return tuple(row for row in self.rows if row.passed is False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values."""
+        """Convert to plain values."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Outcome:
-        """Read back what `to_dict` wrote."""
+        """Make an outcome from the values of `to_dict`."""
         rows = tuple(Row(**row) for row in values["rows"])
         return cls(rows, tuple(values["files"]), tuple(values["notes"]))
 
@@ -132,20 +132,20 @@ class Experiment:
     name, title
         Name on the command line, and heading in the report.
     parts
-        Parts for given parameters.
+        Function that lists the parts for given parameters.
     work
-        Computes a part, in a separate process; it must be a function of a module.
+        Function that computes a part, in a separate process; it must be defined at module level.
     finish
-        Makes tables, figures and rows from the results of all parts, by key.
+        Function that makes tables, figures and rows from the results of all parts, by key.
     full, quick
         Parameters of the full run and of the quick one; None leaves the experiment out of the quick run.
     alone
-        Measures time: nothing runs beside it in the full run.
+        The experiment measures time: in the full run nothing else runs at the same time.
     turn
-        Experiments with smaller numbers begin first. Those that compile different kernels, which others need, do: two
-        processes at work on the same experiment compile everything twice.
+        Experiments with smaller numbers start first. These are experiments that compile different kernels
+        which others need: two processes that work on the same experiment compile everything twice.
     revision
-        Raised when the code changes what comes out, so that older results are made again.
+        Incremented when a change of the code changes the results, so that they are computed again.
     """
 
     name: str
@@ -160,7 +160,7 @@ class Experiment:
     revision: int = 1
 
     def fingerprint(self, parameters: Parameters, seed: int, part: Part | None = None) -> str:
-        """Checksum of all that the outcome, or one part of it, depends on."""
+        """Checksum of everything on which the outcome, or one part, depends."""
         content = {
             "name": self.name,
             "revision": self.revision,
@@ -173,22 +173,22 @@ class Experiment:
 
 
 def _without_lists(parameters: Parameters) -> dict[str, Any]:
-    """Parameters that hold for every part: a list says which parts there are, and a part names its own entry."""
+    """Parameters common to all parts; lists, which say which parts there are, are left out."""
     return {key: value for key, value in parameters.items() if not isinstance(value, list | tuple)}
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Where and with what an experiment runs.
+    """Folders, seed and parameters of a run of an experiment.
 
     Attributes
     ----------
     folder
-        The experiment's own folder.
+        Folder of the experiment.
     databases
-        Folder in which feature databases are kept for all experiments.
+        Folder of the feature databases of all experiments.
     name, seed, parameters
-        Of the experiment, the run, and this run of the experiment.
+        Name of the experiment, seed of the run, parameters of this run of the experiment.
     quick
         Whether this is the quick run.
     """
@@ -201,21 +201,21 @@ class Context:
     quick: bool
 
     def rng(self, *keys: str | int) -> np.random.Generator:
-        """Source of chance that depends on the run's seed, the experiment and the keys, and on nothing else."""
+        """Random generator that depends only on the seed of the run, the experiment and the keys."""
         text = json.dumps([self.name, *keys])
         entropy = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
         return np.random.default_rng([self.seed, entropy])
 
     def database(self, overlap: float) -> FeatureDatabase:
-        """Planar database of the thesis for an overlap ratio (a fraction), built once and kept in a file."""
+        """Planar database of the thesis for an overlap ratio (a fraction), built once and stored."""
         return _database(self.databases, overlap)
 
     def database_file(self, overlap: float) -> Path:
-        """Where that database is kept."""
+        """File of the database."""
         return _database_file(self.databases, overlap)
 
     def lost_in_space(self, overlap: float, solver: Solver = "exact") -> LostInSpace:
-        """The LSI algorithm on that database, kept in this process."""
+        """The LSI algorithm with that database, kept for this process."""
         return _lost_in_space(self.databases, overlap, solver)
 
     def sky(self) -> FrameSky:
@@ -236,7 +236,7 @@ def row(
     target: str = "",
     remark: str = "",
 ) -> Row:
-    """Make a row for the report; a bound, which is this project's own, makes it a check of the class "ours".
+    """Make a row for the report; with a bound it becomes a check of class "ours".
 
     `starid.thesis.experiments.comparison` makes the checks against published numbers.
 
@@ -247,15 +247,15 @@ def row(
     ours, published
         Values: numbers (printed with `digits` decimals and `unit`) or text; published may be None.
     at_least, at_most
-        Bounds of this project on `ours`, which must then be a number.
+        Bounds on `ours`, set by this project; `ours` must then be a number.
     passed, target
-        A check of another kind, and its wording.
+        Result of another kind of check, and its description.
     remark
-        Why the two differ.
+        Why the two values differ.
     """
     space = space_before(unit)
     if isinstance(ours, str) and not (at_least is None and at_most is None):
-        raise ReproduceError(f"reproduce: {quantity}: a text has no bounds; give a number")
+        raise ReproduceError(f"reproduce: {quantity}: text cannot have bounds; give a number")
     bounds = []
     if at_least is not None and not isinstance(ours, str):
         bounds.append(f"≥ {at_least:g}{space}{unit}")
@@ -278,19 +278,19 @@ def row(
 
 
 def space_before(unit: str) -> str:
-    """What stands between a number and its unit."""
+    """Separator between a number and its unit."""
     return "" if unit in ("", "°", "″") else " "
 
 
 def value_text(value: float | str | None, unit: str, digits: int) -> str:
-    """A value as the report prints it; "—" for none."""
+    """Format a value for the report; "—" for None."""
     if value is None:
         return "—"
     return value if isinstance(value, str) else f"{value:.{digits}f}{space_before(unit)}{unit}"
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> str:
-    """Write columns of equal length under their names; numbers with nine significant digits. Return the file's name."""
+    """Write named columns, numbers with nine significant digits; return the file name."""
     lengths = {len(column) for column in columns.values()}
     if len(lengths) != 1:
         raise ReproduceError(f"reproduce: columns of {path.name} have the lengths {sorted(lengths)}")
@@ -306,13 +306,13 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -
 
 
 def write_lines(path: Path, lines: Sequence[Mapping[str, Any]]) -> str:
-    """Write lines that all have the same names as `write_csv` does."""
+    """As `write_csv`, for a list of lines with the same keys."""
     return write_csv(path, {name: [line[name] for line in lines] for name in lines[0]})
 
 
 @lru_cache(maxsize=1)
 def star_catalog() -> StarCatalog:
-    """The stars at the catalogue's own epoch."""
+    """The stars at the epoch of the catalogue."""
     from starid.catalog import load_catalog
 
     return load_catalog(epoch=EPOCH)
@@ -320,7 +320,7 @@ def star_catalog() -> StarCatalog:
 
 @lru_cache(maxsize=16)
 def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None) -> FrameSky:
-    """Stars of the flat sky for a brightness limit (None: the one of the published databases)."""
+    """Stars of the flat sky for a brightness limit (None: as in the published databases)."""
     from dataclasses import replace
     from typing import cast
 
@@ -337,10 +337,10 @@ def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None
 
 @lru_cache(maxsize=4)
 def author_database(overlap: float) -> FeatureDatabase:
-    """Planar database whose brightness counts from the brightest star of the catalogue.
+    """Planar database with brightness relative to the brightest star of the catalogue.
 
-    These are the weights of the thesis's frame object, a − min(a); the normalised features differ in r alone, by
-    hundredths of a degree before they are normalised. The mean brightness A is greater by −min(a).
+    These are the weights of the thesis's frame object, a − min(a). The normalised features differ only in r,
+    by hundredths of a degree before normalisation. The mean brightness A is larger by −min(a).
     """
     from dataclasses import replace
 

@@ -25,7 +25,7 @@ from starid.thesis.experiments.experiment import (
 from starid.thesis.experiments.plots import colours, figure, save
 
 FRAME_DEG: Final = 42.0
-"""Frame width of these figures: their zones, δ −6° … 36° and α 0° … 42°, are 42° wide."""
+"""Frame width of these figures, degrees: their zones, δ −6° … 36° and α 0° … 42°, are 42° wide."""
 
 NO_LIMIT: Final = -99.0
 """A brightness limit that keeps every star."""
@@ -39,16 +39,16 @@ _MAPS: Final = {
     "sigma_A": ("2_7", "brightness deviation", "σ_A / mag"),
     "sigma_r": ("2_8", "polar radius deviation", "σ_r / °"),
 }
-"""Feature → number of its map, its name, and symbol with unit; in the order of the panels."""
+"""Feature → number of its map, name, and symbol with unit; in the order of the panels."""
 
-_NOTE: Final = """No brightness limit, frames 42° wide in the flat (α, δ) plane, as the thesis draws them; every star of the
-catalogue takes part. The thesis prints no numbers with these figures; the values it names in the text are compared.
-As a frame near δ = ±90° reaches beyond the pole, where the flat plane ends, half of it is empty there: that alone
-makes r grow and n fall at the upper and lower rims of the maps."""
+_NOTE: Final = """No brightness limit; frames 42° wide in the flat (α, δ) plane, as the thesis draws them,
+with every star of the catalogue. The thesis prints no numbers with these figures; the values in its text are
+compared. A frame near δ = ±90° extends beyond the pole, where the flat plane ends, so half of it is empty:
+only for this reason r grows and n falls at the upper and lower rims of the maps."""
 
 
 def _features(centres: Array, kappa: float) -> Array:
-    """Features and θ (degrees) of frames, (n, 6); NaN for a frame without a star."""
+    """Features and θ (degrees) of frames, (n, 6); NaN for a frame without stars."""
     from starid.thesis.frame_sky import cell_features
 
     sky = planar_sky(kappa, "faintest", FRAME_DEG)
@@ -174,7 +174,7 @@ def _rows(whole: Results) -> list[Row]:
             "figure 2.5: greatest polar radius r of frames that lie whole within −90° … 90°",
             printed=float(radius[inner].max()),
             unit="°",
-            remark="What is left of it without the empty space beyond the poles.",
+            remark="The same without the empty space beyond the poles.",
         ),
     ]
 

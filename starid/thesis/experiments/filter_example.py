@@ -1,4 +1,4 @@
-"""Plots of the filter's input and of its cluster: figures 3.2, 5.3 and 5.4, and the example of section 6.2.1."""
+"""Input of the filter and its cluster: figures 3.2, 5.3 and 5.4; the example of section 6.2.1."""
 
 from __future__ import annotations
 
@@ -45,11 +45,12 @@ _FAINTEST: Final = 3.8
 _PATCH: Final = (28.1, 30.1, 29.2, 31.9)
 _BRIGHTNESS_SIGMA: Final = 5.0
 
-_NOTE: Final = """The field α, δ ∈ (0°, 42°) with its six brightest stars (the thesis's "brighter than −12 M_V" is met by none of the catalogue)
-and a false star in each of two frames, the second shifted by −5° in declination and turned by 10° counter-clockwise. 21 pairs in
-each frame make the 441 disparities of figure 3.2. Without noise every pair of true stars gives the same turn; measured to whole
-pixels of the image the turns spread as the thesis's do. Figure 5.3 draws the field's stars to 3.8 mag as Gaussians, without noise and with
-σ_p = 1 px and σ_m = 5 intensity units, and the patch that the thesis magnifies."""
+_NOTE: Final = """The field α, δ ∈ (0°, 42°) with its six brightest stars (no catalogue star is "brighter than
+−12 M_V", as the thesis has it) and a false star in each of two frames. The second frame is shifted by −5° in
+declination and rotated by 10° counter-clockwise. 21 pairs in each frame make the 441 disparities of figure
+3.2. Without noise every pair of true stars has the same rotation; with positions rounded to whole pixels the
+rotations spread as in the thesis. Figure 5.3 shows the stars of the field to 3.8 mag as Gaussians, without
+noise and with σ_p = 1 px and σ_m = 5 intensity units, and the patch that the thesis magnifies."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -58,7 +59,7 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _field(limit: float) -> tuple[Array, Array]:
-    """Magnitudes (n,) and α, δ in degrees (n, 2) of the stars of the field to a limit, brightest first."""
+    """Magnitudes (n,) and α, δ in degrees (n, 2) of the stars in the field to a limit, brightest first."""
     catalog = star_catalog()
     places = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad]))
     chosen = np.all((places > 0.0) & (places < _FIELD_DEG), axis=1) & (catalog.hp <= limit)
@@ -80,12 +81,12 @@ def _frames(rng: np.random.Generator) -> tuple[ObservedFrame, ObservedFrame]:
 
 
 def _to_pixels(frame: ObservedFrame) -> ObservedFrame:
-    """The frame with its places rounded to whole pixels."""
+    """Round the positions in a frame to whole pixels."""
     return ObservedFrame(frame.brightness, np.rint(frame.positions / PIXEL_DEG) * PIXEL_DEG)
 
 
 def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[Array, Mask]:
-    """All disparities of two frames, (n, 3), and which of them are in the main cluster."""
+    """All disparities of two frames, (n, 3), and a mask of those in the main cluster."""
     first, second = pairs_of(before), pairs_of(now)
     found = np.empty((len(first) * len(second), 3))
     disparity_list(first, second, found)
@@ -121,7 +122,7 @@ def _cluster_figure(context: Context, result: Results) -> str:
 
 
 def _image(brightness: Array, pixels: Array) -> Array:
-    """Stars as Gaussians on the detector; intensity falls linearly with magnitude, as in the thesis's 8-bit images."""
+    """Draw stars as Gaussians; intensity falls linearly with magnitude, as in the thesis's 8-bit images."""
     image = np.zeros((_PIXELS, _PIXELS))
     reach = np.arange(-8, 9)
     for mag, (x, y) in zip(brightness, pixels, strict=True):
@@ -200,7 +201,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
                 published=f"{_INTERVAL[0]}° … {_INTERVAL[1]}°",
                 printed=f"{turns.min():.2f}° … {turns.max():.2f}°",
                 ours=f"{abs(float(result[f'turn_{name}'])):.3f}°",
-                remark="Ours: the turn of the affine motion of all matches; the true one is 10°.",
+                remark="Ours: the rotation of the affine motion of all matches; the true one is 10°.",
             )
         )
     points = result["disparities_pixels"]

@@ -1,4 +1,4 @@
-"""False-star filter and camera motion: parameter choice 6.12, figures 6.14–6.19, confusion matrices A.1–A.18."""
+"""False-star filter and camera motion: parameters 6.12, figures 6.14–6.19, tables A.1–A.18."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
 from starid.thesis.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
 
 RADIUS_DEG: Final = 21.0
-"""Radius of the circular field of these experiments."""
+"""Radius of the circular field of these experiments, degrees."""
 
 EQUIVALENT: Final = 0.2
-"""Share of the printed noise with which the thesis's affine motion has the published μ_d of figure 6.18."""
+"""Factor on the printed noise for which the thesis's affine motion has the published μ_d of figure 6.18."""
 
 KINDS: Final = ("brightness", "position", "both")
 _MODELS: Final[tuple[MotionModel, ...]] = ("affine", "rigid")
-_KIND_WORDS: Final = {"brightness": "brightness", "position": "position", "both": "brightness and position"}
+_KIND_LABELS: Final = {"brightness": "brightness", "position": "position", "both": "brightness and position"}
 FACTORS: Final = (0, 1, 2, 3, 4, 5)
 _CORNER: Final = (87.41, -8.86)
 _BRIGHTEST: Final = 3.0
@@ -50,7 +50,7 @@ _FILTERS: Final = ("any", "matched", "followed")
 _WORST_MOTION_DEG: Final = 0.0419
 _ALL: Final = 100.0
 _SPREAD_OF_MOTION: Final = 0.35
-"""Standard deviation of the μ_d of a frame, in parts of its mean, for seven stars and an affine motion."""
+"""Relative standard deviation of the μ_d of a frame, for seven stars and an affine motion."""
 _STARS_A_FRAME: Final = 6.617
 _NAMED: Final = (
     ("brightness", 0, 0, "accuracy", 100.0),
@@ -69,7 +69,7 @@ _NAMED: Final = (
 
 
 def first_frame() -> tuple[Any, Any]:
-    """Magnitudes (7,) and offsets in degrees (7, 2) of the stars of the published experiments: Hp < 3 in the square."""
+    """Magnitudes (7,) and offsets (7, 2), degrees, of the published stars: Hp < 3 in the square."""
     catalog = star_catalog()
     places = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad])) - _CORNER - RADIUS_DEG
     chosen = (catalog.hp < _BRIGHTEST) & np.all(np.abs(places) <= RADIUS_DEG, axis=1)
@@ -79,13 +79,13 @@ def first_frame() -> tuple[Any, Any]:
 def frames_of_seven(
     rng: np.random.Generator, noise: NoiseModel, count: int
 ) -> tuple[SimulatedFrame, Iterator[SimulatedFrame]]:
-    """The clean frame of those seven stars, and so many frames that are moved from it."""
+    """The clean frame with the seven stars, and `count` frames moved from it."""
     frames = moved_frames(rng, *first_frame(), noise, count=count, radius_deg=RADIUS_DEG)
     return next(frames), frames
 
 
 def noise_of(kind: str, factor: float, false_stars: int) -> NoiseModel:
-    """Noise of one set."""
+    """Noise model of one set."""
     return NoiseModel.factor(
         factor,
         false_stars,
@@ -98,7 +98,7 @@ def noise_of(kind: str, factor: float, false_stars: int) -> NoiseModel:
 def _motion(
     first: SimulatedFrame, frame: SimulatedFrame, result: FilterResult, model: MotionModel
 ) -> tuple[float, float, float, float]:
-    """μ_d, σ_d, error of the rotation and of the translation, degrees; NaN without matches enough."""
+    """μ_d, σ_d, and errors of rotation and translation, degrees; NaN with too few matches."""
     motion = matched_motion(first.observed, frame.observed, result.matches, model=model)
     if motion is None:
         return math.nan, math.nan, math.nan, math.nan
@@ -106,7 +106,7 @@ def _motion(
 
 
 def motion_errors(motion: CameraMotion, frame: SimulatedFrame) -> tuple[float, float]:
-    """Errors of the rotation and of the translation of a frame, degrees."""
+    """Errors of the rotation and the translation of a frame, degrees."""
     away = motion.translation_deg - frame.shift_deg
     return abs(motion.rotation_deg - frame.rotation_deg), float(np.hypot(*away))
 
@@ -149,7 +149,7 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _percent(counts: Sequence[int], indicator: str) -> float:
-    """An indicator of eq. 6.2, percent, of true positives, false positives, false negatives and true negatives."""
+    """An indicator of eq. 6.2, percent, from true and false positives, false and true negatives."""
     return Confusion(*(int(count) for count in counts)).percent(indicator)
 
 
@@ -180,7 +180,7 @@ def _indicator_figures(context: Context, results: Mapping[str, Results]) -> list
                 ours, theirs = ([_percent(c, indicator) for c in sets] for sets in (counts, TABLES[kind, f]))
                 ax.plot(FACTORS, ours, "-o", color=colour, markersize=3, label=f"f = {f}")
                 ax.plot(FACTORS, theirs, ":", color=colour)
-            ax.set(title=f"{_KIND_WORDS[kind]} noise", xlabel="noise factor μ", ylabel=f"{indicator} / %")
+            ax.set(title=f"{_KIND_LABELS[kind]} noise", xlabel="noise factor μ", ylabel=f"{indicator} / %")
         fig.legend(*np.ravel(axes)[0].get_legend_handles_labels(), loc="outside right upper")
         fig.suptitle(f"{indicator.capitalize()}, noise as printed (dotted: published)")
         files.append(save(fig, context.folder / f"figure_6_{number}.png"))
@@ -196,7 +196,7 @@ def _motion_figures(context: Context, results: Mapping[str, Results]) -> list[st
                 for scale, style in zip(context.parameters["scales"], ("-o", "--"), strict=False):
                     values = np.nanmean(results[f"{kind}-f{f}-x{scale:g}"]["affine"][:, :, place], axis=1)
                     ax.plot(FACTORS, values, style, color=colour, markersize=3, label=f"f = {f}, ×{scale:g}")
-            ax.set(title=f"{_KIND_WORDS[kind]} noise", xlabel="noise factor μ", ylabel=f"mean {name} / °")
+            ax.set(title=f"{_KIND_LABELS[kind]} noise", xlabel="noise factor μ", ylabel=f"mean {name} / °")
         fig.legend(*np.ravel(axes)[0].get_legend_handles_labels(), loc="outside right upper")
         scales = " and ".join(f"× {scale:g}" for scale in context.parameters["scales"])
         fig.suptitle(
@@ -214,7 +214,7 @@ def _agreeing(
     name: str,
     indicator: str,
 ) -> list[bool]:
-    """For each set of a kind of noise whether an indicator lies within the sampling error of the published one."""
+    """Whether an indicator agrees within sampling error, for each set of a kind of noise."""
     matches = []
     for f in false_stars:
         counts = results[f"{kind}-f{f}-x{scale:g}"][name]
@@ -226,14 +226,14 @@ def _agreeing(
 
 
 def _trials(ours: Any, published: Sequence[int], indicator: str) -> int:
-    """Number of independent decisions behind an indicator: the stars of a frame are lost together, so frames for the recall."""
+    """Number of independent trials; for the recall frames, as the stars of a frame are lost together."""
     if indicator == "precision":
         return int(min(ours[0] + ours[1], published[0] + published[1]))
     return int(min(ours[0] + ours[2], published[0] + published[2]) / _STARS_A_FRAME + 0.5)
 
 
 def _matrix(context: Context, results: Mapping[str, Results], scale: float, indicator: str) -> str:
-    """Published and our indicator of every set: a line for each of the tables A.1 to A.18, a column for each μ."""
+    """Tabulate our and the published indicator: a line for each table A.1–A.18, a column for each μ."""
     words = "noise as printed" if scale == 1.0 else f"noise × {scale:g}"
     head = f"{indicator} / %, {words}: published / in the cluster / matched"
     lines = [
@@ -248,13 +248,13 @@ def _matrix(context: Context, results: Mapping[str, Results], scale: float, indi
                 counts = (TABLES[kind, f][k], result["any"][k], result["matched"][k])
                 cells.append(" / ".join(f"{_percent(c, indicator):.1f}" for c in counts))
             number = 3 * f + 1 + KINDS.index(kind)
-            label = f"A.{number}: f = {f}, {_KIND_WORDS[kind]}"
+            label = f"A.{number}: f = {f}, {_KIND_LABELS[kind]}"
             lines.append("| " + " | ".join((label, *cells)) + " |")
     return "\n".join(lines)
 
 
 def _table_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
-    """How many of the tables' sets agree, in every reading of the noise and of the rule."""
+    """Count the sets of the tables that agree, for every interpretation of the noise and of the rule."""
     rows = []
     false_stars = context.parameters["false_stars"]
     for kind in context.parameters["kinds"]:
@@ -267,7 +267,7 @@ def _table_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             sets = len(found[1.0, "any"])
             rows.append(
                 same(
-                    f"tables A.1–A.18, {_KIND_WORDS[kind]} noise: {indicator} of the sets",
+                    f"tables A.1–A.18, {_KIND_LABELS[kind]} noise: {indicator} of the sets",
                     published=f"{sets} values",
                     author=f"{sum(found[1.0, 'matched'])} of {sets}",
                     printed=f"{sum(found[1.0, 'any'])} of {sets}",
@@ -281,7 +281,7 @@ def _table_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
 
 
 def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
-    """The values that section 6.2.2 names of figures 6.14 to 6.17."""
+    """The values of figures 6.14 to 6.17 that section 6.2.2 states."""
     rows = []
     for kind, f, k, indicator, published in _NAMED:
         if kind not in context.parameters["kinds"] or f not in context.parameters["false_stars"]:
@@ -290,7 +290,7 @@ def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         printed, author, ours = (_percent(literal[name][k], indicator) for name in _FILTERS)
         smaller = _percent(reduced["matched"][k], indicator)
         trials = int(context.parameters["frames"])
-        quantity = f"{indicator}, {_KIND_WORDS[kind]} noise, μ = {k}, f = {f}"
+        quantity = f"{indicator}, {_KIND_LABELS[kind]} noise, μ = {k}, f = {f}"
         rows.append(
             agreement(
                 quantity,
@@ -358,7 +358,7 @@ def _motion_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         agreement(
             "figure 6.18: greatest mean μ_d without noise, with false stars",
             published=0.0083,
-            tolerance=(0.00415, "half of it, as it is made by single frames"),
+            tolerance=(0.00415, "half of it, as single frames dominate it"),
             author=dirty,
             unit="°",
             digits=4,
@@ -366,22 +366,25 @@ def _motion_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     ]
 
 
-_NOTE: Final = """Seven stars (Hp < 3), circular field of 21°; every moved frame is compared with the first, complete one, which
-has its own false stars but no noise. This reading alone gives the published numbers of true and of false stars in the
-field, about 6 617 and 976 per false star. "In the cluster" is the rule as printed: whoever appears in the main cluster is a
-star, *as printed*. *As the author ran it* wants two objects to name each other most and at least twice, "matched": only so does the
-precision come out, in nearly all sets; under the rule as printed one chance member of the cluster lets a false star pass.
+_NOTE: Final = """Seven stars (Hp < 3), circular field of 21°; every moved frame is compared with the first,
+complete one, which has its own false stars but no noise. Only this interpretation gives the published numbers
+of true and false stars in the field, about 6 617 and 976 per false star. In the rule as printed, every object
+in the main cluster is a star: "in the cluster", or *as printed*. *As the author ran it*, "matched", two
+objects must each name the other most often, and at least twice. Only this rule reproduces the precision, in
+nearly all sets; under the rule as printed, one chance member of the cluster lets a false star pass.
 
-The recall does not come out in most sets. It falls by half a percent with every unit of brightness noise in the published tables, where
-clustering loses nothing, and at position noise it starts to fall at once, where ours holds to μ = 3: something else than the clustering
-loses stars there, which the text does not say. At μ = 4 and 5 with many false stars ours is below the published one: the 21 disparities of
-seven stars spread so far that in many frames no neighbourhood of ε = 0.4 holds half the number of objects (experiment `fsf-limits`
-counts them).
+The recall is not reproduced in most sets. In the published tables it falls by half a percent with every unit
+of brightness noise, to which clustering loses nothing, and with position noise it falls from the start, while
+ours holds up to μ = 3. Something other than the clustering loses stars there, and the text does not say what.
+At μ = 4 and 5 with many false stars, ours is below the published recall: the 21 disparities of seven stars
+spread so far that in many frames no neighbourhood of ε = 0.4 contains half as many points as there are
+objects (experiment `fsf-limits` counts these frames).
 
-The published μ_d is that of a fifth of the printed noise: an affine motion, six degrees of freedom as the thesis has it, leaves
-0.042° at one pixel of noise, where the thesis has 0.0419° at "μ = 5"; table 6.4, on the other hand, has the translation's error of one whole pixel at μ = 1.
-The sets are therefore run with both, the printed noise and a fifth of it. All 108 confusion matrices, with both readings, both noises, the scalable
-filter and the published counts, stand in `confusion_matrices.csv`; the tables here give their recall."""
+The published μ_d corresponds to a fifth of the printed noise: with six degrees of freedom, as in the thesis,
+an affine motion has 0.042° at one pixel of noise, while the thesis has 0.0419° at "μ = 5". In table 6.4, on
+the other hand, the error of the translation is one whole pixel at μ = 1. The sets are therefore run with the
+printed noise and with a fifth of it. All 108 confusion matrices, for both rules, both noises and the scalable
+filter, and the published counts, are in `confusion_matrices.csv`; the tables here list the recall."""
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:

@@ -1,4 +1,4 @@
-"""Why the recall of the thesis's filter falls at the noise as printed: how far noise spreads the disparities of true pairs."""
+"""Why the recall of the thesis's filter falls: the spread of the disparities of true pairs."""
 
 from __future__ import annotations
 
@@ -23,12 +23,14 @@ from starid.thesis.fsf import EPSILON, MIN_SAMPLES_SHARE, pair_count, pairs_of
 
 _FALSE_STARS: Final = 5
 
-_NOTE: Final = f"""Seven stars that are all seen, brightness and position noise, no false star: the {pair_count(7)} disparities of the pairs that
-belong together ought to lie in one heap. The table gives the heap's spread, how many of its members the fullest neighbourhood
-of ε = {EPSILON:g} holds (the heap's chance of a core point), and in which share of the frames that is less than the min_samples that
-seven stars and f false ones ask for, {MIN_SAMPLES_SHARE:g}·(7 + f). Without a core point there is no cluster, and all stars of the frame count as missed. At
-the noise as printed the heap is gone in a growing share of the frames from μ = 4 on, and the more so the more false stars there are; at
-{EQUIVALENT:g} of it nothing is lost. But for chance companions among the false pairs this bounds the recall, however the other steps are read."""
+_NOTE: Final = f"""Seven stars, all visible, with brightness and position noise and no false star: the
+{pair_count(7)} disparities of corresponding pairs should form one cluster. The table lists its spread, how
+many of its members the fullest neighbourhood of ε = {EPSILON:g} contains (which decides whether there is a
+core point), and the share of frames in which that is less than the min_samples for seven stars and f false
+ones, {MIN_SAMPLES_SHARE:g}·(7 + f). Without a core point there is no cluster, and all stars of the frame
+count as missed. At the printed noise there is no cluster in a growing share of the frames from μ = 4 on, the
+more so the more false stars there are; at {EQUIVALENT:g} of it nothing is lost. Apart from chance neighbours
+among the false pairs, this limits the recall, however the other steps are interpreted."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:

@@ -1,4 +1,4 @@
-"""Studies of the false-star filters: parameter choice 6.12, tables 6.3–6.5, and hundreds of objects a frame."""
+"""Studies of the false-star filters: parameters 6.12, tables 6.3–6.5, hundreds of objects per frame."""
 
 from __future__ import annotations
 
@@ -50,18 +50,23 @@ _CASE_TABLE: Final[dict[tuple[int, str], tuple[float, float, float, float, float
     (2, "position"): (100.0, 100.0, 6.7e-1, 1.4e-1, 2.7e-2, 1.7e-2),
     (2, "both"): (98.89, 98.59, 6.7e-1, 1.7e-1, 2.9e-2, 1.7e-2),
 }
-"""Tables 6.3 and 6.4: accuracy and precision (percent; the recall is 100 % in every row), ε_γ, σ_γ, ε_ρ and σ_ρ (degrees)."""
+"""Tables 6.3 and 6.4: accuracy, precision (percent; recall is 100 %), ε_γ, σ_γ, ε_ρ, σ_ρ (degrees)."""
 
-_CASE_NOTE: Final = """Ten moved frames, noise factor 1. The thesis gives rotation errors of 0.7° in most rows of table 6.4, even without noise: its sign or reference must have differed. Figure 6.13 shows the stars of a frame and the earlier frame's stars moved by the estimated motion, without and with noise."""
+_CASE_NOTE: Final = """Ten moved frames, noise factor 1. The thesis has rotation errors of 0.7° in most rows
+of table 6.4, even without noise: its sign or reference must have been different. Figure 6.13 shows the stars
+of a frame, and the stars of the earlier frame moved by the estimated motion, without and with noise."""
 
 _CASE_FRAMES: Final = 10
 _CASE_STARS: Final = 70
 _ROUNDING_ERROR_DEG: Final = 1e-12
-"""Errors below this are those of the arithmetic."""
+"""Errors below this are rounding errors, degrees."""
 
 _PUBLISHED_CORRELATION: Final = (0.427, 0.680, 0.635, 0.999, 0.997, 0.901)
 _KINDS: Final = ("transient", "stationary", "drifting")
-_CROWD_NOTE: Final = """Counted are the true stars that were in the field in the two frames before as well, since the filter wants three sightings, and all false ones. Drifting stars that move by less than the gate from frame to frame need a few more frames before the filter recognises them. The time is that of the quickest tenth of the frames, since other work on the machine adds to the rest."""
+_CROWD_NOTE: Final = """Counted are all false stars, and the true stars that were in the field in both frames
+before as well, since the filter needs three sightings. Drifting stars that move by less than the gate from
+frame to frame need a few more frames before the filter recognises them. The time is taken from the fastest
+tenth of the frames, since other work on the machine slows the rest."""
 
 
 def _choice_parts(parameters: Parameters) -> list[Part]:
@@ -116,7 +121,7 @@ def _choice_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             published="close to 0",
             printed=chosen[0],
             digits=3,
-            remark="The choice of the thesis; smaller min_samples lose fewer here, and let more false stars in.",
+            remark="The choice of the thesis; smaller min_samples lose fewer stars here, but let more false stars pass.",
         ),
         shown("error of the shift, the same", printed=chosen[1], unit="°", digits=4),
     )
@@ -183,7 +188,7 @@ def _case_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
 
 
 def _reconstruction_figure(context: Context) -> str:
-    """The stars of a moved frame and those of the frame before, moved by the estimated motion: figure 6.13."""
+    """Draw figure 6.13: the stars of a frame, and of the previous one after the estimated motion."""
     fig, axes = figure(1, 2, width=9.5, height=4.6, sharey=True)
     for factor, ax in zip((0.0, 1.0), axes, strict=True):
         clean, frames = frames_of_seven(context.rng("figure 6.13"), noise_of("both", factor, 0), 1)
@@ -231,7 +236,7 @@ def _correlation_work(context: Context, part: Part) -> Results:
 
 
 def _of_correlation(published: float, trials: int) -> Tolerance:
-    """Three standard errors of the difference of two correlation coefficients, by Fisher's transformation."""
+    """Tolerance for two correlation coefficients: three standard errors, by Fisher's transformation."""
     error = 3.0 * (1.0 - published**2) * math.sqrt(2.0 / (trials - 3))
     return error, f"3 standard errors of two coefficients of {trials}, {error:.2g}"
 
@@ -263,7 +268,7 @@ def _correlation_finish(context: Context, results: Mapping[str, Results]) -> Out
     axes[-1, 0].set_xlabel("trial")
     name = save(fig, context.folder / "figures_6_31_6_32_d.png")
     table = write_lines(context.folder / "table_6_5.csv", lines)
-    note = "With noise the two rise and fall together as published; coefficients near 1 come from single frames with a wrong match, of which there are few here."
+    note = "With noise the two are correlated as published; coefficients near 1 come from single frames with a wrong match, which are rare here."
     return Outcome(tuple(rows), (table, name), (note,))
 
 

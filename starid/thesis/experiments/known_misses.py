@@ -1,8 +1,8 @@
-"""Published numbers that the reproduction is known not to reach, each with its reason.
+"""Published numbers that the reproduction is known to miss, each with the reason.
 
-A check that is missed and stands here is a known miss: the report shows it, the exit status stays 0. A check that is
-missed and does not stand here is a regression. A row that stands for several numbers is known with the number of them
-that agree, and fewer are a regression.
+A failed check that is listed here is a known miss: the report shows it, and the exit status stays 0. A failed
+check that is not listed is a regression. A row with several numbers is listed with how many of them agree;
+fewer are a regression.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from starid.thesis.experiments.experiment import Row
 
 @dataclass(frozen=True, slots=True)
 class KnownMiss:
-    """Why a check is missed.
+    """Why a check fails.
 
     Attributes
     ----------
     reason
         One sentence for the report.
     met
-        How many of the row's published numbers agree all the same.
+        How many of the published numbers in the row agree nevertheless.
     """
 
     reason: str
@@ -31,22 +31,22 @@ class KnownMiss:
 
 
 _LAMBDA: Final = (
-    "The printed reconstructions are those of λ = 1.011 and 1.414, which are not on the grid of eq. 2.34."
+    "The printed reconstructions belong to λ = 1.011 and 1.414, which are not on the grid of eq. 2.34."
 )
 _RECALL: Final = (
-    "The published recall falls at once and with brightness noise too, where clustering loses nothing; what "
-    "else loses stars there the text does not say."
+    "The published recall falls from the start, and with brightness noise too, which does not affect the "
+    "clustering; the text does not say what else loses stars there."
 )
-_TURN: Final = "The published errors of the rotation are 0.7° even without noise; the sign or the reference must have differed."
+_TURN: Final = "The published rotation errors are 0.7° even without noise; the sign or the reference must have been different."
 _CORRELATION: Final = (
     "Coefficients near 1 come from single frames with a wrong match, which are rare here; the published noise is "
     "not known."
 )
 _MEAN: Final = (
-    "The median agrees with the published mean; ours is made by frames that are wrong by tens of degrees, of which the "
+    "The median agrees with the published mean; our mean is dominated by frames wrong by tens of degrees, of which the "
     "published one has none."
 )
-_SIDE: Final = "No reading of eq. 6.5 gives the published sides."
+_SIDE: Final = "No interpretation of eq. 6.5 gives the published sides."
 _BEYOND: Final = "The published sides, and how the frames were chosen, are not known at this overlap."
 _MAP: Final = "Which frames the thesis's maps leave out at the rims of the flat plane is not known."
 
@@ -66,7 +66,7 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
             "table 6.1: database size, p = 99.3 %",
         ),
         **_each(
-            "1 469 387.76 is rounded, where the thesis cuts the others off.",
+            "1 469 387.76 is rounded up, while the thesis truncates the others.",
             "nominal N, eq. 2.23, φ = 42°, p = 99.5 %",
         ),
     },
@@ -80,7 +80,7 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
         ),
     },
     "lsi-accuracy": _each(
-        "The published share is that of frames of the database; ours are between them.",
+        "The published share is for frames in the database; our frames are between them.",
         "stars compared (ours), p = 99.5 %, off the grid: share with ε_f ≤ 0.3°",
     ),
     "lsi-noise": {
@@ -89,12 +89,12 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
             "brightness noise, σ = 3, on the grid: share with ε_f ≤ 0.283°",
         ),
         **_each(
-            "The published curves are of forty trials; over all frames what the solver's rounding leaves of ε_ψ says nothing of ε_f.",
+            "The published curves show forty trials; over all frames, ε_ψ is mostly rounding error of the solver, unrelated to ε_f.",
             "rank correlation of ε_ψ and ε_f, no noise, on the grid",
         ),
     },
     "rsi": _each(
-        "At the noise as printed and μ = f = 3 the features of a frame no longer single out its place.",
+        "At the printed noise and μ = f = 3 the features of a frame no longer determine its position.",
         "mean ε_f, p = 99.5 %, μ = 3, f = 3, noise × 1: RSI, τ = 0.5, with memory (ours)",
         "mean ε_f, p = 99.75 %, μ = 3, f = 3, noise × 1: RSI, τ = 0.5, with memory (ours)",
     ),
@@ -103,7 +103,7 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
         "tables A.1–A.18, position noise: recall of the sets": KnownMiss(_RECALL, 9),
         "tables A.1–A.18, brightness and position noise: recall of the sets": KnownMiss(_RECALL, 8),
         "tables A.1–A.18, brightness and position noise: precision of the sets": KnownMiss(
-            "Two sets of μ = 4 and 5 lose too many stars for so few false ones to weigh as little.", 34
+            "Two sets at μ = 4 and 5 lose so many stars that even a few false ones lower the precision.", 34
         ),
         **_each(
             _RECALL,
@@ -115,7 +115,7 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
             "f1, position noise, μ = 5, f = 4",
         ),
         **_each(
-            "The published value is made by wrong matches of single frames, which mutual votes exclude here.",
+            "The published value comes from wrong matches in single frames, which mutual votes exclude here.",
             "figure 6.18: greatest mean μ_d without noise, with false stars",
         ),
     },
@@ -141,13 +141,13 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
         **_each(_SIDE, *(f"table 6.8: side Γ of the region, μ = f = {m}" for m in range(4))),
     },
 }
-"""Experiment → quantity → why it is missed."""
+"""Experiment → quantity → why the check fails."""
 
 
 def known_miss(
     experiment: str, row: Row, known: Mapping[str, Mapping[str, KnownMiss]] | None = None
 ) -> KnownMiss | None:
-    """The entry of a missed row, None if it is met, has none, or reaches less than the entry says."""
+    """Return the entry for a failed row; None if there is none or fewer numbers agree than it states."""
     if row.passed is not False:
         return None
     entry = (KNOWN if known is None else known).get(experiment, {}).get(row.quantity)

@@ -25,7 +25,7 @@ from starid.thesis.experiments.experiment import (
 from starid.thesis.experiments.lsi_trials import (
     COLUMNS,
     FRAMES,
-    GRID_WORDS,
+    GRID_LABELS,
     OFF,
     ON,
     ROWS,
@@ -38,7 +38,7 @@ from starid.thesis.metrics import error_colours
 
 _PUBLISHED: Final = {0.3: 100.0, 0.2: 92.24, 0.1: 71.43, 0.013: 59.20, 0.008: 58.67, 0.002: 57.79}
 _POINTS: Final = 1.5
-"""Tolerance of the shares: the standard error of a share of 1 701 frames is 0.7 to 1.2 points."""
+"""Tolerance for shares, percentage points: the standard error of a share of 1 701 frames is 0.7 to 1.2."""
 _PSI: Final = (0.49, 0.54)
 """Mean and deviation of ε_ψ without noise, table H.1."""
 _MAP_SCALES: Final = (0.1, 1.0)
@@ -46,25 +46,27 @@ _BEST: Final = 99.5
 _COMPARED_FROM: Final = 99.0
 _SAME: Final = 1e-6
 _AGREES: Final = 1e-4
-_TIE_WORDS: Final = "Where several weights ω reconstruct the observation equally well, the last digit of the features decides between them."
+_TIE_NOTE: Final = "If several weights ω reconstruct the observation equally well, the last digit of the features decides between them."
 
-_NOTE: Final = """The thesis's frames have their lower-left corner at α = 2° + 5°·k, δ = −88° + 5°·m. With p = 99.5 % the
-grid's step is 0.2°, so that every one of these frames is a frame of the database: the search finds the observation
-itself, at distance zero, and what is left is only what the LASSO penalty adds by mixing neighbours in. How much that is depends on
-the solver: MATLAB's `lasso` ends its descent long before the minimum and mixes far more in than the LASSO of eq. 2.34, solved
-exactly, does. The published accuracy is MATLAB's, to a point. Moved off the
-grid the same algorithm loses: the nearest cell often differs from the frame by a star at the rim, and no mixture of
-cells undoes that. The third line, "sub-cell", is ours: from the nearest cell, and from up to 16 more, it solves for the
-boresight at which the features, computed from the stars, agree, and keeps the first place that does, or the best. "Stars
-compared" goes one step further: at each such place, of up to 256 cells, the observed stars are turned by the roll found there and
-looked for among the catalogue's; the first place with nine in ten of them wins (databases from 99 % on)."""
+_NOTE: Final = """The thesis's frames have their lower-left corner at α = 2° + 5°·k, δ = −88° + 5°·m. With p =
+99.5 % the step of the grid is 0.2°, so that every one of these frames is in the database: the search finds
+the observation itself, at distance zero, and the only error is what the LASSO penalty adds by mixing in
+neighbours. How large it is depends on the solver: MATLAB's `lasso` stops its descent long before the minimum
+and mixes in far more than the exact solution of the LASSO of eq. 2.34. The published accuracy is MATLAB's, to
+a percentage point. Off the grid the same algorithm is less accurate: the nearest cell often differs from the
+frame by a star at the rim, which no mixture of cells can correct. The third line, "sub-cell", is ours:
+starting from the nearest cell and up to 16 more, it solves for the boresight at which the features, computed
+from the stars, agree, and keeps the first that does, or the best. "Stars compared" goes one step further: for
+up to 256 cells the observed stars are rotated by the roll found there and compared with the catalogue; the
+first position at which nine in ten are found wins (databases from 99 % on)."""
 
-_LIMIT_NOTE: Final = """What limits the sub-cell search: while no star crosses the rim, n, A and σ_A are constant, and only
-r and σ_r give where in the cell the frame is — two equations for two unknowns, with more than one solution in places. In
-{ambiguous:.1f} % of the off-grid frames the answer is more than 0.01° away although all five features agree there to
-{agrees:g} on the scale 0 … 100: five features without the polar angle do not single out a frame. In {lost:.1f} % no start
-reached agreement. Neither more neighbours nor a finer grid mends the first; comparing the stars themselves does: {stars:.1f} % are then
-more than 0.01° away."""
+_LIMIT_NOTE: Final = """What limits the sub-cell search: while no star crosses the rim, n, A and σ_A are
+constant, and only r and σ_r determine where in the cell the frame is — two equations for two unknowns, in
+places with more than one solution. In {ambiguous:.1f} % of the off-grid frames the answer is more than 0.01°
+away although all five features agree to {agrees:g} on the scale 0 … 100: five features without the polar
+angle do not determine a frame uniquely. In {lost:.1f} % no start reached agreement. Neither more neighbours
+nor a finer grid removes the ambiguity, but comparing the stars themselves does: {stars:.1f} % are then more
+than 0.01° away."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -141,7 +143,7 @@ def _roll_figure(
         axis.set_ylabel("δ / °")
         fig.colorbar(image, ax=axis, label="ε_f / °", extend="max")
     axes[-1, 0].set_xlabel("α of the centre / °")
-    fig.suptitle(f"ε_f (MSE) as the author ran it, p = {percent:g} %, frames {GRID_WORDS[grid]}")
+    fig.suptitle(f"ε_f (MSE) as the author ran it, p = {percent:g} %, frames {GRID_LABELS[grid]}")
     return save(fig, path)
 
 
@@ -169,7 +171,7 @@ def _precision_figure(
                     color=colour,
                     label=f"p = {percent:g} %",
                 )
-            axes[i, j].set_title(f"{word}, {GRID_WORDS[grid]}")
+            axes[i, j].set_title(f"{word}, {GRID_LABELS[grid]}")
             axes[i, j].set_xlabel(f"threshold of {symbol} / °")
             if j:
                 axes[i, j].set_ylabel("")
@@ -205,7 +207,7 @@ def _on_grid_rows(result: Results) -> list[Row]:
             tolerance=sampled_mean(spread, FRAMES),
             author=float(result["psi_author"].mean()),
             printed=float(result["psi_mse"].mean()),
-            remark="Published of the sequences of table H.1.",
+            remark="The published value is for the sequences of table H.1.",
         ),
         *(
             shown(
@@ -213,7 +215,7 @@ def _on_grid_rows(result: Results) -> list[Row]:
                 published=words,
                 **shares(result, limit, "theta"),
                 unit="%",
-                remark="Published as a curve; here the angle is averaged on the circle.",
+                remark="Published as a curve; here the mean of the angle is circular.",
             )
             for limit, words in ((0.2, "hardly over 60 %"), (1.0, "nearly 70 %"))
         ),
@@ -238,7 +240,7 @@ def _off_grid_rows(result: Results) -> list[Row]:
                 ours=share(result["f_stars"], limit),
                 larger=True,
                 unit="%",
-                remark="Published on the grid, where it is easier.",
+                remark="The published share is on the grid, where it is easier.",
             )
             for limit, published in _PUBLISHED.items()
         ),
@@ -264,7 +266,7 @@ def _off_grid_rows(result: Results) -> list[Row]:
 def _listed(
     quantity: str, sets: Sequence[Results], conditions: Sequence[float], published: str | None, digits: int
 ) -> Row:
-    """A row with the share within 0.3° under each of several conditions, in all readings."""
+    """Make a row with the share within 0.3° under several conditions, in all variants."""
     found = [shares(one, 0.3) for one in sets]
     author, printed, ours = (
         ", ".join(f"{one[reading]:.{digits}f}" for one in found) + " %"
@@ -280,7 +282,7 @@ def _rows(results: Mapping[str, Results], percents: list[float]) -> list[Row]:
         rows += _on_grid_rows(results[f"p{_BEST:g}-{ON}"]) + _off_grid_rows(results[f"p{_BEST:g}-{OFF}"])
         rows.append(_order_row(results, percents))
     for grid, published in ((ON, "grows up to 99.5 %"), (OFF, None)):
-        quantity = f"LSI (MSE), {GRID_WORDS[grid]}: share with ε_f ≤ 0.3° for p = {{}} %"
+        quantity = f"LSI (MSE), {GRID_LABELS[grid]}: share with ε_f ≤ 0.3° for p = {{}} %"
         sets = [results[f"p{percent:g}-{grid}"] for percent in percents]
         rows.append(_listed(quantity, sets, percents, published, 1))
     return rows
@@ -300,8 +302,8 @@ def _order_row(results: Mapping[str, Results], percents: list[float]) -> Row:
         ours=ours,
         unit="%",
         digits=1,
-        remark="The finer database of 99.6 % does worse because the test frames are not on its grid: that the thesis, too, finds "
-        "99.5 % best shows that its figure is owed to the grid.",
+        remark="The finer database of 99.6 % does worse because the test frames are not on its grid. That 99.5 % is best in "
+        "the thesis too shows that its accuracy is due to the grid.",
     )
 
 
@@ -310,10 +312,10 @@ def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float
     for grid in (ON, OFF):
         sets = [results[f"p{percent:g}-roll{roll:g}-{grid}"] for roll in rolls]
         frames = sets[0]["f_mse"].size
-        where = f"p = {percent:g} %, {GRID_WORDS[grid]}: frames of {frames}"
+        where = f"p = {percent:g} %, {GRID_LABELS[grid]}: frames of {frames}"
         for what, names, remark in (
             ("ε_ψ", ("psi_author", "psi_mse"), ""),
-            ("ε_f", ("f_author_mse", "f_mse"), _TIE_WORDS),
+            ("ε_f", ("f_author_mse", "f_mse"), _TIE_NOTE),
         ):
             author, printed = (
                 float(max(np.sum(np.abs(other[name] - sets[0][name]) > _SAME) for other in sets[1:]))
@@ -333,7 +335,7 @@ def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float
                 if grid == ON
                 else shown(quantity, author=author, printed=printed, digits=0)
             )
-        quantity = f"p = {percent:g} %, {GRID_WORDS[grid]}: share with ε_f ≤ 0.3° at roll {{}}°"
+        quantity = f"p = {percent:g} %, {GRID_LABELS[grid]}: share with ε_f ≤ 0.3° at roll {{}}°"
         rows.append(_listed(quantity, sets, rolls, "equal", 2))
     return rows
 
@@ -347,7 +349,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     files = []
     for number, kind, word in ((1, "author_mse", "MSE"), (2, "author_1se", "1SE")):
         for grid in (ON, OFF):
-            title = f"ε_f of the {word} solution as the author ran it, frames {GRID_WORDS[grid]}"
+            title = f"ε_f of the {word} solution as the author ran it, frames {GRID_LABELS[grid]}"
             path = folder / f"figure_6_{number}_{grid}.png"
             files.append(_map_figure(path, results, mapped, kind, grid, title))
     for grid in (ON, OFF) if "every" not in context.parameters else ():

@@ -23,7 +23,7 @@ from starid.thesis.experiments.experiment import (
     write_lines,
 )
 from starid.thesis.experiments.lsi_patterns import complete, pattern_files, pattern_rows
-from starid.thesis.experiments.lsi_trials import GRID_WORDS, OFF, ON, count_words, share, solve_frames
+from starid.thesis.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label, share, solve_frames
 from starid.thesis.experiments.plots import colours, figure, precision_curve, save
 from starid.thesis.simulation import NoiseModel
 
@@ -34,15 +34,15 @@ _OVERLAP: Final = 0.995
 _KINDS: Final = ("position", "brightness", "both")
 _LEVELS: Final = (1.0, 2.0, 3.0)
 _ROOT: Final = 0.25
-"""As the author ran it, by the published shares: a noise "σ" has the standard deviation 0.25·√σ pixels and units."""
+"""Factor on the noise in the author's version: "σ" means 0.25·√σ pixels or units."""
 _UNIT_RANGE: Final = (11.5, 12.5)
-"""Reading (i): the 255 steps of intensity span one magnitude."""
-_KIND_WORDS: Final = {
+"""Interpretation (i): the 255 steps of intensity span one magnitude."""
+_KIND_LABELS: Final = {
     "position": "positional noise / px",
     "brightness": "brightness noise / intensity units",
     "both": "both",
 }
-_NOISE_WORDS: Final = {
+_NOISE_LABELS: Final = {
     "position": "position noise",
     "brightness": "brightness noise",
     "both": "position and brightness noise",
@@ -59,30 +59,35 @@ _RIVALS: Final = {
     "brightness": {3.0: "PA 97.80"},
 }
 
-_NOTE: Final = """p = 99.5 %, the MSE solution. Position noise is normal with σ in pixels of 42°/937 per axis, brightness noise with σ in
-units of an 8-bit intensity, of which 255 span the magnitudes 11.5 … 15; "μ drawn" adds a mean, drawn for each frame from
-N(0, 1). False stars are uniform in the circular field and in magnitude, 11.5 … 15; missing stars are drawn from the true
-ones. The features are those of the noisy list: a star stays in the list even when noise moves it across the rim, as it
-must have in the thesis (otherwise n changes, and the figures fall to those with false and missing stars).
+_NOTE: Final = """p = 99.5 %, the MSE solution. Position noise is normal with σ in pixels of 42°/937 per axis,
+brightness noise with σ in units of an 8-bit intensity, of which 255 span the magnitudes 11.5 … 15; "μ drawn"
+adds a mean, drawn for each frame from N(0, 1). False stars are uniform in the circular field and in
+magnitude, 11.5 … 15; missing stars are drawn from the true ones. The features are computed from the noisy
+list: a star stays in the list even if noise moves it across the rim, as it must have in the thesis (otherwise
+n changes, and the shares are as low as with false and missing stars).
 
-**The published figures under noise have two readings, and neither is complete.** With the noise as printed, σ pixels and σ
-intensity units, the thesis's algorithm falls to about half of the frames within 0.3° at σ = 3, where the thesis has 99.2 %. Brightness
-noise does most of it: one unit is {unit:.4f} mag, which over {stars:.0f} stars moves A by {shift:.2f} on the normalised scale 0 … 100, as
-far as a neighbouring cell is. (i) *Six features*: with the polar angle as a sixth feature of the search, as the worked example of
-section 5.1 was computed, and a brightness unit of 1/255 mag, the nearest cell alone has about the published shares within 0.3° at the
-noise as printed; but not those within 0.1° and 0.013°, and a search with the polar angle is not invariant to roll, as figure 6.3 is. (ii) *As the author ran it*:
-with MATLAB's `lasso` and a noise of 0.25·√σ, as if a fraction of σ had been passed as a variance, all twelve published shares of
-both noises come out within about two points. No text supports the 0.25; the published μ_d of at most 0.0419° (figure 6.18), less
-than one pixel at "5 px", asks for a like reduction. The percentages 99.99 and 97.99 of section 6.1.2.3 are not multiples of 1/1701
-and cannot be shares of the 1 701 frames."""
+**The published figures under noise can be interpreted in two ways, and neither is complete.** With the
+printed noise, σ pixels and σ intensity units, the thesis's algorithm has only about half of the frames within
+0.3° at σ = 3, while the thesis has 99.2 %. Brightness noise is the main cause: one unit is {unit:.4f} mag,
+which for {stars:.0f} stars moves A by {shift:.2f} on the normalised scale 0 … 100, as much as to a
+neighbouring cell. (i) *Six features*: with the polar angle as a sixth feature of the search, as in the worked
+example of section 5.1, and a brightness unit of 1/255 mag, the nearest cell alone has about the published
+shares within 0.3° at the printed noise, but not those within 0.1° and 0.013°; and a search with the polar
+angle is not invariant to roll, as figure 6.3 is. (ii) *As the author ran it*: with MATLAB's `lasso` and a
+noise of 0.25·√σ, as if a fraction of σ had been passed as a variance, all twelve published shares for both
+noises are reproduced to within about two percentage points. Nothing in the text supports the 0.25; the
+published μ_d of at most 0.0419° (figure 6.18), less than one pixel at "5 px", requires a similar reduction.
+The percentages 99.99 and 97.99 of section 6.1.2.3 are not multiples of 1/1701 and cannot be shares of the 1
+701 frames."""
 
-_TEXT_NOTE: Final = """The thesis's sentence on 0.2°, 0.1° and 0.013° with noise is read as: for each of these limits, the shares at σ = 1, 2, 3. Read as
-printed (one σ for each triple), the share at σ = 3 would fall from 99.2 % within 0.3° to 36 % within 0.2°, and rise with
-the limit getting smaller."""
+_TEXT_NOTE: Final = """The thesis's sentence on 0.2°, 0.1° and 0.013° with noise is taken to mean, for each of
+these limits, the shares at σ = 1, 2, 3. Taken literally (one σ for each triple), the share at σ = 3 would
+fall from 99.2 % within 0.3° to 36 % within 0.2°, and rise as the limit becomes smaller."""
 
-_FALSE_NOTE: Final = """A false or missing star changes n by one, which on the normalised scale is {step:.2f}, and A and σ_A besides; the nearest
-neighbour is then another region of the sky. One star of the median {stars:.0f} a frame is enough: this, not noise, is what
-breaks the LSI algorithm, on the grid and off it, and why the thesis puts a filter before it."""
+_FALSE_NOTE: Final = """A false or missing star changes n by one, which is {step:.2f} on the normalised scale,
+and also A and σ_A; the nearest neighbour is then in another region of the sky. One star among the median of
+{stars:.0f} per frame is enough: this, not noise, is why the LSI algorithm fails, on the grid and off it, and
+why the thesis puts a filter before it."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -156,7 +161,7 @@ def _noise_figure(
                 precision_curve(
                     axes[i, j], errors, limit, color=colour, label=label, ls="--" if "mean" in key else "-"
                 )
-            axes[i, j].set_title(f"{_KIND_WORDS[kind]}, {GRID_WORDS[grid]}")
+            axes[i, j].set_title(f"{_KIND_LABELS[kind]}, {GRID_LABELS[grid]}")
             axes[i, j].set_xlabel(f"threshold of ε_{'f' if quantity == 'f' else 'θ'} (MSE) / °")
         axes[i, 0].legend(loc="lower right")
     number = 6 if quantity == "f" else 7
@@ -172,16 +177,16 @@ def _false_figure(context: Context, results: Mapping[str, Results]) -> str:
             for count, colour in zip(range(4), ["black", *colours(3)], strict=True):
                 key = f"{kind}-{count}-{grid}" if count else f"none-{grid}"
                 if key in results:
-                    label = count_words(count, kind) if count else "no noise"
+                    label = count_label(count, kind) if count else "no noise"
                     precision_curve(axes[i, j], results[key]["f_mse"], 1.0, color=colour, label=label)
-            axes[i, j].set_title(f"{kind} stars, {GRID_WORDS[grid]}")
+            axes[i, j].set_title(f"{kind} stars, {GRID_LABELS[grid]}")
             axes[i, j].set_xlabel("threshold of ε_f (MSE) / °")
             axes[i, j].legend(loc="center right")
     return save(fig, context.folder / "figure_6_8.png")
 
 
 def _curves(kind: str) -> list[tuple[str, str, str, str]]:
-    """Result, name, colour and head of the cases' names of each curve of the identification rates."""
+    """Result, label, colour and prefix of the case names for each curve of the identification rates."""
     head = "root-" if kind in _KINDS else ""
     return [
         ("author_mse", "as the author ran it", "C1", head),
@@ -211,7 +216,7 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
                         rates[level] = share(results[key][f"f_{method}"], IDENTIFIED_DEG)
                         line = {"level": level, "grid": grid, "method": method, "rate_percent": rates[level]}
                         lines.append(line)
-                words = f"{word}, {GRID_WORDS[grid]}"
+                words = f"{word}, {GRID_LABELS[grid]}"
                 axis.plot(list(rates), list(rates.values()), style, marker="o", color=colour, label=words)
         published = _RATES.get(kind)
         if published:
@@ -226,7 +231,7 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
 
 
 def _readings(results: Mapping[str, Results], kind: str, level: float, limit: float, grid: str) -> Readings:
-    """Share within a limit in each reading that was computed; without noise the readings of the noise are one."""
+    """Share within a limit for each variant computed; without noise the noise variants are equal."""
     literal = results.get(f"{kind}-{level:g}-{grid}" if level else f"none-{grid}")
     reduced = results.get(f"root-{kind}-{level:g}-{grid}" if level else f"none-{grid}")
     found: Readings = {}
@@ -247,15 +252,19 @@ def _noise_row(
     *,
     words: str = "",
 ) -> Row | None:
-    """A published share on the grid, in all readings."""
+    """Make a row for a published share on the grid, in all variants."""
     values = _readings(results, kind, level, limit, ON)
     if "author" not in values:
         return None
     frames = results[f"none-{ON}"]["f_mse"].size
     angle = results.get(f"six-{kind}-{level:g}-{ON}")
-    remark = words if angle is None else f"{words} Reading (i): {share(angle['f_six'], limit):.2f} %.".strip()
+    remark = (
+        words
+        if angle is None
+        else f"{words} Interpretation (i): {share(angle['f_six'], limit):.2f} %.".strip()
+    )
     return agreement(
-        f"{_NOISE_WORDS[kind]}, σ = {level:g}, on the grid: share with ε_f ≤ {limit:g}°",
+        f"{_NOISE_LABELS[kind]}, σ = {level:g}, on the grid: share with ε_f ≤ {limit:g}°",
         published=published,
         tolerance=sampling(published, frames),
         **values,
@@ -282,7 +291,7 @@ def _noise_rows(results: Mapping[str, Results]) -> list[Row]:
             values = _readings(results, "both", level, limit, OFF)
             rows.append(
                 shown(
-                    f"{_NOISE_WORDS['both']}, σ = {level:g}, off the grid: share with ε_f ≤ {limit:g}°",
+                    f"{_NOISE_LABELS['both']}, σ = {level:g}, off the grid: share with ε_f ≤ {limit:g}°",
                     **values,
                     unit="%",
                 )
@@ -304,7 +313,7 @@ def _object_rows(results: Mapping[str, Results], grid: str) -> list[Row]:
                 continue
             result = results[key]
             author, printed = share(result["f_author_mse"], 1.0), share(result["f_mse"], 1.0)
-            quantity = f"{count_words(count, kind)}, {GRID_WORDS[grid]}: share with ε_f ≤ 1°"
+            quantity = f"{count_label(count, kind)}, {GRID_LABELS[grid]}: share with ε_f ≤ 1°"
             if count == 1 and grid == ON:
                 rows.append(
                     same(

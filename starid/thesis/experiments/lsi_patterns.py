@@ -1,4 +1,4 @@
-"""Does ε_ψ reveal a bad answer? Patterns 6.20–6.27 and B, and errors over thresholds of ε_ψ, 6.28–6.30 and C."""
+"""Does ε_ψ reveal a bad answer? Patterns 6.20–6.27 and B, errors over thresholds 6.28–6.30 and C."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from starid.arrays import Array
 from starid.thesis.experiments.comparison import Readings, agreement, same, shown
 from starid.thesis.experiments.experiment import Context, Results, Row, write_csv
-from starid.thesis.experiments.lsi_trials import GRID_WORDS, OFF, ON, count_words
+from starid.thesis.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label
 from starid.thesis.experiments.plots import colours, figure, save
 
 _CASES: Final = {
     "none": "no noise",
     **{f"root-both-{n}": f"μ = {n}" for n in (1, 2, 3)},
-    **{f"{kind}-{n}": count_words(n, kind) for kind in ("false", "missing") for n in (1, 2, 3)},
+    **{f"{kind}-{n}": count_label(n, kind) for kind in ("false", "missing") for n in (1, 2, 3)},
 }
 _GROUPS: Final = (("root-both", "noise"), ("false", "false stars"), ("missing", "missing stars"))
 _TRIALS: Final = slice(559, 600)
@@ -25,7 +25,7 @@ _STEP: Final = 0.01
 
 
 def complete(results: Mapping[str, Results]) -> bool:
-    """Whether all cases are there, on and off the grid."""
+    """Whether all cases were computed, on and off the grid."""
     return all(f"{case}-{grid}" in results for case in _CASES for grid in (ON, OFF))
 
 
@@ -46,12 +46,12 @@ def _patterns(context: Context, results: Mapping[str, Results], grid: str) -> st
     for j in range(2):
         axes[0, j].legend(loc="upper right")
         axes[-1, j].set_xlabel("trial")
-    fig.suptitle(f"LSI (MSE) as the author ran it, trials 560 to 600, frames {GRID_WORDS[grid]}")
+    fig.suptitle(f"LSI (MSE) as the author ran it, trials 560 to 600, frames {GRID_LABELS[grid]}")
     return save(fig, context.folder / f"figures_6_20_to_6_27_and_b_{grid}.png")
 
 
 def _below_thresholds(errors: Array, psi: Array, thresholds: Array) -> tuple[Array, Array]:
-    """Mean and standard deviation of the errors whose ε_ψ is below each threshold; NaN where there are none."""
+    """Mean and standard deviation of the errors with ε_ψ below each threshold; NaN if there are none."""
     order = np.argsort(psi)
     counts = np.searchsorted(psi[order], thresholds)
     sums = np.concatenate([[0.0], np.cumsum(errors[order])])
@@ -76,7 +76,7 @@ def _thresholds(context: Context, results: Mapping[str, Results], quantity: str)
                 for k, (values, name) in enumerate(zip(pair, ("mean", "deviation"), strict=True)):
                     axis = axes[i, 2 * g + k]
                     axis.plot(thresholds, values, color=colour, label=_CASES[case])
-                    axis.set_title(f"{words}, {GRID_WORDS[grid]}")
+                    axis.set_title(f"{words}, {GRID_LABELS[grid]}")
                     axis.set_ylabel(f"{name} of {symbol} / °")
                     columns[f"{case}_{grid}_{name}_deg"] = values
         axes[i, 0].legend()
@@ -87,7 +87,7 @@ def _thresholds(context: Context, results: Mapping[str, Results], quantity: str)
 
 
 def pattern_files(context: Context, results: Mapping[str, Results]) -> list[str]:
-    """Draw the patterns and the errors over thresholds; returns the names of the files."""
+    """Draw the patterns and the errors over thresholds; return the names of the files."""
     files = [_patterns(context, results, grid) for grid in (ON, OFF)]
     for quantity in ("f", "theta"):
         files += _thresholds(context, results, quantity)
@@ -95,7 +95,7 @@ def pattern_files(context: Context, results: Mapping[str, Results]) -> list[str]
 
 
 def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
-    """How far ε_ψ and ε_f go together, and what a threshold on ε_ψ leaves."""
+    """Rows on the correlation of ε_ψ and ε_f, and on the errors below a threshold of ε_ψ."""
     from scipy.stats import spearmanr
 
     clean = results[f"none-{ON}"]
@@ -125,8 +125,8 @@ def pattern_rows(results: Mapping[str, Results]) -> list[Row]:
                 if kept.size
                 else ""
             )
-            quantity = f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {GRID_WORDS[grid]}"
-            remark = f"As the author ran it ε_ψ < 1 in {100.0 * kept.size / below.size:.0f} % of the frames{beyond}."
+            quantity = f"rank correlation of ε_ψ and ε_f, {_CASES[case]}, {GRID_LABELS[grid]}"
+            remark = f"As the author ran it, ε_ψ < 1 in {100.0 * kept.size / below.size:.0f} % of the frames{beyond}."
             if grid == OFF:
                 rows.append(shown(quantity, **rank, remark=remark))
                 continue

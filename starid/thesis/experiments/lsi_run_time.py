@@ -1,4 +1,4 @@
-"""Run time of LSI by stage, table 6.1, and of the sub-cell search beside it."""
+"""Run time of LSI by stage, table 6.1, and of the sub-cell search."""
 
 from __future__ import annotations
 
@@ -36,19 +36,22 @@ _PUBLISHED: Final = {
     99.5: (0.071, 38.577, 0.022, 7.480, 0.029, 46.108),
     99.75: (0.071, 287.686, 0.022, 5.371, 0.029, 293.179),
 }
-"""Milliseconds for feature extraction, 1NN, dictionary, LASSO, estimation, and in all."""
+"""Milliseconds for feature extraction, 1NN, dictionary, LASSO, estimation, and the total."""
 
 _STAGES: Final = ("extraction", "search", "dictionary", "lasso", "estimation", "total", "subcell")
-_WORDS: Final = ("feature extraction", "1NN search", "dictionary", "LASSO", "estimation", "total")
+_LABELS: Final = ("feature extraction", "1NN search", "dictionary", "LASSO", "estimation", "total")
 _PASSES: Final = 3
 _COMPARED: Final = ("1NN search", "LASSO", "total")
 _BEST: Final = 99.5
 _LARGEST: Final = 99.75
 
-_NOTE: Final = """Median over the test frames of the least of three passes, in milliseconds, one thread, calls from Python included. The thesis
-gives means measured in MATLAB on a Core i5 at 2.7 GHz: its search is a scan of all frames, ours walks a tree over
-the 8-bit codes and looks at the stars of the few cells that could be nearer; its LASSO solves for 100 λ one by one, ours follows the piecewise
-linear path. The rivals of table 6.2 are quoted by the thesis from their papers, measured on other machines. Times depend on the machine; the ratio says what matters. Off the grid the search has more cells to look at, as no cell is at distance zero."""
+_NOTE: Final = """Median over the test frames of the shortest of three passes, in milliseconds,
+single-threaded, including calls from Python. The thesis gives means measured in MATLAB on a Core i5 at 2.7
+GHz. Its search scans all frames, ours descends a tree of the 8-bit codes and computes the few cells that
+could be nearer from their stars; its LASSO solves for 100 values of λ one by one, ours follows the piecewise
+linear path. The thesis quotes the rivals of table 6.2 from their papers, measured on other machines. Times
+depend on the machine, so the ratios matter. Off the grid the search must compute more cells, since none is at
+distance zero."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -56,7 +59,7 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _milliseconds(count: int, work: Callable[[int], object]) -> Array:
-    """Least time of each of `count` calls in several passes, ms."""
+    """Shortest time of each of `count` calls over several passes, ms."""
     best = np.full(count, np.inf)
     for _ in range(_PASSES):
         for i in range(count):
@@ -119,12 +122,12 @@ def _rows(results: Mapping[str, Results], percents: list[float], *, checked: boo
     for percent in percents:
         for grid in (ON, OFF):
             times = results[f"p{percent:g}-{grid}"]
-            for i, (stage, word) in enumerate(zip(_STAGES, _WORDS, strict=False)):
+            for i, (stage, word) in enumerate(zip(_STAGES, _LABELS, strict=False)):
                 if percent not in (_BEST, _LARGEST) and stage != "total":
                     continue
                 quantity = f"p = {percent:g} %, {grid} the grid: {word}"
                 ours, published = float(np.median(times[stage])), _PUBLISHED[percent][i]
-                # the thesis's frames are on the grid, and the quick run judges no time by the clock
+                # the thesis's frames are on the grid, and the quick run does not check times
                 if checked and grid == ON and word in _COMPARED:
                     rows.append(
                         improvement(

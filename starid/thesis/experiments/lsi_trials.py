@@ -1,4 +1,4 @@
-"""Trials of the LSI algorithm on the thesis's 1 701 frames, on and off the grid, rolled, and with noise."""
+"""Trials of the LSI algorithm on the 1 701 frames of the thesis: on and off the grid, rolled, with noise."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from starid.thesis.simulation import NoiseModel, add_noise, turned
 from starid.thesis.subcell import FineEstimate, SubcellSearch
 
 COLUMNS: Final = 63
-"""Test frames along right ascension: α corner 2° + 5°·k."""
+"""Number of test frames in right ascension, with corners at α = 2° + 5°·k."""
 
 ROWS: Final = 27
-"""Test frames along declination: δ corner −88° + 5°·m."""
+"""Number of test frames in declination, with corners at δ = −88° + 5°·m."""
 
 FRAMES: Final = COLUMNS * ROWS
-"""The thesis's number of test frames, 1 701."""
+"""Number of test frames in the thesis, 1 701."""
 
 HALF_FRAME_DEG: Final = 20.0
-"""From the corner of a frame to its centre, degrees: the frames behind the published numbers are 40° wide."""
+"""Half-width of a frame, degrees: the frames of the published figures are 40° wide."""
 
 _COMPARED_NEIGHBOURS: Final = 256
-"""Neighbours tried where the stars themselves decide."""
+"""Number of neighbours tried if the stars themselves decide."""
 
 ON, OFF = "on", "off"
-"""The frames as they are, and moved off the grid."""
+"""Test frames as they are, and moved off the grid."""
 
-GRID_WORDS: Final = {ON: "on the grid", OFF: "off the grid"}
+GRID_LABELS: Final = {ON: "on the grid", OFF: "off the grid"}
 
 
-def count_words(count: int, kind: str) -> str:
-    """How many false or missing stars, in words."""
+def count_label(count: int, kind: str) -> str:
+    """Format a number of false or missing stars."""
     return f"{count} {kind} star{'s' if count > 1 else ''}"
 
 
 def centres(every: int = 1) -> Array:
-    """Centres of the test frames, (n, 2) degrees, row by row; only every so-many-th if asked for."""
+    """Centres of the test frames, (n, 2) degrees, row by row, or of every n-th frame only."""
     ra = 2.0 + 5.0 * np.arange(COLUMNS) + HALF_FRAME_DEG
     dec = -88.0 + 5.0 * np.arange(ROWS) + HALF_FRAME_DEG
     grid = np.stack(np.meshgrid(ra, dec), axis=-1).reshape(-1, 2)
@@ -52,7 +52,7 @@ def centres(every: int = 1) -> Array:
 
 
 def frames_under_test(rng: np.random.Generator, grid: str, step_deg: float, every: int) -> Array:
-    """Centres of the test frames; `grid` "off" moves each by its own random fraction of the grid step, both ways."""
+    """Centres of the test frames; with `grid` "off", each moved by a random fraction of the grid step."""
     places = centres(every)
     if grid == OFF:
         places = places + step_deg * rng.uniform(0.0, 1.0, places.shape)
@@ -71,36 +71,37 @@ def solve_frames(
     compares: bool = False,
     with_angle: bool = False,
 ) -> Results:
-    """Run LSI, with the exact LASSO and with MATLAB's, and the sub-cell search after it, on the test frames.
+    """Run LSI, with the exact LASSO and with MATLAB's, and then the sub-cell search, on the test frames.
 
     Parameters
     ----------
     context
-        Databases.
+        Provides the databases.
     overlap
         Overlap ratio p as a fraction.
     grid
         "on" or "off".
     rng
-        Where frames are moved to, and their noise.
+        Random generator for the shift of the frames and their noise.
     noise
-        Noise of a frame's stars; it is asked for each frame, so that it may draw a mean.
+        Noise of the stars; called for each frame, so that it can draw a mean.
     roll_deg
-        The camera's roll.
+        Roll of the camera, degrees.
     every
-        Use only every so-many-th frame.
+        Use only every n-th frame.
     compares
-        Run the sub-cell search that compares the stars, too.
+        Also run the sub-cell search that compares the stars.
     with_angle
-        Look for the cell that is nearest with the polar angle as a sixth feature, too.
+        Also find the nearest cell with the polar angle as a sixth feature.
 
     Returns
     -------
     Results
-        `frames` (n, 2) degrees; `f_…` (n,): ε_f in degrees of the estimates `mse` and `1se` with the exact LASSO, `author_mse`
-        and `author_1se` with MATLAB's, `fine` of the sub-cell search, and, if asked for, `stars` of the one that compares the
-        stars and `six` of the cell nearest in six features; `theta_…` likewise: ε_θ in degrees; `psi_mse`, `psi_author`,
-        `residual`: ε_ψ of the two kinds of LSI and of the sub-cell search.
+        `frames` (n, 2) degrees; `f_…` (n,): ε_f in degrees of the estimates `mse` and `1se` with the exact
+        LASSO, `author_mse` and `author_1se` with MATLAB's, `fine` of the sub-cell search, and, if requested,
+        `stars` of the search that compares the stars and `six` of the nearest cell in six features;
+        `theta_…`: ε_θ in degrees of the same; `psi_mse`, `psi_author`, `residual`: ε_ψ of the two kinds of
+        LSI and of the sub-cell search.
     """
     lsi = context.lost_in_space(overlap)
     author = context.lost_in_space(overlap, "matlab")
@@ -159,7 +160,7 @@ def share(errors: Array, limit: float) -> float:
 def shares(
     result: Results, limit: float, quantity: str = "f", ours: str = "fine", *, beyond: bool = False
 ) -> Readings:
-    """Share of errors within a limit, or beyond it, of LSI (MSE) in both readings and of a search of ours, percent."""
+    """Share of errors within or beyond a limit, %, for both variants of LSI (MSE) and a search of ours."""
     author, printed, best = (
         100.0 - within if beyond else within
         for within in (share(result[f"{quantity}_{kind}"], limit) for kind in ("author_mse", "mse", ours))

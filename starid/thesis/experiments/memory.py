@@ -26,9 +26,10 @@ from starid.thesis.experiments.experiment import (
 _LIMIT_MB: Final = 400.0
 _PROBE: Final = "starid.thesis.experiments.memory_probe"
 
-_NOTE: Final = """Greatest resident size of a fresh process that maps the database's file, sorts its codes into the search tree, solves
-270 frames lost in space and follows a sequence of 100 with the recursive algorithm, the interpreter, its libraries and the mapped
-file included. The compiled code is there before: the process is run twice, and the second run counts."""
+_NOTE: Final = """Peak resident size of a new process that maps the database file, sorts its codes into the
+search tree, solves 270 frames lost in space and follows a sequence of 100 frames with the recursive
+algorithm, including the interpreter, its libraries and the mapped file. To exclude compilation, the process
+is run twice, and the second run counts."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -62,7 +63,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             unit="MB",
             digits=0,
             at_most=_LIMIT_MB,
-            remark=f"{line['loaded_mb']:.0f} MB when the database is loaded and its tree is made",
+            remark=f"{line['loaded_mb']:.0f} MB once the database is loaded and its tree is built",
         )
         for line in lines
     )

@@ -1,4 +1,4 @@
-"""A separate process that loads a database, identifies with it, and says on stdout how much memory it took."""
+"""A separate process that loads a database, identifies with it, and prints how much memory it took."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import numpy as np
 
 
 def peak_bytes() -> int:
-    """Greatest resident size of this process so far.
+    """Peak resident size of this process, bytes.
 
-    Linux distinguishes it from that of the process it was forked from, which `getrusage` does not.
+    Linux does not count the process from which it was forked, as `getrusage` does.
     """
     status = Path("/proc/self/status")
     if status.exists():
@@ -24,7 +24,7 @@ def peak_bytes() -> int:
 
 
 def main(path: Path) -> None:
-    """Run lost-in-space on frames all over the sky, then the recursive algorithm on a sequence."""
+    """Solve frames all over the sky lost in space, then follow a sequence with the recursive algorithm."""
     from starid.thesis.database_file import load_database
     from starid.thesis.lsi import LostInSpace
     from starid.thesis.rsi import RecursiveIdentification, RsiSettings

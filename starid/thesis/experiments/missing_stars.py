@@ -1,4 +1,4 @@
-"""What section 7.2 of the thesis leaves to be done: missing stars put back by the filter, and a divided field."""
+"""The future work of section 7.2 of the thesis: missing stars restored by the filter, and a divided field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from starid.thesis.experiments.experiment import (
     star_catalog,
     write_lines,
 )
-from starid.thesis.experiments.lsi_trials import OFF, count_words, frames_under_test, share
+from starid.thesis.experiments.lsi_trials import OFF, count_label, frames_under_test, share
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.features import FeatureError, FeatureVector, extract_features
 from starid.thesis.fsf import ClusterFilter
@@ -43,18 +43,19 @@ _START: Final = (108.41, 12.14)
 _MARGIN_DEG: Final = 1.6
 _RIM_DEG: Final = 0.01
 _CASES: Final = ("none", "missing-1", "missing-2", "missing-3", "false-1", "false-2", "false-3", "covered")
-_WORDS: Final = {
+_LABELS: Final = {
     "none": "nothing missing",
     "covered": f"a body covers the field beyond {_COVERED_FROM_DEG:g}° on one side",
-    **{f"{kind}-{n}": count_words(n, kind) for kind in ("missing", "false") for n in (1, 2, 3)},
+    **{f"{kind}-{n}": count_label(n, kind) for kind in ("missing", "false") for n in (1, 2, 3)},
 }
 
-_NOTE: Final = f"""*Divided field*: nine circles of {_FRAME_DEG:g}° in the field of 40°, each searched in a database of that width (step
-{_STEP_DEG:g}°, 6 300 kB), and the boresight that most of them agree on within a degree; where no two agree there is no answer. A missing or a
-false star spoils the circles that hold it and leaves the others. *Put back*: in sequences the stars of the frame before that the
-measured motion carries into the field, and that are not seen there, are put back before the features are made; the two frames are
-clean but for one star in each that is missing from the later one. The sequence's answer is searched in 4° about the true place, so that only
-the features decide."""
+_NOTE: Final = f"""*Divided field*: nine circles of {_FRAME_DEG:g}° in the field of 40°, each searched in a
+database of that width (step {_STEP_DEG:g}°, 6 300 kB), and the boresight on which most of them agree to
+within a degree; if no two agree there is no answer. A missing or false star affects only the circles that
+contain it. *Put back*: in sequences, the stars of the previous frame that the measured motion carries into
+the field, but that are not detected there, are put back before the features are computed. The two frames are
+clean except for one star of each that is missing from the later one. The answer for the sequence is searched
+within 4° of the true position, so that only the features decide."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -70,7 +71,7 @@ def _divided() -> DividedField:
 
 
 def _spoiled(rng: np.random.Generator, case: str, brightness: Array, places: Array) -> ObservedFrame:
-    """A frame with what a case takes from it or adds to it."""
+    """Remove stars from a frame, or add false ones, as a case says."""
     if case == "covered":
         seen = places[:, 0] < _COVERED_FROM_DEG
         return ObservedFrame(brightness[seen], places[seen])
@@ -83,7 +84,7 @@ def _spoiled(rng: np.random.Generator, case: str, brightness: Array, places: Arr
 
 
 def _case(context: Context, part: Part) -> Results:
-    """ε_f of the whole field and of the divided one, NaN for no answer, (2, n)."""
+    """ε_f (2, n) of the whole and of the divided field; NaN for no answer."""
     lsi, divided, sky = context.lost_in_space(_OVERLAP), _divided(), context.sky()
     rng = context.rng(part.key)
     frames = frames_under_test(
@@ -112,7 +113,7 @@ def _features(frame: ObservedFrame) -> FeatureVector | None:
 
 
 def _put_back(context: Context) -> Results:
-    """ε_f of frames that lack a star: as they are, and with what the filter puts back, (2, n)."""
+    """ε_f (2, n) of frames that lack a star: as they are, and with the stars that the filter restores."""
     lsi, cluster = context.lost_in_space(_OVERLAP), ClusterFilter()
     rng = context.rng("put-back")
     sequence = list(
@@ -169,7 +170,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             within = {f"within_{limit:g}": share(one, limit) for limit in (0.3, 1.0)}
             lost = 100.0 * float(np.mean(np.isnan(one)))
             lines.append({"case": part.key, "method": name, **within, "no_answer": lost})
-        words = _WORDS.get(part.key, "one star missing, put back from the frame before")
+        words = _LABELS.get(part.key, "one star missing, put back from the frame before")
         rows.append(
             row(
                 f"{words}, off the grid: share with ε_f ≤ 1°",

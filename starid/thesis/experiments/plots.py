@@ -1,4 +1,4 @@
-"""One look for all figures."""
+"""Common style of all figures."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STYLE: Any = {
 def figure(
     rows: int = 1, columns: int = 1, *, width: float = 7.0, height: float = 4.2, **options: Any
 ) -> Any:
-    """A figure without a window, and its axes as `matplotlib.pyplot.subplots` returns them (inches)."""
+    """Make a figure (size in inches) without a window, and its axes as in `matplotlib.pyplot.subplots`."""
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -33,7 +33,7 @@ def figure(
 
 
 def save(fig: Any, path: Path) -> str:
-    """Write a figure as PNG, close it, and return the file's name."""
+    """Write a figure as PNG, close it, and return the file name."""
     import matplotlib.pyplot as plt
 
     write_atomically(path, lambda part: fig.savefig(part, format="png", dpi=130))
@@ -42,14 +42,14 @@ def save(fig: Any, path: Path) -> str:
 
 
 def colours(count: int) -> list[Any]:
-    """Colours for curves in an order, from dark to light."""
+    """Colours for a sequence of curves, from dark to light."""
     import matplotlib as mpl
 
     return [mpl.colormaps["viridis"](0.05 + 0.85 * i / max(count - 1, 1)) for i in range(count)]
 
 
 def precision_curve(axes: Any, errors: Any, limit: float, **options: Any) -> None:
-    """Draw the share of errors at or below a threshold, in percent, over thresholds 0 … limit in steps of limit/1000."""
+    """Draw the percentage of errors at or below a threshold, for 1000 thresholds from 0 to limit."""
     import numpy as np
 
     thresholds = np.linspace(0.0, limit, 1001)

@@ -1,4 +1,4 @@
-"""What the thesis prints of its filter and of its recursive algorithm, from the tables beside this module."""
+"""Published results of the filter and of the recursive algorithm, from the CSV files beside this module."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 Key = tuple[float, int, float]
-"""Overlap ratio p, noise factor μ (equal to the number of false stars f), and threshold τ; τ = 0 is LSI with the filter."""
+"""Overlap ratio p, noise factor μ (= number of false stars f), threshold τ (0: LSI with the filter)."""
 
 
 def _lines(name: str) -> list[dict[str, str]]:
@@ -33,21 +33,22 @@ def _recursion() -> dict[Key, dict[str, float]]:
 
 
 TABLES: Final = _confusion()
-"""Kind of noise and number of false stars → for μ = 0 … 5: true positives, false positives, false negatives, true negatives.
+"""Kind of noise and number of false stars → true and false positives, false and true negatives for μ = 0 … 5.
 
-Tables A.1 to A.18. In table A.2 (position noise, no false stars) the thesis's copy has lost the positives for μ = 1 … 5; they
-are 6 620 less the negatives here.
+Tables A.1 to A.18. In table A.2 (position noise, no false stars) the copy of the thesis has lost the
+positives for μ = 1 … 5; here they are 6 620 minus the negatives.
 """
 
 RECURSION: Final = _recursion()
-"""Tables of the recursive algorithm, by the names of `rsi_parts.statistics`.
+"""Tables of the recursive algorithm, with the names of `rsi_parts.statistics`.
 
-H.1 and H.2: mean and standard deviation of ε_f, of ε_θ (degrees), and of ε_ψ. 6.7, where τ > 0: share of frames that trigger the
-update, and that have ε_ψ > τ, percent. 6.8, where τ > 0: mean and standard deviation of the side of the region of search,
-degrees, and its size, kB. 6.9: mean and standard deviation of the time of the search and of the LASSO, milliseconds.
+H.1 and H.2: mean and standard deviation of ε_f, of ε_θ (degrees), and of ε_ψ. 6.7, for τ > 0: share of frames
+that trigger the update, and that have ε_ψ > τ, percent. 6.8, for τ > 0: mean and standard deviation of the
+side of the search region, degrees, and its size, kB. 6.9: mean and standard deviation of the time of the
+search and of the LASSO, milliseconds.
 """
 
 
 def printed_of(values: Mapping[str, Any]) -> dict[str, float]:
-    """What the thesis prints of a part of the recursive experiments; empty where its tables have no such row."""
+    """Published values for a part of the recursive experiments; empty if the tables have no such row."""
     return RECURSION.get((values["overlap"], values["factor"], values["tau"]), {})

@@ -1,4 +1,4 @@
-"""Which experiments there are."""
+"""Registry of the experiments."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def experiments() -> dict[str, Experiment]:
     Raises
     ------
     ReproduceError
-        If two modules use the same name.
+        Two modules use the same name.
     """
     found: dict[str, Experiment] = {}
     for module in MODULES:
@@ -49,12 +49,12 @@ def experiments() -> dict[str, Experiment]:
 
 
 def select(names: Sequence[str], *, quick: bool) -> list[Experiment]:
-    """Experiments by name; without names all, or all that have a quick form.
+    """Select experiments by name; without names all of them, or all that have a quick form.
 
     Raises
     ------
     ReproduceError
-        If a name is unknown, or has no quick form and the quick run is asked for.
+        A name is unknown, or has no quick form although the quick run is requested.
     """
     known = experiments()
     if not names:
@@ -62,8 +62,8 @@ def select(names: Sequence[str], *, quick: bool) -> list[Experiment]:
     for name in names:
         if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean {near[0]}?" if near else "`starhil reproduce --list` names them all"
+            hint = f"did you mean {near[0]}?" if near else "`starhil reproduce --list` lists them all"
             raise ReproduceError(f"reproduce: there is no experiment {name}; {hint}")
         if quick and known[name].quick is None:
-            raise ReproduceError(f"reproduce: {name} has no quick form; leave out --quick")
+            raise ReproduceError(f"reproduce: {name} has no quick form; run it without --quick")
     return [known[name] for name in dict.fromkeys(names)]

@@ -1,4 +1,4 @@
-"""The report: every experiment's rows beside the published values, its figures and its tables."""
+"""The report: rows of all experiments compared with the published values, figures and tables."""
 
 from __future__ import annotations
 
@@ -9,38 +9,44 @@ from typing import Any, Final
 from starid.files import write_atomically
 from starid.thesis.experiments.experiment import Kind, Row
 from starid.thesis.experiments.known_misses import known_miss
-from starid.thesis.experiments.runner import Finished
+from starid.thesis.experiments.runner import FinishedExperiment
 
 REPORT_FILE: Final = "report.md"
-"""Name of the report in the results' folder."""
+"""Name of the report in the folder of results."""
 
-_HEAD: Final = """# The thesis's experiments, made again
+_HEAD: Final = """# The thesis's experiments, reproduced
 
-Experiments of E. O. Özyurt, *A Feedback Star Identification Algorithm via Regularized Pattern Recognition Using a
-Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University), computed here from the Hipparcos catalogue (new
-reduction) and put beside the published values. Four columns, of which a row fills those that apply:
+Experiments of E. O. Özyurt, *A Feedback Star Identification Algorithm via Regularized Pattern Recognition
+Using a Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University), computed here from the
+Hipparcos catalogue (new reduction) and compared with the published values. There are four columns, of which a
+row fills those that apply:
 
-* **published**: what the thesis prints; a curve or a phrase is quoted, "—" means that it prints nothing.
-* **as the author ran it**: the readings that recomputing the published numbers has recovered, MATLAB's `lasso` above all.
+* **published**: the value printed in the thesis; a curve or a phrase is quoted, "—" means that nothing is
+  printed.
+* **as the author ran it**: the author's version of the algorithm, as inferred from the published numbers;
+  above all, with MATLAB's `lasso`.
 * **as printed**: the equations and parameters of the thesis's text, solved exactly.
-* **ours**: what this project makes of the task.
+* **ours**: this project's own solution of the task.
 
-A check belongs to one of three classes, counted apart:
+A check belongs to one of three classes, which are counted separately:
 
-* **agrees**: the value as the author ran it (or else as printed, or else ours) lies within a tolerance on *both* sides of the
-  published number. The tolerance comes from the printed digits or from the sampling error, and the row says which.
-* **better**: ours is on the better side of the published number; the row says by how much.
+* **agrees**: the value as the author ran it (or else as printed, or else ours) is within a tolerance on
+  *both* sides of the published number. The tolerance comes from the printed digits or from the sampling
+  error; the row says which.
+* **better**: ours is better than the published number; the row says by how much.
 * **ours**: nothing was published; the bound is a requirement of this project.
 
-A missed check is shown as a miss. One that is known to be missed names its reason; one that is not is a *regression*, and only that
-gives the exit status 1.
+A failed check is shown as a miss. A known miss states its reason; any other is a *regression*, and only a
+regression gives the exit status 1.
 
 How to read the accuracy figures of the LSI algorithm:
 
-* **On the grid**: the thesis tests on 1 701 frames, and with p = 99.5 % every one of them *is* a frame of the database.
-  The nearest neighbour is then the frame itself, and the figure says little about frames in between.
-* **Off the grid**: the same frames, each moved by an irrational fraction of the grid step (drawn from a seeded
-  generator), which is what a real sensor sees. Every accuracy figure of the LSI algorithm is given for both.
+* **On the grid**: the thesis tests on 1 701 frames, and with p = 99.5 % every one of them *is* a frame of the
+  database. The nearest neighbour is then the frame itself, and the figure says little about frames in
+  between.
+* **Off the grid**: the same frames, each moved by an irrational fraction of the grid step (drawn from a
+  seeded generator), which is what a real sensor sees. Every accuracy figure of the LSI algorithm is given for
+  both.
 """
 
 CLASSES: Final[dict[Kind, str]] = {
@@ -48,7 +54,7 @@ CLASSES: Final[dict[Kind, str]] = {
     "better": "published numbers are bettered",
     "ours": "bounds of this project hold",
 }
-"""The classes of checks and what is counted in each."""
+"""Classes of checks, and what is counted in each."""
 
 
 def _mark(experiment: str, row: Row) -> str:
@@ -88,8 +94,8 @@ def _table(rows: Iterable[tuple[str, Row]]) -> list[str]:
     return lines
 
 
-def counts(results: Sequence[Finished]) -> dict[str, dict[str, int]]:
-    """For each class how many numbers are met and how many there are."""
+def counts(results: Sequence[FinishedExperiment]) -> dict[str, dict[str, int]]:
+    """For each class, how many numbers agree and how many there are."""
     rows = [row for result in results for row in result.outcome.rows]
     return {
         kind: {
@@ -100,8 +106,8 @@ def counts(results: Sequence[Finished]) -> dict[str, dict[str, int]]:
     }
 
 
-def regressions(results: Sequence[Finished]) -> list[tuple[str, Row]]:
-    """Missed checks that are not known misses, with the names of their experiments."""
+def regressions(results: Sequence[FinishedExperiment]) -> list[tuple[str, Row]]:
+    """Failed checks that are not known misses, with the names of their experiments."""
     return [
         (result.experiment.name, row)
         for result in results
@@ -110,7 +116,7 @@ def regressions(results: Sequence[Finished]) -> list[tuple[str, Row]]:
     ]
 
 
-def _section(finished: Finished) -> list[str]:
+def _section(finished: FinishedExperiment) -> list[str]:
     experiment, outcome = finished.experiment, finished.outcome
     lines = [f"## {experiment.title}", ""]
     for note in outcome.notes:
@@ -127,8 +133,8 @@ def _section(finished: Finished) -> list[str]:
     return lines
 
 
-def report_text(results: Sequence[Finished], *, quick: bool, seed: int) -> str:
-    """The report in Markdown."""
+def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int) -> str:
+    """Format the report in Markdown."""
     missed = [(result.experiment.name, row) for result in results for row in result.outcome.failed]
     lost = regressions(results)
     lines = [_HEAD]
@@ -140,7 +146,7 @@ def report_text(results: Sequence[Finished], *, quick: bool, seed: int) -> str:
         ]
     minutes = sum(result.seconds for result in results) / 60.0
     lines += [
-        f"Seed {seed}. All took {minutes:.1f} minutes of processor time, on two cores half as long.",
+        f"Seed {seed}. The run took {minutes:.1f} minutes of processor time, about half as long on two cores.",
         "",
         "| class | met | of |",
         "|---|---:|---:|",
@@ -161,15 +167,15 @@ def report_text(results: Sequence[Finished], *, quick: bool, seed: int) -> str:
     return "\n".join(lines)
 
 
-def write_report(results: Sequence[Finished], folder: Path, *, quick: bool, seed: int) -> Path:
-    """Write the report into the results' folder and return its path."""
+def write_report(results: Sequence[FinishedExperiment], folder: Path, *, quick: bool, seed: int) -> Path:
+    """Write the report to the folder of results and return its path."""
     path = folder / REPORT_FILE
     text = report_text(results, quick=quick, seed=seed)
     write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
     return path
 
 
-def summary(results: Sequence[Finished]) -> dict[str, Any]:
+def summary(results: Sequence[FinishedExperiment]) -> dict[str, Any]:
     """Counts and rows as plain values, for `--json`."""
     rows = [(result, row) for result in results for row in result.outcome.rows]
     return {

@@ -1,4 +1,7 @@
-"""Recursive identification: sequences 6.33–6.36 and E, precision 6.37–6.41 and F, run time 6.42, 6.43 and G, tables 6.7–6.9 and H."""
+"""Recursive identification: figures 6.33–6.43, E, F and G, tables 6.7–6.9 and H.
+
+Sequences: 6.33–6.36 and E; precision: 6.37–6.41 and F; run time: 6.42, 6.43 and G.
+"""
 
 from __future__ import annotations
 
@@ -55,7 +58,7 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def measured_step(step: RsiStep, frame: SimulatedFrame) -> tuple[float, ...]:
-    """The fields of one frame."""
+    """Measurements of one frame, in the order of `FIELDS`."""
     motion = step.motion
     distances = (
         (math.nan, math.nan) if motion is None else (motion.mean_distance_deg, motion.sigma_distance_deg)

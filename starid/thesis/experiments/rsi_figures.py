@@ -1,4 +1,7 @@
-"""Figures of the recursive algorithm: sequences 6.33–6.36 and E, precision 6.37–6.41 and F, run time 6.42, 6.43 and G."""
+"""Figures of the recursive algorithm.
+
+Sequences: 6.33–6.36 and E; precision: 6.37–6.41 and F; run time: 6.42, 6.43 and G.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ _MAX_MS: Final = 1.0
 
 
 def rsi_figures(context: Context, results: Mapping[str, Results]) -> list[str]:
-    """Draw all figures; returns the names of the files."""
+    """Draw all figures; return the names of the files."""
     files = []
     for scale in context.parameters["scales"]:
         files.append(_by_noise(context, results, scale))
@@ -28,7 +31,7 @@ def rsi_figures(context: Context, results: Mapping[str, Results]) -> list[str]:
 
 
 def _chosen(context: Context, scale: float) -> list[Part]:
-    """Sets with as many false stars as noise, at one scale of the noise; the clean ones belong to every scale."""
+    """Sets with μ = f at one scale of the noise; those without noise belong to every scale."""
     return [
         part
         for part in rsi_parts(context.parameters)
@@ -43,7 +46,7 @@ def _unique(values: Sequence[Any]) -> list[Any]:
 
 
 def _by_noise(context: Context, results: Mapping[str, Results], scale: float) -> str:
-    """A panel for each noise, a curve for each method and overlap: figures 6.37, 6.38, F.1 and F.2."""
+    """Draw a panel for each noise, a curve for each method and overlap: figures 6.37, 6.38, F.1 and F.2."""
     parts = _chosen(context, scale)
     factors = _unique([part.values["factor"] for part in parts])
     fig, axes = figure(2, (len(factors) + 1) // 2, width=9.0, height=7.0, squeeze=False, sharey=True)
@@ -69,7 +72,7 @@ def _by_noise(context: Context, results: Mapping[str, Results], scale: float) ->
 
 
 def _by_method(context: Context, results: Mapping[str, Results], overlap: float, scale: float) -> str:
-    """A panel for each method, a curve for each noise: figures 6.39 to 6.41, or F.3 to F.5."""
+    """Draw a panel for each method, a curve for each noise: figures 6.39 to 6.41, or F.3 to F.5."""
     parts = [part for part in _chosen(context, scale) if part.values["overlap"] == overlap]
     names = _unique([method_of(part.values) for part in parts])
     fig, axes = figure(2, (len(names) + 1) // 2, width=9.0, height=7.0, squeeze=False, sharey=True)
@@ -92,7 +95,7 @@ def _by_method(context: Context, results: Mapping[str, Results], overlap: float,
 
 
 def _sequence_parts(context: Context) -> tuple[list[int], list[float], dict[tuple[int, float], Part]]:
-    """Runs of the algorithm as printed with the finest database and the least noise: by noise factor and τ."""
+    """Runs as printed, with the finest database and the lowest noise, by noise factor and τ."""
     found = {
         (part.values["factor"], part.values["tau"]): part
         for part in _chosen(context, context.parameters["scales"][0])
@@ -108,7 +111,7 @@ def _numbers(results: Mapping[str, Results], part: Part) -> dict[str, Any]:
 
 
 def _sequences(context: Context, results: Mapping[str, Results]) -> str:
-    """ε_ψ and ε_f frame by frame: figures 6.33 to 6.36 and E."""
+    """Draw ε_ψ and ε_f frame by frame: figures 6.33 to 6.36 and E."""
     factors, taus, parts = _sequence_parts(context)
     fig, axes = figure(
         len(factors),
@@ -138,7 +141,7 @@ def _sequences(context: Context, results: Mapping[str, Results]) -> str:
 
 
 def _run_times(context: Context, results: Mapping[str, Results]) -> str:
-    """ε_f, side of the region and run times frame by frame: figures 6.42, 6.43 and G."""
+    """Draw ε_f, side of the region and run times frame by frame: figures 6.42, 6.43 and G."""
     factors, taus, parts = _sequence_parts(context)
     fig, axes = figure(
         len(factors), len(taus), width=10.0, height=2.2 * len(factors), squeeze=False, sharex=True

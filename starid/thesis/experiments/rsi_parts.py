@@ -1,4 +1,4 @@
-"""Sets and methods of the recursive experiments, and what is measured in each frame of them."""
+"""Sets and methods of the recursive experiments, and the quantities measured in each frame."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ FIELDS: Final = (
     "mean_distance",
     "sigma_distance",
 )
-"""What is kept of every frame: ε_f, ε_θ (degrees), ε_ψ, Γ (degrees), cells of the region, times, flags, μ_d, σ_d (degrees)."""
+"""Fields of a frame: ε_f, ε_θ (°), ε_ψ, Γ (°), cells of the region, times, flags, μ_d, σ_d (°)."""
 
 SETTLING: Final = 5
-"""First frames left out of the statistics: false stars cannot be recognised yet."""
+"""Number of first frames left out of the statistics, in which false stars cannot be recognised yet."""
 
 LSI_ONLY: Final = 0.0
-"""In place of a threshold τ: every frame searches the whole database."""
+"""Threshold τ for which every frame searches the whole database."""
 
 BY_EQUATION, BY_TABLE = "equation", "table"
-"""Side of the region of search by eq. 6.5 as read here, or as table 6.8 has it."""
+"""Side of the search region, by eq. 6.5 as interpreted here, or from table 6.8."""
 
 
 _MEASURES: Final[dict[str, Callable[..., Any]]] = {
@@ -45,9 +45,9 @@ _MEASURES: Final[dict[str, Callable[..., Any]]] = {
 
 
 def rsi_parts(parameters: Parameters) -> list[Part]:
-    """All runs: sets with as many false stars as noise, which the tables print; the others with the memory alone.
+    """List all runs: sets with μ = f, as in the tables, and the other sets with memory only.
 
-    The side of table 6.8 is tried at the first scale of the noise only.
+    The side of table 6.8 is tried only at the first scale of the noise.
     """
     return [
         Part(
@@ -73,7 +73,7 @@ def rsi_parts(parameters: Parameters) -> list[Part]:
 
 
 def method_of(values: Mapping[str, Any]) -> str:
-    """Name of a part's method."""
+    """Name of the method of a part."""
     if values["tau"] == LSI_ONLY:
         return "FSF-aided LSI"
     name = f"RSI, τ = {values['tau']:g}"
@@ -82,14 +82,14 @@ def method_of(values: Mapping[str, Any]) -> str:
     return name if values["side"] == BY_EQUATION else f"{name}, Γ of table 6.8"
 
 
-def set_words(values: Mapping[str, Any]) -> str:
-    """A part's overlap, noise and false stars."""
+def set_label(values: Mapping[str, Any]) -> str:
+    """Describe the overlap, noise and false stars of a part."""
     words = f"p = {100 * values['overlap']:g} %, μ = {values['factor']}, f = {values['false_stars']}"
     return words + (f", noise × {values['scale']:g}" if values["factor"] else "")
 
 
 def statistics(result: Results) -> dict[str, float]:
-    """Means, deviations and shares over the frames of a part, after the settling."""
+    """Means, standard deviations and shares over the frames of a part, without the first `SETTLING`."""
     settled = dict(zip(FIELDS, result["numbers"][:, SETTLING:], strict=True))
     side = settled["side"][np.isfinite(settled["side"])]
     error = settled["error"]

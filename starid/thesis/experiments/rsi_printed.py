@@ -1,4 +1,7 @@
-"""The recursive algorithm with the thesis's own filter and affine motion: tables 6.7, 6.8, H.1 and H.2, three readings of eq. 6.5."""
+"""The recursive algorithm with the thesis's own filter and affine motion: tables 6.7, 6.8, H.1 and H.2.
+
+Equation 6.5 is interpreted in three ways.
+"""
 
 from __future__ import annotations
 
@@ -41,46 +44,44 @@ _MARGIN_DEG: Final = 1.6
 _SIDE_DEG: Final = 3.96
 _FIRST: Final = 1
 _TAUS: Final = (LSI_ONLY, 0.5, 1.0)
-_WORDS: Final = {
-    "author": "as the author ran it",
-    "printed": "as printed",
-    "rigid": "as printed, rigid motion",
-}
 
-_NOTE: Final = """The clean rows of tables H.1 and H.2 are compared on the frames of figure 6.1, moved off the grid, each searched in the region of
-table 6.8 about its true place: which frames the thesis's sequences held is not known. *As the author ran it* is MATLAB's `lasso` on five
-features after a search with the polar angle as a sixth one; *as printed* is the search in five features and eq. 2.34, solved
-exactly. The tolerance is one published standard deviation, as the published means belong to other frames.
+_NOTE: Final = """The clean rows of tables H.1 and H.2 are compared on the frames of figure 6.1, moved off the
+grid, each searched in the region of table 6.8 about its true position; which frames the thesis's sequences
+contained is not known. *As the author ran it* is MATLAB's `lasso` on five features after a search with the
+polar angle as a sixth; *as printed* is the search in five features and eq. 2.34, solved exactly. The
+tolerance is one published standard deviation, because the published means are for other frames.
 
-The sequences run with the thesis's own filter (density-based clustering of the disparities of all pairs, ε = 0.4, min_samples = 0.5·n)
-and an affine motion; frames move from the first one by U(−25, 25) px and U(−2.5°, 2.5°), as in the filter's experiments, and objects are seen
-1.6° beyond the field of the features. With 25 to 30 objects in a frame half a million pairs of pairs crowd the disparity list, and under
-"whoever appears in the main cluster is a star" about half of the false stars pass; *as the author ran it* wants two objects to name
-each other most, which stops nearly all of them. The noise is {equivalent:g} of the printed one in the first and the printed one in
-the second. A rigid motion in place of the affine one stands beside."""
+The sequences run with the thesis's own filter (density-based clustering of the disparities of all pairs, ε =
+0.4, min_samples = 0.5·n) and an affine motion. Frames move from the first one by U(−25, 25) px and U(−2.5°,
+2.5°), as in the experiments on the filter, and objects are visible 1.6° beyond the field of the features.
+With 25 to 30 objects in a frame there are half a million disparities, and with every object in the main
+cluster taken for a star about half of the false stars pass. *As the author ran it*, two objects must name
+each other most often, which stops nearly all of them. The noise is {equivalent:g} of the printed noise in the
+first case and the printed noise in the second. A rigid motion instead of the affine one is also shown."""
 
-_GAMMA_NOTE: Final = """**Table 6.8 in three readings of eq. 6.5.** (a) With the printed "110" the side falls as noise grows. (b) With "1·10" it is
-Γ_min + √(μ_d·σ_d), and exact matches give 2.00°. (c) With μ_d and σ_d of the distances of *all* survivors of the filter to their nearest
-neighbours, which the "min" of eq. 3.11 allows, the side grows with noise; it does not start at 3.96°. None gives the table, whose sides
-are 2° + √(1.96² + 0.54·μ²) to 0.06°, as if a constant of 1.96° were added to noise in quadrature."""
+_GAMMA_NOTE: Final = """**Table 6.8 with three interpretations of eq. 6.5.** (a) With the printed "110" the
+side falls as noise grows. (b) With "1·10" it is Γ_min + √(μ_d·σ_d), and exact matches give 2.00°. (c) With
+μ_d and σ_d of the distances between *all* survivors of the filter and their nearest neighbours, which the
+"min" of eq. 3.11 allows, the side grows with noise, but does not start at 3.96°. None reproduces the table,
+whose sides are 2° + √(1.96² + 0.54·μ²) to 0.06°, as if noise were added in quadrature to a constant of 1.96°."""
 
 
 class _Replayed:
-    """A filter that was run before, as several methods see the same frames."""
+    """Replays filter results, because several methods process the same frames."""
 
     def __init__(self, results: Sequence[FilterResult], *, matched: bool) -> None:
         self._results = iter(results)
         self._matched = matched
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
-        """The next result; matched, only objects that name each other are true stars."""
+        """Return the next result; if `matched`, only objects that name each other are true stars."""
         del before, now
         result = next(self._results)
         return dataclasses.replace(result, true_now=result.matched) if self._matched else result
 
 
 def _settings(reading: str, tau: float, side: float) -> RsiSettings:
-    """Settings of a reading and a threshold; LSI only is a region that is never small enough."""
+    """Settings of a variant and a threshold; for LSI only, no region is ever small enough."""
     author = reading == "author"
     model: MotionModel = "rigid" if reading == "rigid" else "affine"
     lsi = tau == LSI_ONLY
@@ -106,7 +107,7 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _clean(context: Context, part: Part) -> Results:
-    """ε_f, ε_θ and ε_ψ of frames off the grid, searched in the region of table 6.8 about their true places."""
+    """ε_f, ε_θ and ε_ψ of frames off the grid, searched in the region of table 6.8."""
     overlap = part.values["overlap"]
     found: Results = {}
     frames: Array | None = None
@@ -139,7 +140,7 @@ def _filtered(frames: Sequence[SimulatedFrame]) -> list[FilterResult]:
 
 
 def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]) -> Array:
-    """μ_d and σ_d of the matches, and of all survivors to their nearest neighbours, degrees, (n, 4)."""
+    """μ_d and σ_d of the matches, and from all survivors to their nearest neighbours, degrees, (n, 4)."""
     found = np.full((len(results), 4), math.nan)
     for i, (before, now, result) in enumerate(zip(frames[:-1], frames[1:], results, strict=True)):
         first, second = before.observed.positions, now.observed.positions
@@ -182,7 +183,7 @@ def _work(context: Context, part: Part) -> Results:
 
 
 def _means(numbers: Array) -> dict[str, float]:
-    """Statistics of a run after its first frame, which has no filter."""
+    """Statistics of a run without its first frame, which is not filtered."""
     settled = dict(zip(FIELDS, numbers[:, _FIRST:], strict=True))
     side = settled["side"][np.isfinite(settled["side"])]
     found = {

@@ -1,4 +1,4 @@
-"""Tables 6.7, 6.8, 6.9, H.1 and H.2 beside ours, and the report's rows and paragraphs on the recursive algorithm."""
+"""Tables 6.7–6.9, H.1 and H.2 and ours; rows and paragraphs of the report on the recursive algorithm."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from starid.thesis.experiments.rsi_parts import (
     SETTLING,
     method_of,
     rsi_parts,
-    set_words,
+    set_label,
     statistics,
 )
 from starid.thesis.rsi import RsiSettings, region_cells, region_side
@@ -45,7 +45,7 @@ _FILE: Final = "tables_6_7_6_8_6_9_h_1_h_2.csv"
 
 
 def _published(values: Mapping[str, Any]) -> dict[str, float]:
-    """What the thesis prints of a set with as many false stars as noise; empty where its tables have no such row."""
+    """Published values for a set with μ = f; empty if the tables have no such row."""
     unknown = values["false_stars"] != values["factor"] or values["memory"] or values["side"] == BY_TABLE
     return {} if unknown else printed_of(values)
 
@@ -55,7 +55,7 @@ def _region_kilobytes(values: Mapping[str, Any], side_deg: float) -> float:
 
 
 def rsi_tables(context: Context, results: Mapping[str, Results]) -> list[str]:
-    """Write every set and method, ours and published, as one CSV, and the readings of eq. 6.5 as another."""
+    """Write two CSV files: all sets and methods, and the interpretations of eq. 6.5."""
     lines = []
     for part in rsi_parts(context.parameters):
         v, measured = part.values, statistics(results[part.key])
@@ -70,7 +70,7 @@ def rsi_tables(context: Context, results: Mapping[str, Results]) -> list[str]:
 
 
 def _readings(context: Context, results: Mapping[str, Results]) -> list[dict[str, float]]:
-    """The side Γ as printed, with the square root, and of table 6.8, with the μ_d and σ_d it is made of, for the first RSI method."""
+    """Side Γ as printed, with the square root, and in table 6.8; μ_d and σ_d; for the first RSI method."""
     parameters = context.parameters
     tau = min(t for t, *_ in parameters["methods"] if t != LSI_ONLY)
     lines = []
@@ -97,7 +97,7 @@ def _wide(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
 
 
 def _pair(theirs: float | None, ours: float, digits: int) -> str:
-    """Published and ours in one cell."""
+    """Format the published value and ours in one cell."""
     left = "—" if theirs is None else f"{theirs:.{digits}f}"
     return f"{left} / " + ("—" if math.isnan(ours) else f"{ours:.{digits}f}")
 
@@ -107,7 +107,7 @@ def _error_table(context: Context, results: Mapping[str, Results]) -> str:
     for part in _diagonal(rsi_parts(context.parameters)):
         s, theirs = statistics(results[part.key]), _published(part.values)
         cells = [_pair(theirs.get(name), s[name], 2) for name in _NAMES[:6]]
-        lines.append((f"{set_words(part.values)}: {method_of(part.values)}", *cells))
+        lines.append((f"{set_label(part.values)}: {method_of(part.values)}", *cells))
     head = ("tables H.1 and H.2: published / ours", "ε_f mean / °", "σ", "ε_θ mean / °", "σ", "ε_ψ mean", "σ")
     return _wide(head, lines)
 
@@ -118,7 +118,7 @@ def _update_table(context: Context, results: Mapping[str, Results]) -> str:
         v, s, theirs = part.values, statistics(results[part.key]), _published(part.values)
         s["region_kB"] = _region_kilobytes(v, s["side_mean"])
         cells = [_pair(theirs.get(name), s[ours], digits) for name, ours, digits in _UPDATE_COLUMNS]
-        lines.append((f"{set_words(v)}: {method_of(v)}", *cells))
+        lines.append((f"{set_label(v)}: {method_of(v)}", *cells))
     head = (
         "tables 6.7, 6.8 and 6.9: published / ours",
         "triggers / %",
@@ -131,7 +131,7 @@ def _update_table(context: Context, results: Mapping[str, Results]) -> str:
 
 
 def _matrix(context: Context, results: Mapping[str, Results], overlap: float) -> str | None:
-    """Mean ε_f of the method with memory in all sets, as table 6.6 arranges them."""
+    """Format the mean ε_f of the method with memory in all sets, arranged as in table 6.6."""
     found = {
         (p.values["false_stars"], p.values["factor"]): statistics(results[p.key])["error_mean"]
         for p in rsi_parts(context.parameters)
@@ -148,12 +148,12 @@ def _matrix(context: Context, results: Mapping[str, Results], overlap: float) ->
 
 
 def rsi_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
-    """Mean ε_f of every set with as many false stars as noise, and the worst of all sets, beside the published means."""
+    """Rows with the mean ε_f of the sets with μ = f, the worst of all sets, and the published means."""
     rows = []
     parts = rsi_parts(context.parameters)
     for part in _diagonal(parts):
         v, s = part.values, statistics(results[part.key])
-        quantity = f"mean ε_f, {set_words(v)}: {method_of(v)}"
+        quantity = f"mean ε_f, {set_label(v)}: {method_of(v)}"
         remark = (
             f"Median {s['error_median']:.3f}°, {s['gross_percent']:.1f} % beyond 1°; ε_θ {s['roll_median']:.1f}° "
             f"in the median; invalid {s['invalid_percent']:.1f} %."
@@ -173,7 +173,7 @@ def rsi_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             for p in parts
             if p.values["overlap"] == overlap and p.values["memory"] and p.values["scale"] != 1.0
         ]
-        means = {set_words(p.values): statistics(results[p.key])["error_mean"] for p in chosen}
+        means = {set_label(p.values): statistics(results[p.key])["error_mean"] for p in chosen}
         worst = max(means, key=lambda words: means[words])
         rows.append(
             improvement(
@@ -189,26 +189,31 @@ def rsi_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     return rows
 
 
-_SETTING_NOTE: Final = f"""Sequences of frames of the flat sky that start at the published frame; from one frame to the next the boresight moves by
-U(−25, 25) px per axis and the frame turns by U(−2.5°, 2.5°). Stars enter and leave; the filter is the scalable one;
-the thesis's own stands in the experiment `rsi-as-printed`; objects are seen two degrees beyond the field of the features, so that a star about to
-enter is known by then. The first {SETTLING} frames, in which false stars cannot yet be recognised, are left out of the
-statistics. "Noise × {EQUIVALENT:g}" is the noise that the published μ_d belongs to. All methods see the same frames."""
+_SETTING_NOTE: Final = f"""Sequences of frames of the flat sky, starting at the published frame. From one
+frame to the next the boresight moves by U(−25, 25) px per axis and the frame rotates by U(−2.5°, 2.5°). Stars
+enter and leave. The filter is the scalable one; the thesis's own filter is used in the experiment
+`rsi-as-printed`. Objects are visible two degrees beyond the field of the features, so that a star is known
+before it enters. The first {SETTLING} frames, in which false stars cannot be recognised yet, are left out of
+the statistics. "Noise × {EQUIVALENT:g}" is the noise to which the published μ_d corresponds. All methods
+process the same frames."""
 
-_MEMORY_NOTE: Final = """**What makes the mean large, and what mends it.** Half of the answers of the algorithm as printed are within a few
-hundredths of a degree; its mean is made by rare gross errors. They come from two places. In frames with few stars a
-neighbouring cell of the region fits better than the true one (1 to 2° off), and the next region then lies about a wrong
-place. And where the region's answer exceeds τ the rule takes whichever answer has the smaller ε_ψ: of millions of cells one
-far away often has. The published means cannot be compared here: a standard deviation of 0.18° in a thousand frames has no room for a single
-gross error, while searching the whole database, as the thesis's own LSI does, makes them in a few per cent of the frames that are not
-of the grid. "With memory" is our addition, off in the algorithm as printed: the last 15 answers, carried forward with
-the camera's measured motion, vote, two agreeing within half a degree; what most agree on is the answer, its median the
-centre of the next region. The camera's motion is known to hundredths of a degree, so that errors which come and go from
-frame to frame are outvoted."""
+_MEMORY_NOTE: Final = """**Why the mean is large, and what helps.** Half of the answers of the algorithm as
+printed are within a few hundredths of a degree; the mean is dominated by rare gross errors, which have two
+causes. In frames with few stars a neighbouring cell of the region fits better than the true one (1 to 2°
+off), and the next region is then centred on a wrong position. And where the answer from the region exceeds τ,
+the rule takes the answer with the smaller ε_ψ: among millions of cells a distant one often has a smaller one.
+The published means cannot be compared here: a standard deviation of 0.18° over a thousand frames leaves no
+room for a single gross error, but a search of the whole database, as in the thesis's LSI, produces them in a
+few per cent of the frames off the grid. "With memory" is our addition, not part of the algorithm as printed:
+the last 15 answers, carried forward with the measured camera motion, vote, and two agree if they are within
+half a degree. The answer is the one on which most agree, and their median is the centre of the next region.
+The camera motion is known to hundredths of a degree, so that errors which vary from frame to frame are
+outvoted."""
 
-_TRIGGER_NOTE: Final = """**Fewer triggers.** The exact LASSO leaves a much smaller ε_ψ than the published one (0.05 to 0.1 against 0.4 to 0.5), and the same τ
-is exceeded less often; the time of the search falls accordingly. Of our times the tables give medians, as other work on the machine
-makes single frames slow; the experiment `lsi-run-time` measures the search by itself."""
+_TRIGGER_NOTE: Final = """**Fewer triggers.** The exact LASSO has a much smaller ε_ψ than the published one
+(0.05 to 0.1 instead of 0.4 to 0.5), so the same τ is exceeded less often, and the search takes less time. The
+tables give medians of our times, because other work on the machine makes single frames slow; the experiment
+`lsi-run-time` measures the search alone."""
 
 
 def rsi_notes(context: Context, results: Mapping[str, Results]) -> list[str]:
@@ -238,10 +243,12 @@ def rsi_notes(context: Context, results: Mapping[str, Results]) -> list[str]:
     return notes
 
 
-_REGION_NOTE: Final = """**Table 6.8 cannot come from eq. 6.5.** As printed, with 110, the equation is Γ_min + (μ_d·σ_d)^−0.02: about 6° without
-noise, falling as noise grows, where the table has 3.96° growing to 4.95°. With "1·10" for "110" it is Γ_min + √(μ_d·σ_d), and
-the table would need residuals of 2 to 3 degrees, a hundred times the thesis's own μ_d (figure 6.18: at most 0.0419°), and of 2° in the
-set without noise, where its μ_d is 1e-15. The published sides are those of 2° + √(1.96² + 0.54·μ²) to 0.06°, as if a constant of 1.96° were added to
-noise in quadrature; the text names no such term. So the region here is that of the second reading, about 2°; the runs "Γ of table
-6.8" repeat the sets with the published sides and show what they change. The sizes in kB that the table prints are a tenth of what its sides come
-to, 6 300 kB (25 200 kB) times Γ² over the 360° × 180° of the sky."""
+_REGION_NOTE: Final = """**Table 6.8 cannot come from eq. 6.5.** As printed, with 110, the equation is Γ_min +
+(μ_d·σ_d)^−0.02: about 6° without noise, falling as noise grows, while the table has 3.96° growing to 4.95°.
+With "1·10" for "110" it is Γ_min + √(μ_d·σ_d), and the table would need residuals of 2 to 3 degrees, a
+hundred times the thesis's own μ_d (figure 6.18: at most 0.0419°), and of 2° in the set without noise, where
+its μ_d is 1e-15. The published sides are 2° + √(1.96² + 0.54·μ²) to 0.06°, as if noise were added in
+quadrature to a constant of 1.96°; the text mentions no such term. The region here therefore follows the
+second interpretation, about 2°; the runs "Γ of table 6.8" repeat the sets with the published sides to show
+the difference. The printed sizes in kB are a tenth of what the sides imply: 6 300 kB (25 200 kB) times Γ²
+over the 360° × 180° of the sky."""

@@ -1,4 +1,4 @@
-"""Runs experiments: parts in parallel, nothing twice, every result in a file before it counts."""
+"""Run experiments: parts in parallel, none computed twice, every result stored in a file."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from starid.thesis.experiments.experiment import (
 )
 
 OUTCOME_FILE: Final = "outcome.json"
-"""What an experiment ended with, in its folder."""
+"""File of the outcome in the folder of an experiment."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with the name of the experiment at work, parts done and parts in all."""
+"""Called with the name of the experiment, the number of parts done and the total."""
 
 
 @dataclass(frozen=True, slots=True)
-class Finished:
+class FinishedExperiment:
     """An experiment that has been run.
 
     Attributes
@@ -41,9 +41,9 @@ class Finished:
     quick
         Whether it ran with its quick parameters.
     seconds
-        Processor time for its parts, added up over the processes, and for its tables and figures.
+        Processor time for its parts, summed over the processes, and for its tables and figures.
     parts
-        Number of parts computed for it, 0 if all were there already.
+        Number of parts computed; 0 if all results were stored already.
     """
 
     experiment: Experiment
@@ -69,14 +69,14 @@ class _Plan:
 
     @property
     def alone(self) -> bool:
-        """Whether nothing runs beside it: it measures times that are checked, as the quick run does not."""
+        """Whether to run it alone because times are checked, which the quick run does not do."""
         return self.experiment.alone and not self.context.quick
 
 
 def _plan(experiment: Experiment, folder: Path, *, quick: bool, seed: int) -> _Plan:
     parameters: Parameters | None = experiment.quick if quick else experiment.full
     if parameters is None:
-        raise ReproduceError(f"reproduce: {experiment.name} has no quick form; leave out --quick")
+        raise ReproduceError(f"reproduce: {experiment.name} has no quick form; run it without --quick")
     context = Context(
         folder / experiment.name, folder / "databases", experiment.name, seed, parameters, quick
     )
@@ -87,12 +87,12 @@ def _plan(experiment: Experiment, folder: Path, *, quick: bool, seed: int) -> _P
 
 
 def _processor_time() -> float:
-    """Processor time of this process and of those it has waited for, seconds."""
+    """Processor time of this process and of the children it has waited for, seconds."""
     return sum(os.times()[:4])
 
 
 def _run_part(plan: _Plan, part: Part) -> tuple[str, float]:
-    """Compute a part and keep it; returns the experiment's name and the processor time it took, seconds."""
+    """Compute and store a part; return the name of the experiment and the processor time, seconds."""
     start = _processor_time()
     results = plan.experiment.work(plan.context, part)
     seconds = _processor_time() - start
@@ -108,15 +108,15 @@ def _load_part(path: Path) -> tuple[Results, float]:
     return results, float(results.pop("seconds_"))
 
 
-def _finished_before(plan: _Plan) -> Finished | None:
-    """The outcome in the experiment's folder, if it belongs to these parameters and all its files are there."""
+def _stored_outcome(plan: _Plan) -> FinishedExperiment | None:
+    """Return the stored outcome, if it is for the same parameters and all its files exist."""
     stored = _read_outcome(plan.context.folder)
     if stored is None or stored["fingerprint"] != plan.fingerprint:
         return None
     outcome = Outcome.from_dict(stored["outcome"])
     if not all((plan.context.folder / name).exists() for name in outcome.files):
         return None
-    return Finished(plan.experiment, outcome, plan.context.quick, float(stored["seconds"]), 0)
+    return FinishedExperiment(plan.experiment, outcome, plan.context.quick, float(stored["seconds"]), 0)
 
 
 def _read_outcome(folder: Path) -> Mapping[str, Any] | None:
@@ -127,12 +127,12 @@ def _read_outcome(folder: Path) -> Mapping[str, Any] | None:
         return None
     except (OSError, ValueError) as error:
         raise ReproduceError(
-            f"reproduce: {path} cannot be read ({error}); remove it to have it made again"
+            f"reproduce: {path} cannot be read ({error}); remove it to compute it again"
         ) from error
     return stored
 
 
-def _finish(plan: _Plan, computed: int) -> Finished:
+def _finish(plan: _Plan, computed: int) -> FinishedExperiment:
     start = _processor_time()
     results: dict[str, Results] = {}
     seconds = 0.0
@@ -140,7 +140,7 @@ def _finish(plan: _Plan, computed: int) -> Finished:
         results[part.key], spent = _load_part(plan.file(part))
         seconds += spent
     plan.context.folder.mkdir(parents=True, exist_ok=True)
-    # tables and figures are overwritten: an outcome of other parameters no longer belongs to them
+    # tables and figures are overwritten, so an outcome for other parameters is no longer valid
     (plan.context.folder / OUTCOME_FILE).unlink(missing_ok=True)
     outcome = plan.experiment.finish(plan.context, results)
     seconds += _processor_time() - start
@@ -155,7 +155,7 @@ def _finish(plan: _Plan, computed: int) -> Finished:
         ensure_ascii=False,
     )
     write_atomically(plan.context.folder / OUTCOME_FILE, lambda path: path.write_text(text, encoding="utf-8"))
-    return Finished(plan.experiment, outcome, plan.context.quick, seconds, computed)
+    return FinishedExperiment(plan.experiment, outcome, plan.context.quick, seconds, computed)
 
 
 def run(
@@ -166,33 +166,33 @@ def run(
     seed: int = 1,
     jobs: int = 2,
     progress: Progress | None = None,
-) -> list[Finished]:
-    """Run experiments; what is finished in `folder` with the same parameters is taken from there.
+) -> list[FinishedExperiment]:
+    """Run experiments; results in `folder` for the same parameters are reused.
 
     Parameters
     ----------
     experiments
-        Which, in the order of the report.
+        The experiments, in the order of the report.
     folder
-        Where all results go, each experiment into its own folder.
+        Folder for all results, with one subfolder per experiment.
     quick
         Use the quick parameters.
     seed
-        Seed of all chance; results do not depend on `jobs`.
+        Seed of all random numbers; results do not depend on `jobs`.
     jobs
-        Processes. Experiments that measure time run afterwards, one at a time, unless `quick`.
+        Number of processes. Experiments that measure time run afterwards, one at a time, unless `quick`.
     progress
-        Called with every part that ends.
+        Called whenever a part is finished.
 
     Raises
     ------
     ReproduceError
-        If a stored result cannot be read or an experiment has no quick form.
+        A stored result cannot be read, or an experiment has no quick form.
     """
     from joblib import Parallel, delayed
 
     plans = [_plan(experiment, folder, quick=quick, seed=seed) for experiment in experiments]
-    finished = {plan.experiment.name: _finished_before(plan) for plan in plans}
+    finished = {plan.experiment.name: _stored_outcome(plan) for plan in plans}
     open_plans = [plan for plan in plans if finished[plan.experiment.name] is None]
     todo = [(plan, part) for plan in open_plans for part in plan.parts if not plan.file(part).exists()]
     missing = {plan.experiment.name: 0 for plan in open_plans}
@@ -222,13 +222,15 @@ def run(
     return [result for plan in plans if (result := finished[plan.experiment.name]) is not None]
 
 
-def finished_in(folder: Path, experiments: Sequence[Experiment], *, quick: bool, seed: int) -> list[Finished]:
-    """Experiments of which a folder holds an outcome for these parameters and this seed; nothing is computed."""
+def finished_in(
+    folder: Path, experiments: Sequence[Experiment], *, quick: bool, seed: int
+) -> list[FinishedExperiment]:
+    """Load the outcomes stored in a folder for these parameters and this seed; compute nothing."""
     found = []
     for experiment in experiments:
         if quick and experiment.quick is None:
             continue
-        stored = _finished_before(_plan(experiment, folder, quick=quick, seed=seed))
+        stored = _stored_outcome(_plan(experiment, folder, quick=quick, seed=seed))
         if stored is not None:
             found.append(stored)
     return found

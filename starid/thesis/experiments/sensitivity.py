@@ -1,4 +1,4 @@
-"""How much hangs on each parameter, which chapter 7 of the thesis asks for: κ, λ, Γ_min, K, ε and min_samples."""
+"""Sensitivity to the parameters κ, λ, Γ_min, K, ε and min_samples, as chapter 7 of the thesis suggests."""
 
 from __future__ import annotations
 
@@ -36,11 +36,13 @@ _OVERLAP: Final = 0.995
 _TAU: Final = 0.5
 _SHOWN_LAMBDAS: Final = (0.05, 0.25, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
 
-_NOTE: Final = """One parameter at a time, the others as the thesis has them; the frames are those of figure 6.1, moved off the grid. **κ** sets the
-number of stars: more stars make the features smoother and the places more alike. **λ** fixed, instead of the one of least error: as the
-author ran it a greater one mixes more of the neighbours in. **Γ_min**: the side of the region of search about a place that is 0.5°
-off. **K**: how many answers of LSI K·τ would call invalid, and how many of those left are more than 1° off. **ε, min_samples**: precision
-and recall of the filter on the seven stars with three false ones, at noise factor 1. The overlap p has its own experiment, `lsi-accuracy`."""
+_NOTE: Final = """One parameter is varied at a time, the others are as in the thesis; the frames are those of
+figure 6.1, moved off the grid. **κ** sets the number of stars: with more stars the features are smoother and
+positions more alike. **λ** is fixed instead of chosen for the least error; as the author ran it, a larger one
+mixes in more of the neighbours. **Γ_min**: the side of the search region about a position that is 0.5° off.
+**K**: how many answers of LSI K·τ would make invalid, and how many of the others are more than 1° off. **ε,
+min_samples**: precision and recall of the filter on the seven stars with three false ones, at noise factor 1.
+The overlap p has a separate experiment, `lsi-accuracy`."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -151,7 +153,7 @@ def _line(
     author: float,
     printed: float = math.nan,
 ) -> Row:
-    """A row of the report that goes into the table as well."""
+    """Make a row of the report and add it to the table."""
     lines.append((parameter, value, measure, author, printed))
     return shown(
         f"{parameter} = {value:g}: {measure}",

@@ -1,4 +1,4 @@
-"""What the thesis does not have: LSI and RSI on the sphere, on what a real sensor sees, with random attitudes."""
+"""Beyond the thesis: LSI and RSI on the sphere, with random attitudes, on what a real sensor sees."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _identifier(name: str) -> Any:
 def points(
     rng: np.random.Generator, camera: Any, catalog: Any, attitude: Attitude, noise: Mapping[str, Any]
 ) -> tuple[Any, Any]:
-    """Positions and fluxes of the stars that a sensor with a limit of 6 mag sees, with noise and false stars."""
+    """Positions and fluxes of the stars that a sensor sees to 6 mag, with noise and false stars."""
     stars = catalog.brighter_than(_LIMIT + 0.8)
     xy, inside = camera.project(attitude.to_sensor(stars.vectors))
     magnitude = stars.v + rng.normal(0.0, 1.0, len(stars)) * noise["magnitude"]
@@ -79,7 +79,7 @@ def _work(context: Context, part: Part) -> Results:
     count = int(context.parameters["frames"])
     numbers = np.full((count, len(_COLUMNS)), np.nan)
     attitude = random_attitude(rng)
-    # this process may have done other parts with it
+    # this process may have used it for other parts
     identifier.reset()
     predicted: Attitude | None = None
     for i in range(count):
@@ -107,7 +107,7 @@ def _work(context: Context, part: Part) -> Results:
     return {"numbers": numbers}
 
 
-def _words(noise: Mapping[str, Any]) -> str:
+def _label(noise: Mapping[str, Any]) -> str:
     return f"σ {noise['magnitude']:g} mag, {noise['position']:g} px, {noise['false']} false stars"
 
 
@@ -115,7 +115,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     rows = []
     for part in _parts(context.parameters):
         found = dict(zip(_COLUMNS, results[part.key]["numbers"].T, strict=True))
-        name, words = part.values["algorithm"].upper(), _words(part.values["noise"])
+        name, words = part.values["algorithm"].upper(), _label(part.values["noise"])
         valid = found["valid"] > 0.0
         errors = found["cross_arcsec"][valid]
         if name == "LSI":
@@ -151,19 +151,20 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     return rows
 
 
-_NOTE: Final = """Camera of 42° on 937 pixels, stars to 6 mag, random attitudes (LSI) or a slew of 0.6° a frame from a random one
-(RSI), positions and fluxes without images. Features of the stars to 5.1 mag in the inscribed circle, cells 0.42° apart over
-the whole sphere, 234 095 of them. The thesis's own answer, one nearest neighbour and LASSO, is right in few frames: noise of
-0.1 mag already carries several stars across the brightness limit, and each of them moves all five features. As an order in
-which to try cells the features still do well: among the candidates that they put first, the stars themselves vote for a roll,
-are paired, and the attitude is verified. What is not verified is invalid; none may be wrong."""
+_NOTE: Final = """Camera of 42° on 937 pixels, stars to 6 mag, random attitudes (LSI) or a slew of 0.6° per
+frame from a random attitude (RSI); positions and fluxes, without images. The features use the stars to 5.1
+mag in the inscribed circle; there are 234 095 cells, 0.42° apart over the whole sphere. The thesis's own
+answer, from one nearest neighbour and LASSO, is right in few frames: noise of 0.1 mag already carries several
+stars across the brightness limit, and each changes all five features. The features are still useful to order
+the cells: for the best candidates the stars themselves vote for a roll and are paired, and the attitude is
+verified. An attitude that is not verified is invalid; none may be wrong."""
 
 
 def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines = [
         {
             "algorithm": part.values["algorithm"],
-            "noise": _words(part.values["noise"]),
+            "noise": _label(part.values["noise"]),
             **dict(zip(_COLUMNS, numbers, strict=True)),
         }
         for part in _parts(context.parameters)

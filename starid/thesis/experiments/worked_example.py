@@ -50,7 +50,7 @@ _OMEGA: Final = {
 }
 _BORESIGHT: Final = {"mse": (94.88, -84.85), "one_se": (94.86, -84.81)}
 _ERROR: Final = {"mse": 0.1983, "one_se": 0.2347}
-_WORDS: Final = {"mse": "MSE", "one_se": "1SE"}
+_LABELS: Final = {"mse": "MSE", "one_se": "1SE"}
 _HALF_DIGIT: Final = 0.0051
 _PERCENT, _WIDER_PERCENT = 96.0, 98.0
 
@@ -61,19 +61,21 @@ _PSI: Final = {
 """Reconstructed features n, A, r, σ_A, σ_r and θ."""
 _EPSILON: Final = {"mse": 2.69, "one_se": 4.13}
 _LAMBDA: Final = {"mse": 1.00, "one_se": 1.40}
-"""Of the λ of eq. 2.34 those whose weights are nearest to the printed ones."""
+"""The λ of eq. 2.34 whose weights are nearest to the printed ones."""
 _TURN: Final = 3.6
-"""Degrees of the polar angle to one unit of the normalised scale."""
+"""Degrees of polar angle per unit of the normalised scale."""
 
-_NOTE: Final = """Frame with lower-left corner (95°, −85°), κ = 11.5, p = 96 %. The printed features come out when brightness is the Hp
-magnitude, stars *fainter* than κ are kept, the frame is 40° wide (the text says 42°), the frame object is the mean
-weighted with a − min(a), the magnitudes counted from the brightest star of the catalogue (eq. 2.5 prints a division by n), and the
-deviations are roots of variances over n − 1 (eqs 2.6 and 2.8 print variances over n). The normalisation printed with eq. 5.1 is that of
-the database of p = 98 %; the example itself goes on with that of 96 %. From there the author's program was MATLAB's `lasso` on *six* features,
-the polar angle as θ/3.6 among them. The printed ω is ω/Σω, with which the boresight is F·ω, while the printed features T·ω are those of
-ω itself, brought back to their units. Which λ a cross-validation took is not known, as its folds are random: the printed weights, and within
-a few units of their last digit the printed reconstructions, are those of λ = 1.00 and 1.40. "As printed" is eq. 2.34 on five features, solved
-exactly, at the λ of the least error."""
+_NOTE: Final = """Frame with lower-left corner (95°, −85°), κ = 11.5, p = 96 %. The printed features are
+reproduced if brightness is the Hp magnitude, stars *fainter* than κ are kept, the frame is 40° wide (the text
+says 42°), the frame object is the mean weighted with a − min(a), with magnitudes relative to the brightest
+star of the catalogue (eq. 2.5 is printed with a division by n), and the deviations are square roots of
+variances over n − 1 (eqs 2.6 and 2.8 are printed as variances over n). The normalisation printed with eq. 5.1
+belongs to the database of p = 98 %; the example itself continues with p = 96 %. From there the author's
+program was MATLAB's `lasso` with *six* features, including the polar angle as θ/3.6. The printed ω is ω/Σω,
+with which the boresight is F·ω, while the printed features T·ω use ω itself and are converted back to their
+units. Which λ the cross-validation chose is not known, because its folds are random: the printed weights and,
+within a few units of their last digit, the printed reconstructions belong to λ = 1.00 and 1.40. "As printed"
+is eq. 2.34 with five features, solved exactly, at the λ of the least error."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -81,7 +83,7 @@ def _parts(parameters: Parameters) -> list[Part]:
 
 
 def _author(context: Context) -> Results:
-    """The example as the author ran it: weights counted from the brightest star, six features, MATLAB's `lasso`."""
+    """The author's version: weights relative to the brightest star, six features, MATLAB's `lasso`."""
     from starid.thesis.lasso import LAMBDAS
     from starid.thesis.lsi import LostInSpace
     from starid.thesis.matlab_lasso import matlab_path
@@ -172,7 +174,7 @@ def _numbers(
     unit: str = "",
     remark: str = "",
 ) -> Row:
-    """A row for a list of published numbers, each of which is to agree to its last digit."""
+    """Make a row for a list of published numbers, each of which must agree to its last digit."""
     tolerance = 0.51 * 10.0**-digits
     return same(
         quantity,
@@ -186,7 +188,7 @@ def _numbers(
 
 
 def _estimate_rows(result: Results, kind: str) -> list[Row]:
-    word = _WORDS[kind]
+    word = _LABELS[kind]
     printed = result[f"boresight_{kind}"] - HALF_FRAME_DEG
     author = result[f"author_boresight_{kind}"] - HALF_FRAME_DEG
     fine = result["fine"] - HALF_FRAME_DEG
@@ -228,7 +230,7 @@ def _estimate_rows(result: Results, kind: str) -> list[Row]:
             **errors,
             unit="°",
             digits=4,
-            remark="To two digits; the printed four ask for a λ to three.",
+            remark="To two digits; the printed four digits would require three digits of λ.",
         ),
         improvement(
             f"error of the estimate ε_f ({word}), sub-cell search of the whole database",
@@ -274,9 +276,9 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
             printed=str(int(result["nearest"]) + 1),
             matches=[int(result["author_nearest"]) + 1 == _NEAREST],
             target="the same",
-            remark=f"As the author ran it with the polar angle as a sixth feature. In five features ours lies at distance "
-            f"{float(result['distance']):.2f}, {_NEAREST} at {result['distances'][4]:.2f}; by the printed vectors, too, others are nearer. "
-            "The rows below go on from 735, as the thesis does.",
+            remark=f"As the author ran it with the polar angle as a sixth feature. In five features ours is at distance "
+            f"{float(result['distance']):.2f}, {_NEAREST} at {result['distances'][4]:.2f}; by the printed vectors others are nearer too. "
+            "The rows below continue from 735, as the thesis does.",
         ),
         same(
             "cells of the dictionary",
@@ -308,7 +310,7 @@ def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
 
 
 def _draw(context: Context, result: Results) -> str:
-    """The dictionary as figure 5.1 has it: corners, features and weights of the nine cells."""
+    """Draw the dictionary as in figure 5.1: corners, features and weights of the nine cells."""
     fig, axis = figure(width=7.5, height=5.4)
     corners = result["centres"] - HALF_FRAME_DEG
     axis.scatter(corners[:, 0], corners[:, 1], s=20 + 900 * np.abs(result["author_omega_mse"]), alpha=0.5)

@@ -1,4 +1,4 @@
-"""What the published algorithms share, against brute force and against theory."""
+"""Shared parts of the published algorithms, against brute force and theory."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_pair_ranges_match_a_scan_of_all_pairs() -> None:
         assert inside[start:end].all()
 
 
-def test_a_pair_table_of_equal_distances_or_none_is_searched_too() -> None:
+def test_pair_ranges_of_equal_distances_or_none() -> None:
     axes = np.eye(3)
     table = pair_table(axes, 1.5)
     assert pairs_within(table, 1.41, 1.42) == (0, 3)
@@ -45,13 +45,13 @@ def test_a_pair_table_of_equal_distances_or_none_is_searched_too() -> None:
     assert pairs_within(pair_table(axes, 0.1), 0.0, 1.0) == (0, 0)
 
 
-def test_more_stars_than_16_bits_can_name_are_rejected() -> None:
+def test_more_stars_than_fit_16_bits_are_rejected() -> None:
     with pytest.raises(StaridError, match="brighter limit"):
         pair_table(np.zeros((MAX_STARS + 1, 3)), 0.1)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_neighbours_are_the_same_after_a_turn_but_for_one_angle(seed: int) -> None:
+def test_neighbours_differ_by_one_angle_after_a_rotation(seed: int) -> None:
     vectors = sky(300, seed)
     if seed == 0:
         vectors[0] = [0.0, 0.0, 1.0]
@@ -71,7 +71,7 @@ def test_neighbours_are_the_same_after_a_turn_but_for_one_angle(seed: int) -> No
     assert math.isclose(math.remainder(polar[1, 1] - polar[0, 1] - angle, math.tau), 0.0, abs_tol=1e-9)
 
 
-def test_the_largest_group_is_the_true_one_among_wrong_matches() -> None:
+def test_the_largest_group_has_the_true_matches() -> None:
     stars = sky(50, 5)
     turn = Rotation.random(random_state=1)
     seen = turn.apply(stars[:8])
@@ -82,7 +82,7 @@ def test_the_largest_group_is_the_true_one_among_wrong_matches() -> None:
     assert np.array_equal(group, true)
 
 
-def test_a_mirrored_group_or_a_pair_is_no_group() -> None:
+def test_mirrored_groups_and_pairs_are_rejected() -> None:
     stars = sky(6, 8)
     rows = np.column_stack([np.arange(6), np.arange(6)])
     assert len(largest_group(stars * [-1.0, 1.0, 1.0], stars, rows, 1e-6)) == 0
@@ -90,7 +90,7 @@ def test_a_mirrored_group_or_a_pair_is_no_group() -> None:
     assert len(largest_group(stars, stars, rows[:3], 1e-6)) == 3
 
 
-def test_singular_values_and_their_attitude_follow_a_turn() -> None:
+def test_singular_values_are_invariant_and_give_the_rotation() -> None:
     stars = sky(5, 4) * 0.2 + [0.0, 0.0, 1.0]
     stars /= np.linalg.norm(stars, axis=1, keepdims=True)
     turn = Rotation.random(random_state=9)
@@ -98,7 +98,7 @@ def test_singular_values_and_their_attitude_follow_a_turn() -> None:
     assert np.allclose(found, turn.as_matrix(), atol=1e-9)
 
 
-def test_oriented_triangles_tell_a_triangle_from_its_mirror_image() -> None:
+def test_oriented_triangles_distinguish_mirror_images() -> None:
     stars = sky(3, 11)
     corners = np.array([[2, 0, 1], [0, 1, 2]])
     one = oriented_svd.oriented_triangles(stars, corners)
@@ -111,15 +111,15 @@ def test_oriented_triangles_tell_a_triangle_from_its_mirror_image() -> None:
 
 
 @pytest.mark.parametrize("alike", [True, False])
-def test_a_grid_pattern_holds_each_cell_once_and_the_alignment_star_on_the_axis(alike: bool) -> None:
+def test_a_grid_pattern_has_each_cell_once_and_the_alignment_star_on_the_axis(alike: bool) -> None:
     vectors = sky(400, 21)
     polar, rows = neighbour_list(vectors, 7, 0.5)
     beyond = polar[:, 0] > 0.05
     magnitude = np.zeros(400)
-    if not alike:  # the nearest one is the faintest of all
+    if not alike:  # the nearest star is the faintest
         magnitude = np.random.default_rng(4).random(400)
         magnitude[rows[np.argmax(beyond)]] = 2.0
-    start, owner = grid.look_up_table(vectors, magnitude, 0.5, 0.05)
+    start, owner = grid.lookup_table(vectors, magnitude, 0.5, 0.05)
     aligned = int(np.argmax(beyond & (magnitude[rows] <= np.median(magnitude[rows]))))
     angle = (polar[:, 1] - polar[aligned, 1]) % math.tau
     half = grid.GRID / 2
@@ -132,7 +132,7 @@ def test_a_grid_pattern_holds_each_cell_once_and_the_alignment_star_on_the_axis(
     assert len(owner) == start[-1]
 
 
-def test_log_polar_strings_shift_as_the_sky_turns() -> None:
+def test_log_polar_strings_shift_with_roll() -> None:
     vectors = sky(400, 31)
     turned = np.ascontiguousarray(Rotation.random(random_state=3).apply(vectors))
     one, other = _strings(vectors, 0.5)[5], _strings(turned, 0.5)[5]
@@ -140,7 +140,7 @@ def test_log_polar_strings_shift_as_the_sky_turns() -> None:
         sum(1 for a, b in zip(np.roll(one, shift), other, strict=True) if a and abs(int(a) - int(b)) <= 1)
         for shift in range(len(one))
     )
-    # a turn by part of a sector moves some stars into the next
+    # a rotation by part of a sector moves some stars into the next
     assert best >= 0.3 * np.count_nonzero(one)
     assert np.array_equal(one, _strings(vectors, 0.5)[5])
 

@@ -1,4 +1,4 @@
-"""The published algorithms: one table of what each must identify, and what none may do."""
+"""The published algorithms: required identification rates, and no wrong verified answers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.classic.solver import ClassicIdentifier
 from starid.errors import StaridError
-from starid.geometric.pattern_index import seen_stars
+from starid.geometric.pattern_index import resolved_stars
 from starid.interface import CLASSICS, StarIdentifier, make_identifier
 from starid.solution import Reason
 
@@ -36,9 +36,9 @@ CORNERS = [
 
 @dataclass(frozen=True)
 class Rates:
-    """Shares that an algorithm must identify, %: clean, with position noise of 1 px, five false stars, three missing.
+    """Required identification rates, %: clean, position noise of 1 px, five false stars, three missing.
 
-    `published` is what its paper, or the thesis for it, states without noise or for the noise in the comment, None where neither does.
+    `published` is the rate in its paper or the thesis, without noise or for the noise in the comment, if any.
     """
 
     clean: float
@@ -68,7 +68,7 @@ TABLE = {
 
 @cache
 def stars():
-    return seen_stars(load_catalog(), LIMIT, 2.0 * CAMERA.pixel_scale_rad)
+    return resolved_stars(load_catalog(), LIMIT, 2.0 * CAMERA.pixel_scale_rad)
 
 
 @cache
@@ -79,7 +79,7 @@ def solver(name: str, *, verify: bool) -> ClassicIdentifier:
 
 
 def scene(attitude, rng, *, sigma=0.0, false=0, missing=0):
-    """Positions, fluxes and errors of the stars in the field, V at least that of the table."""
+    """Positions, fluxes and errors of the stars in the field."""
     xy, inside = CAMERA.project(attitude.to_sensor(stars().vectors))
     xy, magnitudes = xy[inside], stars().v[inside]
     lost = rng.choice(min(20, len(xy)), missing, replace=False)
@@ -92,7 +92,7 @@ def scene(attitude, rng, *, sigma=0.0, false=0, missing=0):
 
 
 def least_number(rate: float, frames: int) -> int:
-    """Hits that a solver of this rate falls short of in one of a thousand samples (binomial)."""
+    """Number of hits that a solver with this rate misses in one of a thousand samples (binomial)."""
     p, tail = rate / 100.0, 0.0
     for hits in range(frames + 1):
         tail += math.comb(frames, hits) * p**hits * (1.0 - p) ** (frames - hits)
@@ -102,7 +102,7 @@ def least_number(rate: float, frames: int) -> int:
 
 
 def counted(identifier, attitudes, seed, **options) -> tuple[int, int]:
-    """Right and wrong answers."""
+    """Count right and wrong answers."""
     rng = np.random.default_rng(seed)
     right = wrong = 0
     for attitude in attitudes:
@@ -119,7 +119,7 @@ def attitudes(seed: int) -> list[Attitude]:
     return [*CORNERS, *(random_attitude(rng) for _ in range(FRAMES - len(CORNERS)))]
 
 
-def test_every_algorithm_has_its_row() -> None:
+def test_every_algorithm_is_in_the_table() -> None:
     assert set(TABLE) == set(CLASSICS)
 
 
@@ -133,7 +133,7 @@ def test_every_algorithm_has_its_row() -> None:
         ("missing", {"sigma": 0.5, "missing": 3}),
     ],
 )
-def test_raw_answers_reach_the_rate(name: str, case: str, options: dict[str, float]) -> None:
+def test_raw_answers_reach_the_required_rate(name: str, case: str, options: dict[str, float]) -> None:
     rates = TABLE[name]
     right, _ = counted(solver(name, verify=False), attitudes(3), 5, **options)
     assert right >= least_number(getattr(rates, case), FRAMES)
@@ -191,7 +191,7 @@ def test_every_algorithm_is_an_identifier_with_a_database(name: str) -> None:
     assert made.track(xy, flux, CORNERS[3]).valid
 
 
-def test_bad_options_are_named() -> None:
+def test_bad_options_are_rejected_by_name() -> None:
     with pytest.raises(StaridError, match="tolerance_px"):
         make_identifier("pyramid", CAMERA, tolerance_px=-1.0)
     with pytest.raises(StaridError, match="limiting_magnitude"):

@@ -11,7 +11,7 @@ from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
 from starid.geometric.identifier import Identifier
-from starid.geometric.pattern_index import seen_stars
+from starid.geometric.pattern_index import resolved_stars
 
 WRONG_ARCSEC = 360.0
 
@@ -24,7 +24,7 @@ def identifier() -> Identifier:
 @functools.cache
 def maker() -> SceneMaker:
     camera = DEFAULT_CAMERA
-    return SceneMaker(camera, seen_stars(load_catalog(), 6.0, 2.0 * camera.pixel_scale_rad))
+    return SceneMaker(camera, resolved_stars(load_catalog(), 6.0, 2.0 * camera.pixel_scale_rad))
 
 
 def scenes(settings: SceneSettings, count: int, seed: int) -> list[Scene]:

@@ -1,4 +1,4 @@
-"""The identifier everywhere in the sky, for narrow and wide fields, known and unknown focal lengths."""
+"""The identifier over the whole sky, in narrow and wide fields, with known and unknown focal length."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_random_points_are_rejected_at_an_unknown_focal_length_too() -> None:
         assert not asked.identify(points, 10.0 ** rng.uniform(0.0, 1.5, n)).valid
 
 
-def test_a_refined_camera_is_taken_as_known() -> None:
+def test_a_refined_camera_is_used_as_calibrated() -> None:
     nominal = Camera.from_fov(25.0, 1024, 1024)
     camera = scaled_camera(nominal, 1.04)
     asked = Identifier(nominal, fov_tolerance=0.1)

@@ -1,4 +1,4 @@
-"""What the identifier does with input that is bad, too little or odd."""
+"""Bad, insufficient and unusual input of the identifier."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_bad_arrays_are_rejected_in_one_line(xy: object, flux: object, sigma: ob
         (2, lambda xy, flux: identifier().track(xy, flux, AT, np.full(len(flux), 0.3))),
     ],
 )
-def test_too_few_detections_are_named(least: int, ask: Callable[..., Solution]) -> None:
+def test_too_few_detections_are_reported(least: int, ask: Callable[..., Solution]) -> None:
     xy, flux, _ = sky(AT)
     for count in range(least):
         solution = ask(xy[:count], flux[:count])
@@ -68,12 +68,12 @@ def test_too_few_detections_are_named(least: int, ask: Callable[..., Solution]) 
     assert ask(xy[:least], flux[:least]).reason is not Reason.TOO_FEW_STARS
 
 
-def test_no_detections_may_come_as_an_empty_list() -> None:
+def test_an_empty_list_means_no_detections() -> None:
     assert identifier().identify([], []).reason is Reason.TOO_FEW_STARS
 
 
 @pytest.mark.parametrize("count", [4, 30, 200])
-def test_all_detections_in_one_place_are_no_star_field(count: int) -> None:
+def test_coincident_detections_are_not_identified(count: int) -> None:
     solution = identifier().identify(np.full((count, 2), 300.0), np.ones(count))
     assert (solution.valid, solution.reason) == (False, Reason.NO_MATCH)
 
@@ -95,7 +95,7 @@ def test_detections_without_flux_count_as_faintest() -> None:
     assert not set(solution.detection_index.tolist()) & set(np.flatnonzero(dark <= 0.0).tolist())
 
 
-def test_input_is_left_as_it_was() -> None:
+def test_input_arrays_are_not_modified() -> None:
     xy, flux, _ = sky(AT)
     before = xy.copy(), flux.copy()
     identifier().identify(xy, flux)
@@ -103,7 +103,7 @@ def test_input_is_left_as_it_was() -> None:
     assert (flux == before[1]).all()
 
 
-def test_single_precision_lists_and_strided_arrays_are_taken() -> None:
+def test_single_precision_lists_and_strided_arrays_are_accepted() -> None:
     xy, flux, _ = sky(AT)
     expected = identifier().identify(xy, flux).quaternion_xyzw
     strided = np.zeros((len(xy), 6))
@@ -132,19 +132,19 @@ def test_a_tolerance_of_the_field_must_be_in_range(tolerance: float) -> None:
     [{"tolerance_px": 0.0}, {"max_triangles": -1}, {"window_px": NAN}, {"max_false_probability": INF},
      {"part_stars": -1}, {"part_stars": 31}],
 )  # fmt: skip
-def test_an_effort_out_of_range_is_named(change: dict[str, float]) -> None:
+def test_an_effort_out_of_range_is_rejected_by_name(change: dict[str, float]) -> None:
     with pytest.raises(StaridError, match=next(iter(change))):
         Effort(**change)
 
 
 @pytest.mark.parametrize("limit", [None, 6.0])
-def test_a_catalogue_without_a_star_is_rejected(limit: float | None) -> None:
+def test_a_catalogue_without_stars_is_rejected(limit: float | None) -> None:
     with pytest.raises(StaridError, match="identifier catalog: contains no stars"):
         Identifier(catalog=load_catalog().brighter_than(-5.0), limiting_magnitude=limit, cache=False)
 
 
 @pytest.mark.parametrize("model", ["pinhole", "equidistant", "flat"])
-def test_a_position_far_outside_the_image_is_only_a_false_star(model: Model) -> None:
+def test_a_position_far_outside_the_image_counts_as_a_false_star(model: Model) -> None:
     camera = Camera.from_fov(42.0, model=model)
     stars = load_catalog().brighter_than(5.5)
     xy, inside = camera.project(AT.to_sensor(stars.vectors))
@@ -160,6 +160,6 @@ def test_a_camera_of_another_size_is_rejected() -> None:
         identifier().with_camera(Camera.from_fov(42.0, 640, 480))
 
 
-def test_a_solution_cannot_be_valid_and_have_a_reason_against_it() -> None:
+def test_a_valid_solution_cannot_have_a_reason_for_being_invalid() -> None:
     with pytest.raises(StaridError, match="no_match"):
         Solution(valid=True, reason=Reason.NO_MATCH)

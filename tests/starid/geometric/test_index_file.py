@@ -1,4 +1,4 @@
-"""The index on disk: mapped again, and built again where it is damaged or of another index."""
+"""The index on disk: mapped, and built again if it is damaged or belongs to another index."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_index_is_written_once_and_is_small(stored: Path) -> None:
     assert stored.stat().st_size < MAX_BYTES
 
 
-def test_arrays_come_back_as_they_were_and_cannot_be_written(stored: Path) -> None:
+def test_arrays_are_loaded_unchanged_and_read_only(stored: Path) -> None:
     mapped = index_file.load(stored, key_of(stored))
     assert mapped is not None
     again = index_file.unpack(index_file.pack(mapped, "k"), "k")
@@ -53,16 +53,16 @@ def test_arrays_come_back_as_they_were_and_cannot_be_written(stored: Path) -> No
     [
         (lambda b: b[:0], "empty file"),
         (lambda b: b"GIF89a" + b[6:], "not an index file"),
-        (lambda b: b[:40], "header cut off"),
+        (lambda b: b[:40], "header is truncated"),
         (lambda b: b[: len(b) // 2], "checksum"),
         (lambda b: b[:-1], "checksum"),
         (lambda b: b[: len(b) - 1000] + bytes([b[-1000] ^ 1]) + b[len(b) - 999 :], "checksum"),
         (lambda b: b.replace(b'"key"', b'"kei"', 1), "key"),
-        (lambda b: b[:8] + (1 << 62).to_bytes(8, "little") + b[16:], "header cut off"),
+        (lambda b: b[:8] + (1 << 62).to_bytes(8, "little") + b[16:], "header is truncated"),
     ],
     ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length"],
 )
-def test_damaged_file_is_named_and_built_anew(
+def test_a_damaged_file_is_reported_and_built_again(
     stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage, message: str
 ) -> None:
     good = stored.read_bytes()
@@ -78,17 +78,13 @@ def test_damaged_file_is_named_and_built_anew(
     assert identifier.identify(xy, flux).valid
 
 
-def test_an_index_of_another_camera_under_this_name_is_not_believed(
-    stored: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_index_of_another_camera_is_not_used(stored: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         assert index_file.load(stored, "another") is None
     assert "made for another" in caplog.text
 
 
-def test_a_folder_that_cannot_be_written_costs_only_the_file(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_unwritable_folder_only_prevents_caching(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     blocked = tmp_path / "file"
     blocked.write_text("in the way")
     with caplog.at_level(logging.WARNING):

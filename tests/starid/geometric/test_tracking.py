@@ -37,7 +37,7 @@ def test_a_prediction_within_the_window_is_followed(offset_px: tuple[float, floa
 
 
 @pytest.mark.parametrize("off_deg", [5.0, 90.0, 180.0])
-def test_a_prediction_elsewhere_is_lost(off_deg: float) -> None:
+def test_a_prediction_outside_the_window_is_invalid(off_deg: float) -> None:
     xy, flux, _ = sky(AT)
     solution = identifier().track(xy, flux, AT.rotated([math.radians(off_deg), 0.0, 0.0]))
     assert (solution.valid, solution.reason) == (False, Reason.PREDICTION_LOST)
@@ -59,7 +59,7 @@ def test_random_points_are_not_tracked() -> None:
         assert not identifier().track(points, flux, random_attitude(rng)).valid
 
 
-def test_verifying_asks_more_than_tracking() -> None:
+def test_verification_requires_more_than_tracking() -> None:
     xy, flux, _ = sky(AT)
     tracked = identifier().track(xy, flux, AT, window_px=12.0)
     verified = identifier().verify(xy, flux, AT, window_px=12.0)
@@ -73,7 +73,7 @@ def test_verifying_asks_more_than_tracking() -> None:
     assert not strict.verify(*few, window_px=12.0).valid
 
 
-def test_outliers_are_dropped() -> None:
+def test_outliers_are_rejected() -> None:
     xy, flux, hip = sky(AT, sigma_px=0.1)
     rng = np.random.default_rng(4)
     spoiled = xy.copy()
@@ -84,7 +84,7 @@ def test_outliers_are_dropped() -> None:
     assert not np.isin(solution.detection_index[right], np.arange(5)).any()
 
 
-def test_an_outlier_among_few_stars_is_dropped() -> None:
+def test_an_outlier_among_few_stars_is_rejected() -> None:
     xy, flux, _ = sky(AT, limit=3.6, sigma_px=0.1)
     spoiled = xy[:14].copy()
     spoiled[3] += 2.5
@@ -93,7 +93,7 @@ def test_an_outlier_among_few_stars_is_dropped() -> None:
     assert 3 not in solution.detection_index
 
 
-def test_tracker_knows_the_rate_and_follows() -> None:
+def test_tracker_estimates_the_rate_and_follows() -> None:
     tracker = Tracker(identifier())
     attitude = AT
     modes = []
@@ -107,7 +107,7 @@ def test_tracker_knows_the_rate_and_follows() -> None:
     assert tracker.rate_rad_s == pytest.approx(RATE, abs=5e-4)
 
 
-def test_tracker_falls_back_to_lost_in_space_and_takes_up_the_track_again() -> None:
+def test_tracker_falls_back_to_lost_in_space_and_resumes_tracking() -> None:
     tracker = Tracker(identifier())
     jumped = AT.rotated([0.0, 1.0, 0.3])
     modes = []
@@ -115,7 +115,7 @@ def test_tracker_falls_back_to_lost_in_space_and_takes_up_the_track_again() -> N
         solution = tracker.update(*sky(attitude, i)[:2], float(i))
         assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
         modes.append(solution.mode)
-    # the jump also spoils the rate, which costs one more frame
+    # the jump also affects the rate, which costs one more frame
     assert modes == ["lost_in_space", "tracking", "lost_in_space", "lost_in_space", "tracking"]
 
 
@@ -141,7 +141,7 @@ def test_tracker_forgets_after_the_longest_gap_and_on_reset() -> None:
     assert tracker.predict(1.0) is None
 
 
-def test_tracker_takes_a_rate_from_elsewhere() -> None:
+def test_tracker_accepts_a_rate_from_another_source() -> None:
     tracker = Tracker(identifier())
     tracker.update(*sky(AT, 1)[:2], 0.0)
     turned = propagate(AT, RATE, 4.0)
@@ -150,12 +150,12 @@ def test_tracker_takes_a_rate_from_elsewhere() -> None:
     assert solution.attitude.error_to(turned).total_arcsec < RIGHT_ARCSEC
 
 
-def test_tracker_rejects_a_gap_that_is_none() -> None:
+def test_tracker_rejects_an_invalid_longest_gap() -> None:
     with pytest.raises(StaridError, match="longest_gap_s"):
         Tracker(identifier(), longest_gap_s=0.0)
 
 
-def test_missing_stars_are_named_and_no_others() -> None:
+def test_missing_stars_are_reported_and_no_others() -> None:
     xy, flux, hip = sky(AT, limit=5.5)
     inner = np.flatnonzero((np.minimum(xy, 936.0 - xy) > 20.0).all(axis=1))
     apart = np.linalg.norm(xy[inner, None] - xy, axis=2)
@@ -207,18 +207,18 @@ def test_three_stars_near_a_prediction_are_enough(known: bool) -> None:
     found = tracked(replace(SCENE, kept=3), 3.0, known=known)
     assert sum(solution.valid for solution, _ in found) >= 0.95 * FEW
     right = [off for solution, off in found if solution.valid]
-    # a Student distribution of 3 degrees of freedom has long tails; of 13 it has not
+    # a Student distribution with 3 degrees of freedom has long tails, with 13 it does not
     assert max(right) < (30.0 if not known else 7.0)
     assert all(solution.star_count == 3 for solution, _ in found if solution.valid)
 
 
-def test_two_stars_are_enough_where_errors_and_window_are_small() -> None:
+def test_two_stars_are_enough_if_errors_and_window_are_small() -> None:
     found = tracked(replace(SCENE, sigma_px=0.05, kept=2), 0.3, window_px=2.0)
     assert sum(solution.valid for solution, _ in found) >= 0.5 * FEW
     assert max(off for solution, off in found if solution.valid) < 7.0
 
 
-def test_two_stars_in_a_wide_window_or_of_unknown_error_are_not() -> None:
+def test_two_stars_in_a_wide_window_or_of_unknown_error_are_not_enough() -> None:
     wide = tracked(replace(SCENE, kept=2), 3.0)
     assert not any(solution.valid for solution, _ in wide)
     assert {solution.reason for solution, _ in wide} == {Reason.PREDICTION_LOST}
@@ -237,7 +237,7 @@ def test_false_stars_do_not_make_an_answer_with_one_true_star(
 
 
 @pytest.mark.parametrize(("least", "most", "answered"), [(0.0, 0.05, False), (1.0, 1.2, True)])
-def test_a_pair_that_could_as_well_be_turned_about_is_not_answered(
+def test_a_pair_that_fits_both_ways_round_is_not_identified(
     least: float, most: float, answered: bool
 ) -> None:
     lenient = identifier().with_camera(DEFAULT_CAMERA, effort=Effort(max_false_probability_tracking=1e-3))
@@ -258,7 +258,7 @@ def test_a_pair_that_could_as_well_be_turned_about_is_not_answered(
     assert sum(answers) >= 0.8 * len(answers) if answered else not any(answers)
 
 
-def test_three_stars_of_the_whole_sky_are_not_enough() -> None:
+def test_three_stars_are_not_enough_lost_in_space() -> None:
     scene = maker().scene(replace(SCENE, sigma_px=0.05, kept=3), np.random.default_rng(2))
     errors = np.full(3, 0.05)
     assert identifier().identify(scene.xy_px, scene.flux, errors).reason is Reason.TOO_FEW_STARS
@@ -267,7 +267,7 @@ def test_three_stars_of_the_whole_sky_are_not_enough() -> None:
     assert identifier().track(scene.xy_px, scene.flux, scene.attitude, errors).valid
 
 
-def test_the_narrower_the_window_the_less_can_agree_by_chance() -> None:
+def test_a_narrower_window_lowers_the_probability_of_chance_agreement() -> None:
     scene = maker().scene(replace(SCENE, kept=3), np.random.default_rng(2))
     errors = np.full(3, 0.5)
     bounds = [

@@ -1,4 +1,4 @@
-"""Photographs of the sky by a camera that is no star sensor: more stars than the catalogue has, and other defects."""
+"""Simulated photographs of the sky: more stars than the catalogue has, and the defects of ordinary cameras."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ def photograph(
     quality: int = 0,
     fov_deg: float = FOV_DEG,
 ) -> tuple[NDArray[np.uint8], Attitude, Camera]:
-    """Grey image of 8 bits, the attitude and the camera that took it.
+    """Return an 8-bit grey image, the attitude, and the camera that took it.
 
     Parameters
     ----------
     catalog : StarCatalog
-        The listed stars; half as many again, faint ones, are not in it.
+        The catalogue; the image has half as many faint stars again.
     seed : int
-        Of attitude, unlisted stars, colours and noise.
+        Seed of attitude, unlisted stars, colours and noise.
     distortion : float
-        Displacement at the image's corner as a share of its distance from the centre.
+        Displacement at the corner of the image, as a share of its distance from the centre.
     spot_px : float
         Standard deviation of a star's spot.
     foreground : float
-        Share of the image's height that a hill covers, sharp and grainy.
+        Share of the height of the image covered by a hill, sharp and grainy.
     trail_px : float
-        Length of the stars' trails, in one direction.
+        Length of the star trails, in one direction.
     hot : float
         Share of the pixels that are hot, with any brightness.
     glow : float
-        Peak of the light about a bright body in the field, counts; the body itself saturates.
+        Peak of the glow around a bright body in the field, counts; the body itself is saturated.
     quality : int
-        Of the compression as JPEG, 0 for none.
+        JPEG quality, 0 for no compression.
     fov_deg : float
         Width of the field.
     """

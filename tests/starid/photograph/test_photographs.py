@@ -9,10 +9,10 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
-from starid.geometric.pattern_stars import pick_pattern_stars
+from starid.geometric.pattern_stars import select_pattern_stars
 from starid.photograph import field_sweep, solver
 from starid.photograph.field_sweep import FieldSweep, solve_any_field
-from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_choice
+from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_selection
 from starid.photograph.solver import ImageSolution, solve_image
 from starid.photograph.typical_camera import typical_camera
 from starid.photograph.views import View, has_dark_tail, views
@@ -28,7 +28,7 @@ def sky() -> StarCatalog:
 
 
 def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
-    """Angle between the true and the found direction of the image's centre."""
+    """Angle between the true and the found direction of the centre of the image."""
     middle = np.array([[(WIDTH - 1) / 2, (HEIGHT - 1) / 2]])
     seen = found.solution.attitude.to_icrs(found.camera.back_project(middle))[0]
     true = truth.to_icrs(camera.back_project(middle))[0]
@@ -46,7 +46,7 @@ def centre_error_arcsec(found: ImageSolution, truth, camera: Camera) -> float:
     ],
     ids=["plain", "barrel", "pincushion", "hill", "out of focus"],
 )
-def test_a_photograph_gives_attitude_field_and_distortion(sky, seed, defects) -> None:
+def test_attitude_field_and_distortion_of_a_photograph_are_found(sky, seed, defects) -> None:
     image, truth, camera = photograph(sky, seed, **defects)
     found = solve_image(image, NOMINAL, sky, fov_tolerance=0.1)
     assert found.solution.valid
@@ -66,7 +66,7 @@ def test_negative_and_mirrored_photographs_are_recognised(sky) -> None:
     np.testing.assert_allclose(on_image[:, 0], WIDTH - 1 - mirror.detections.xy_px[:, 0])
 
 
-def test_a_lens_that_cannot_be_calibrated_leaves_the_answer(sky, monkeypatch) -> None:
+def test_a_failed_lens_calibration_keeps_the_solution(sky, monkeypatch) -> None:
     def fail(*_: object, **__: object) -> None:
         raise StaridError("calibration: folds the image")
 
@@ -84,7 +84,7 @@ def test_random_stars_are_not_identified(sky) -> None:
     assert not search.identify(xy, 10.0 ** rng.uniform(0, 2, 100), rounds=[0]).valid
 
 
-def test_a_field_that_is_not_known_is_found_by_trying(sky, monkeypatch) -> None:
+def test_an_unknown_field_is_found_by_trying(sky, monkeypatch) -> None:
     image, truth, camera = photograph(sky, 8)
     monkeypatch.setattr(field_sweep, "FIELDS_DEG", (6.2, 9.3))
     found = solve_any_field(image, sky)
@@ -128,14 +128,14 @@ def test_similar_cameras_share_an_index_with_pixels_no_finer_than_theirs() -> No
     assert typical_camera(Camera.from_fov(120.0, 1000, 1000)) is None
 
 
-def test_an_even_choice_has_the_brightest_of_each_part() -> None:
+def test_an_even_selection_has_the_brightest_of_each_part() -> None:
     rng = np.random.default_rng(9)
     xy = np.concatenate(
         [rng.uniform(0, [WIDTH, HEIGHT], (300, 2)), rng.uniform(0, 40, (300, 2))]
-    )  # half of all crowd in a corner
+    )  # half of all are in one corner
     flux = rng.uniform(1.0, 100.0, 600)
     brightest = np.argsort(-flux)
-    rows = even_choice(xy, brightest, NOMINAL, 2)
+    rows = even_selection(xy, brightest, NOMINAL, 2)
     assert brightest[0] in rows
     assert np.count_nonzero(rows >= 300) <= 2
     assert CELLS < len(rows) <= 2 * CELLS + 40
@@ -153,7 +153,7 @@ def test_a_distorted_lens_keeps_the_width_of_the_field(displacement) -> None:
     assert stretch == pytest.approx(1.0 + displacement, abs=0.03)
 
 
-def test_a_negative_is_known_by_its_dark_tail(sky) -> None:
+def test_a_negative_is_recognised_by_its_dark_tail(sky) -> None:
     image, _, _ = photograph(sky, 10)
     assert not has_dark_tail(image)
     assert has_dark_tail(np.invert(image))
@@ -189,10 +189,10 @@ def test_pattern_stars_match_the_plain_rule() -> None:
     taken = np.zeros(1500, dtype=bool)
     for star in range(1500):
         taken[star] = np.count_nonzero(near[star] & taken) < quota
-    np.testing.assert_array_equal(pick_pattern_stars(vectors, area, quota), np.flatnonzero(taken))
+    np.testing.assert_array_equal(select_pattern_stars(vectors, area, quota), np.flatnonzero(taken))
 
 
-def test_no_wrong_field_gets_a_wide_window_before_the_right_one_had_its_narrow_one(sky, monkeypatch) -> None:
+def test_narrow_windows_are_tried_for_all_fields_before_wide_ones(sky, monkeypatch) -> None:
     image, _, camera = photograph(sky, 1)
     windows: list[tuple[float, float]] = []
     identify = Identifier.identify

@@ -1,4 +1,4 @@
-"""The reproduction's harness: parts, resuming, checks, report, command line; and the numbers the thesis prints."""
+"""Running experiments: parts, resuming, checks, report, command line; numbers printed in the thesis."""
 
 import csv
 import dataclasses
@@ -89,7 +89,7 @@ def test_a_finished_experiment_is_not_run_again(tmp_path):
     assert again[0].outcome == first[0].outcome
 
 
-def test_experiments_begin_in_their_turn_and_report_in_their_order(tmp_path):
+def test_experiments_start_by_turn_and_are_reported_in_order(tmp_path):
     late, early = _experiment("late"), dataclasses.replace(_experiment("early"), turn=0)
     ended = runner.run([late, early], tmp_path, quick=True, jobs=1)
     assert _calls(tmp_path) == ["early part1", "late part1"]
@@ -120,7 +120,7 @@ def test_a_run_resumes_where_it_was_interrupted(tmp_path):
     assert (resumed.parts, resumed.outcome) == (1, whole)
 
 
-def test_an_output_file_that_is_gone_is_made_again_from_the_parts(tmp_path):
+def test_a_missing_output_file_is_made_again_from_the_parts(tmp_path):
     runner.run([_experiment()], tmp_path, jobs=1)
     (tmp_path / "toy" / "values.csv").unlink()
     assert runner.run([_experiment()], tmp_path, jobs=1)[0].parts == 0
@@ -145,7 +145,7 @@ def test_a_part_with_damaged_contents_is_rejected_by_name(tmp_path):
         start = archive.getinfo("value.npy").header_offset
     names = int.from_bytes(content[start + 26 : start + 28], "little")
     extra = int.from_bytes(content[start + 28 : start + 30], "little")
-    content[start + 30 + names + extra] = 0xFF  # a block type that deflate does not have
+    content[start + 30 + names + extra] = 0xFF  # a block type that does not exist in deflate
     part.write_bytes(content)
     (tmp_path / "toy" / "outcome.json").unlink()
     with pytest.raises(StaridError, match=r"part2.*invalid block type.*remove it"):
@@ -227,7 +227,7 @@ def test_a_bound_makes_a_row_a_check(ours, bounds, passed, target):
         (1.0, float("nan"), False),
     ],
 )
-def test_agreement_is_judged_on_both_sides(published, value, passed):
+def test_agreement_is_two_sided(published, value, passed):
     made = agreement("q", published=published, tolerance=(1.5, "1.5 points"), author=value, printed=0.0)
     assert (made.passed, made.kind, made.met, made.of) == (passed, "agrees", int(passed), 1)
     assert made.target == "± 1.5 points"
@@ -242,7 +242,7 @@ def test_agreement_is_judged_on_both_sides(published, value, passed):
         ({"ours": 9.0}, False),
     ],
 )
-def test_the_reading_nearest_to_the_author_is_the_one_that_is_compared(values, passed):
+def test_the_value_closest_to_the_author_s_version_is_compared(values, passed):
     assert agreement("q", published=1.0, tolerance=(0.1, "a tenth"), **values).passed is passed
 
 
@@ -280,8 +280,8 @@ def test_the_sampling_error_combines_two_counts():
     assert 0.0 < sampling(100.0, 1000)[0] < 1.0
 
 
-def test_a_text_has_no_bounds():
-    with pytest.raises(StaridError, match="a text has no bounds"):
+def test_text_cannot_have_bounds():
+    with pytest.raises(StaridError, match="text cannot have bounds"):
         row("q", ours="many", at_least=1.0)
 
 
@@ -290,7 +290,7 @@ def test_columns_of_unequal_length_are_rejected(tmp_path):
         write_csv(tmp_path / "t.csv", {"a": [1], "b": [1, 2]})
 
 
-def test_the_report_names_missed_checks_and_links_the_files(tmp_path):
+def test_the_report_lists_failed_checks_and_links_the_files(tmp_path):
     results = runner.run([_experiment(least=1e9)], tmp_path, jobs=1)
     text = report.report_text(results, quick=False, seed=1)
     assert "| bounds of this project hold | 0 | 1 |" in text
@@ -300,7 +300,7 @@ def test_the_report_names_missed_checks_and_links_the_files(tmp_path):
     assert report.summary(results)["missed"] == 1
 
 
-def test_a_known_miss_is_shown_with_its_reason_and_is_no_regression(tmp_path, monkeypatch):
+def test_a_known_miss_is_shown_with_its_reason_and_is_not_a_regression(tmp_path, monkeypatch):
     known = {"toy": {"total | of all": KnownMiss("The sky has no such total.")}}
     monkeypatch.setattr(known_misses, "KNOWN", known)
     results = runner.run([_experiment(least=1e9)], tmp_path, jobs=1)
@@ -312,7 +312,7 @@ def test_a_known_miss_is_shown_with_its_reason_and_is_no_regression(tmp_path, mo
     assert report.counts(results)["ours"] == {"met": 0, "of": 1}
 
 
-def test_a_group_that_agrees_less_than_is_known_is_a_regression():
+def test_a_row_that_agrees_less_than_known_is_a_regression():
     entry = {"toy": {"q": KnownMiss("Two of them are not known.", 2)}}
     for met, regression in ((2, False), (3, False), (1, True)):
         made = same("q", published="", matches=[True] * met + [False] * (4 - met), target="")
@@ -359,7 +359,7 @@ def test_an_unknown_experiment_is_rejected_with_the_nearest_name():
         registry.select(["lsi-acuracy"], quick=False)
 
 
-def test_an_experiment_without_a_quick_form_is_left_out_or_rejected(monkeypatch):
+def test_an_experiment_without_a_quick_form_is_skipped_or_rejected(monkeypatch):
     known = {"toy": _experiment(), "slow": dataclasses.replace(_experiment("slow"), quick=None)}
     monkeypatch.setattr(registry, "experiments", lambda: known)
     assert [experiment.name for experiment in registry.select([], quick=True)] == ["toy"]
@@ -367,7 +367,7 @@ def test_an_experiment_without_a_quick_form_is_left_out_or_rejected(monkeypatch)
         registry.select(["slow"], quick=True)
 
 
-def test_every_registered_experiment_has_parts_with_names_fit_for_files():
+def test_parts_of_all_experiments_have_valid_file_names():
     for experiment in registry.experiments().values():
         for parameters in (experiment.full, experiment.quick):
             if parameters is not None:
@@ -378,7 +378,7 @@ def test_every_registered_experiment_has_parts_with_names_fit_for_files():
                 json.dumps(dict(parameters))
 
 
-def test_all_test_frames_lie_on_the_grid_and_the_moved_ones_do_not():
+def test_all_test_frames_are_on_the_grid_and_moved_ones_are_not():
     grid = make_grid("planar", 40.0, 0.995)
     assert len(centres()) == FRAMES == 1701
     for kind, most in ((ON, 1e-9), (OFF, None)):
@@ -401,7 +401,7 @@ def test_the_worked_example_agrees_with_the_thesis(tmp_path):
     example = registry.experiments()["worked-example"]
     outcome = runner.run([example], tmp_path, quick=True, jobs=1)[0].outcome
     missed = {entry.quantity for entry in outcome.failed}
-    # the λ that a cross-validation of random folds took is not on the grid of eq. 2.34
+    # the λ chosen by cross-validation with random folds is not on the grid of eq. 2.34
     assert all("reconstruct" in quantity for quantity in missed)
     agreeing = [entry for entry in outcome.rows if entry.kind == "agrees"]
     assert sum(entry.met for entry in agreeing) >= sum(entry.of for entry in agreeing) - 8

@@ -1,4 +1,4 @@
-"""The false-star filters and the camera motion: against scikit-learn, against the truth of simulated frames."""
+"""False-star filters and camera motion, against scikit-learn and the truth of simulated frames."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_clusters_of_any_extent_match_scikit_learn(spread):
     np.testing.assert_array_equal(density_clusters(points, 0.4, 3.0), expected)
 
 
-def test_no_points_have_no_clusters():
+def test_no_points_give_no_clusters():
     assert density_clusters(np.empty((0, 3)), 0.4, 3.0).size == 0
 
 
@@ -75,7 +75,7 @@ def test_without_noise_all_stars_are_found_and_the_motion_is_exact(false_stars):
     assert np.median(distances) < 1e-13
 
 
-def test_scalable_filter_at_the_greatest_published_noise():
+def test_scalable_filter_at_the_largest_published_noise():
     noise = NoiseModel.factor(5.0, 5, magnitude_range=(-1.5, 3.0))
     settings = TrackFilterSettings(
         position_sigma_deg=5.0 * PIXEL_DEG,
@@ -119,7 +119,7 @@ def test_scalable_filter_with_150_true_and_50_false_stars(kind):
     assert total.precision >= 0.998
 
 
-def test_frames_that_follow_one_another_are_followed():
+def test_objects_are_followed_through_successive_frames():
     noise = NoiseModel(false_stars=3, magnitude_range=(-1.5, 3.0))
     frames = [
         f.observed
@@ -132,7 +132,7 @@ def test_frames_that_follow_one_another_are_followed():
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_too_few_objects_are_no_stars(count):
+def test_too_few_objects_are_not_taken_for_stars(count):
     frame = ObservedFrame(np.ones(count), np.zeros((count, 2)))
     for chosen in (ClusterFilter(), TrackFilter()):
         result = chosen(frame, frame)
@@ -140,7 +140,7 @@ def test_too_few_objects_are_no_stars(count):
         assert result.matches.shape == (0, 2)
 
 
-def test_what_is_rejected():
+def test_invalid_input_is_rejected():
     many = ObservedFrame(np.ones(49), np.random.default_rng(0).uniform(-10.0, 10.0, (49, 2)))
     with pytest.raises(FilterError, match="scalable"):
         ClusterFilter()(many, many)
@@ -152,7 +152,7 @@ def test_what_is_rejected():
         TrackFilterSettings(position_sigma_deg=0.0)
 
 
-def test_motion_shrugs_off_outliers():
+def test_motion_is_robust_to_outliers():
     rng = np.random.default_rng(5)
     before = rng.uniform(-20.0, 20.0, (40, 2))
     now = turned(before, 3.0) + np.array([0.5, -0.2])
@@ -167,7 +167,7 @@ def affine(positions):
     return positions @ np.array([[1.02, -0.03], [0.05, 0.97]]).T + np.array([0.5, -0.2])
 
 
-def test_an_affine_motion_is_found_exactly_and_shrugs_off_outliers():
+def test_an_affine_motion_is_found_exactly_and_is_robust_to_outliers():
     rng = np.random.default_rng(6)
     before = rng.uniform(-20.0, 20.0, (30, 2))
     now = affine(before)
@@ -186,7 +186,7 @@ def test_an_affine_motion_follows_the_noise_closer_than_a_rigid_one():
         now = turned(before, 2.0) + rng.normal(0.0, 0.05, before.shape)
         rigid, free = (estimate_motion(before, now, model=model) for model in ("rigid", "affine"))
         ratio.append(free.mean_distance_deg / rigid.mean_distance_deg)
-    # residuals fall as the degrees of freedom that are left: 14 − 3 and 14 − 6
+    # residuals scale with the remaining degrees of freedom: 14 − 3 and 14 − 6
     assert np.mean(ratio) == pytest.approx(np.sqrt((14 - 6) / (14 - 3)), abs=0.03)
 
 

@@ -1,4 +1,4 @@
-"""The database: sizes as published, codes against full precision, the file and what is refused."""
+"""The database: published sizes, codes against full precision, the file, rejection of bad input."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_every_dictionary_is_nine_different_neighbours(geometry):
         assert cells.max() < grid.cells
 
 
-def test_spherical_cells_are_alike_in_area_and_reach_the_poles():
+def test_spherical_cells_are_similar_in_area_and_reach_the_poles():
     grid = make_grid("spherical", 42.0, 0.99)
     area = 360.0 / grid.row_columns * np.cos(np.radians(grid.row_dec_deg)) * 180.0 / grid.rows
     inner = grid.row_columns > 30
@@ -95,7 +95,7 @@ def test_spherical_features_do_not_depend_on_the_pole():
     assert (made.theta != 255).all()
 
 
-def test_a_file_comes_back_as_it_went(tmp_path):
+def test_a_saved_database_is_loaded_unchanged(tmp_path):
     made = database(96.0)
     path = tmp_path / "96.db"
     assert save_database(made, path) == path.stat().st_size
@@ -116,7 +116,7 @@ def test_bad_files_are_rejected_by_name(tmp_path):
         "cannot be read": None,
         "is not a feature database": b"something else entirely",
         "truncated": whole[:-1],
-        "truncated in its header": whole[: len(MAGIC) + 10],
+        "has a truncated header": whole[: len(MAGIC) + 10],
         "is damaged": whole[:5000] + bytes([whole[5000] ^ 1]) + whole[5001:],
         "damaged header": whole[:25] + b"#" + whole[26:],
     }
@@ -130,7 +130,7 @@ def test_bad_files_are_rejected_by_name(tmp_path):
 
 
 @pytest.mark.parametrize("overlap", [1.0, -0.1, float("nan"), 99.5])
-def test_an_overlap_that_is_no_fraction_is_rejected(overlap):
+def test_an_overlap_outside_its_range_is_rejected(overlap):
     with pytest.raises(GridError, match="overlap"):
         make_grid("planar", 40.0, overlap)
 

@@ -51,7 +51,7 @@ stars = st.lists(
 
 @settings(deadline=None, derandomize=True, max_examples=60)
 @given(stars, st.floats(0.0, 360.0))
-def test_turning_the_frame_changes_theta_only(values, angle):
+def test_rotating_the_frame_changes_only_theta(values, angle):
     a, x, y = np.array(values).T
     turn = math.radians(angle)
     xy = np.column_stack([x, y])
@@ -106,6 +106,6 @@ def test_bad_frames_are_rejected(brightness, offsets):
         extract_features(brightness, offsets)
 
 
-def test_a_limit_that_leaves_nothing_is_rejected():
+def test_a_limit_that_leaves_no_star_is_rejected():
     with pytest.raises(StaridError, match="no star is brightest than"):
         sky_of(thesis_catalog(), DatabaseParameters(kappa=-5.0, direction="brightest"))

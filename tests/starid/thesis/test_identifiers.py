@@ -1,4 +1,4 @@
-"""The LSI and RSI identifiers on frames of points: right or invalid, and what they refuse."""
+"""The LSI and RSI identifiers on frames of points: right or invalid; rejection of bad input."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_lsi_at_the_poles_and_at_the_wrap(ra, dec):
     assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
 
 
-def test_the_solver_of_scikit_learn_gives_the_verified_answers_of_the_compiled_code():
+def test_the_scikit_learn_solver_gives_the_same_verified_answers():
     reference = make_identifier("lsi", solver="sklearn")
     rng = np.random.default_rng(8)
     attitude = random_attitude(rng)
@@ -95,7 +95,7 @@ def test_rsi_follows_a_turning_sensor_among_false_stars():
     assert 2.0 <= statistics.region_sum_deg / statistics.frames < 4.0
 
 
-def test_rsi_with_a_wrong_prediction_asks_the_whole_sky():
+def test_rsi_with_a_wrong_prediction_searches_the_whole_sky():
     rng = np.random.default_rng(7)
     attitude = Attitude.from_radec_roll(80.0, 10.0, 0.0)
     recursion = RsiIdentifier()
@@ -106,7 +106,7 @@ def test_rsi_with_a_wrong_prediction_asks_the_whole_sky():
     assert recursion.statistics.triggers == 1
 
 
-def test_a_change_of_exposure_is_no_reason_to_be_lost():
+def test_a_change_of_exposure_does_not_lose_the_attitude():
     xy, flux = points(np.random.default_rng(8), Attitude.from_radec_roll(80.0, 10.0, 0.0))
     lsi().reset()
     assert lsi().identify(xy, flux).valid
@@ -160,7 +160,7 @@ def test_bad_input(make):
 
 
 @pytest.mark.parametrize("window", [np.nan, -1.0, 0.0, np.inf])
-def test_a_window_that_is_none_is_rejected(window):
+def test_an_invalid_window_is_rejected(window):
     recursion = RsiIdentifier()
     with pytest.raises(StaridError, match=r"tracking window_px: must be a positive number of pixels, not "):
         recursion.track(np.empty((0, 2)), np.empty(0), Attitude.identity(), window_px=window)
@@ -203,19 +203,19 @@ def test_a_database_that_does_not_fit_is_rejected(tmp_path, parameters, epoch, w
         LsiIdentifier(database=tmp_path / "other.db")
 
 
-def test_a_database_that_fits_is_taken(tmp_path):
+def test_a_database_that_fits_is_used(tmp_path):
     save_database(build_database(load_catalog(), CAMERA_DATABASE), tmp_path / "mine.db")
     assert LsiIdentifier(database=tmp_path / "mine.db").database.parameters == CAMERA_DATABASE
 
 
-def test_without_a_folder_to_keep_it_in_the_database_is_only_built(tmp_path, monkeypatch, caplog):
+def test_an_unwritable_folder_only_prevents_caching_the_database(tmp_path, monkeypatch, caplog):
     (tmp_path / "file").touch()
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path / "file" / "cache"))
     assert obtain_database(load_catalog(), CAMERA_DATABASE, cache=True).parameters == CAMERA_DATABASE
     assert "cannot be written" in caplog.text
 
 
-def test_a_cached_database_that_cannot_be_read_is_built_anew(tmp_path, monkeypatch, caplog):
+def test_a_cached_database_that_cannot_be_read_is_built_again(tmp_path, monkeypatch, caplog):
     monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
     made = obtain_database(load_catalog(), CAMERA_DATABASE, cache=True)
     (file,) = tmp_path.glob("features-*.bin")

@@ -92,7 +92,7 @@ def test_coordinate_descent_and_the_path_agree_on_a_well_conditioned_problem():
     np.testing.assert_allclose(weights[40], omega, atol=1e-5)
 
 
-def test_columns_that_are_alike_are_solved_too():
+def test_equal_columns_are_solved():
     column = np.array([50.0, 20.0, 30.0, 40.0, 10.0])
     dictionary = np.repeat(column[:, None], 9, axis=1)
     weights = np.empty((LAMBDAS.size, 9))
@@ -101,7 +101,7 @@ def test_columns_that_are_alike_are_solved_too():
 
 
 def test_published_example_about_its_own_cell():
-    """About cell 735 eq. 2.34 gives weights on t5, t6 and t9 and a boresight 0.17° off."""
+    """For cell 735, eq. 2.34 gives weights on t5, t6 and t9, and a boresight 0.17° off."""
     lsi = lost_in_space(96.0)
     observation = lsi.database.normalise(lsi.database.sky.features(115.0, -65.0))
     estimate = lsi.estimate(observation, 734, 0.0).mse
@@ -164,7 +164,7 @@ def test_right_ascension_wraps():
         assert float(boresight_error(estimate.right_ascension_deg, estimate.declination_deg, ra, 10.1)) < 0.5
 
 
-def test_region_holds_the_frame_or_nothing():
+def test_a_region_contains_the_frame_or_nothing():
     lsi = lost_in_space(99.5)
     observation = lsi.database.normalise(lsi.database.sky.features(122.0, 7.0))
     cell, distance, count = lsi.nearest_in_region(observation, 122.3, 6.8, 2.0)

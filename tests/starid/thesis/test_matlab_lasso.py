@@ -1,4 +1,4 @@
-"""MATLAB's `lasso`: against scikit-learn where both converge, and against what the thesis prints where it does not."""
+"""MATLAB's `lasso`: against scikit-learn where both converge, and otherwise against the thesis."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def path_of(dictionary, observation, lambdas=LAMBDAS):
     return weights
 
 
-def test_on_columns_that_are_not_alike_it_is_the_lasso_of_standardised_columns_with_an_intercept():
+def test_well_conditioned_columns_give_the_lasso_of_standardised_columns_with_an_intercept():
     rng = np.random.default_rng(4)
     dictionary = rng.normal(size=(60, 7)) * np.array([1, 5, 0.2, 30, 2, 1, 1]) + rng.normal(size=7)
     observation = dictionary @ np.array([2, 0, -8, 0.1, 0, 0, 1]) + 5.0 + rng.normal(size=60)
@@ -46,7 +46,7 @@ def test_a_column_without_variation_has_no_weight():
     assert np.all(path_of(dictionary, dictionary[:, 0] + dictionary[:, 1])[:, 1] == 0.0)
 
 
-def test_no_weight_above_the_greatest_penalty():
+def test_no_weight_above_the_largest_penalty():
     dictionary = np.random.default_rng(2).normal(size=(5, 9))
     assert np.all(path_of(dictionary, 0.01 * dictionary[:, 4]) == 0.0)
 

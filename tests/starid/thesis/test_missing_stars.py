@@ -1,4 +1,4 @@
-"""Missing stars: put back from the frame before, or left out of account by a divided field."""
+"""Missing stars: restored from the previous frame, or avoided by a divided field."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ RADIUS = 20.0
 
 
 def two_frames(lost, shift=(0.4, -0.3)):
-    """Ten stars, and the same moved without some of them; every object of the later frame is matched."""
+    """Ten stars, and the same moved, without some of them; every object in the later frame is matched."""
     rng = np.random.default_rng(3)
     brightness, positions = rng.uniform(11.5, 13.0, 10), rng.uniform(-12.0, 12.0, (10, 2))
     kept = np.delete(np.arange(10), lost)
@@ -32,7 +32,7 @@ def two_frames(lost, shift=(0.4, -0.3)):
     return before, now, result, estimate_motion(positions[kept], moved[kept]), moved
 
 
-def test_a_missing_star_is_put_back_where_the_motion_carries_it():
+def test_a_missing_star_is_restored_where_the_motion_carries_it():
     before, now, result, motion, moved = two_frames([4])
     mended = restore_missing(before, now, result, motion, radius_deg=RADIUS, margin_deg=0.1)
     assert len(mended) == 10
@@ -40,13 +40,13 @@ def test_a_missing_star_is_put_back_where_the_motion_carries_it():
     assert mended.brightness[-1] == before.brightness[4]
 
 
-def test_a_star_that_left_the_field_is_not_put_back():
+def test_a_star_that_left_the_field_is_not_restored():
     before, now, result, motion, _ = two_frames([4], shift=(30.0, 0.0))
     mended = restore_missing(before, now, result, motion, radius_deg=RADIUS, margin_deg=0.1)
     assert len(mended) == 9
 
 
-def test_a_false_star_of_the_frame_before_is_not_put_back():
+def test_a_false_star_of_the_previous_frame_is_not_restored():
     before, now, result, motion, _ = two_frames([4])
     true_before = result.true_before.copy()
     true_before[4] = False
@@ -80,7 +80,7 @@ def test_a_covered_field_is_identified_by_the_circles_that_are_left(ra, dec, rol
     assert abs((answer.roll_deg - roll + 180.0) % 360.0 - 180.0) < 3.0
 
 
-def test_stars_of_no_place_in_the_sky_have_no_answer():
+def test_random_stars_have_no_answer():
     rng = np.random.default_rng(11)
     frame = ObservedFrame(rng.uniform(11.5, 15.0, 12), rng.uniform(-14.0, 14.0, (12, 2)))
     assert divided().solve(frame) is None

@@ -1,4 +1,4 @@
-"""The compiled code against the thesis's methods on scikit-learn."""
+"""The compiled code against the thesis's methods with scikit-learn."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ BRIGHTNESS = np.array([0.5, 2.91, 1.93, 2.85, 1.58, 0.46, 1.29])
 
 
 def minimised(dictionary, observation, omega, penalty):
-    """What eq. 2.34 minimises."""
+    """The objective of eq. 2.34."""
     return np.sum((observation - dictionary @ omega) ** 2) / 10.0 + penalty * np.abs(omega).sum()
 
 
@@ -37,7 +37,7 @@ def test_lost_in_space_is_the_nearest_neighbour_and_the_lasso_of_scikit_learn(ra
     assert solution.nearest == expected.nearest
     assert solution.distance == pytest.approx(expected.distance, abs=1e-9)
     assert solution.mse.penalty == expected.penalty
-    # columns nearly alike: coordinate descent comes near the minimum, the path is there
+    # nearly equal columns: coordinate descent comes close to the minimum, the path reaches it
     ours, theirs = (
         minimised(solution.dictionary, solution.observation, omega, expected.penalty)
         for omega in (solution.mse.omega, expected.omega)

@@ -1,4 +1,4 @@
-"""The recursive algorithm and the simulator's sequences."""
+"""The recursive algorithm and the sequences of the simulator."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_a_clean_sequence_is_followed_in_the_region():
     assert np.mean(errors) <= 0.18
 
 
-def test_an_error_above_the_threshold_asks_the_whole_database_and_may_be_invalid():
+def test_an_error_above_the_threshold_searches_the_whole_database_and_may_be_invalid():
     lsi = lost_in_space(99.5)
     tiny = RsiSettings(tau=1e-9, invalid_factor=1.0)
     recursion = RecursiveIdentification(lsi, quiet_filter(), tiny)
@@ -96,7 +96,7 @@ def test_the_same_seed_gives_the_same_frames():
     assert run(1).shape != run(2).shape or not np.array_equal(run(1), run(2))
 
 
-def test_noise_has_the_moments_asked_for():
+def test_noise_has_the_requested_moments():
     rng = np.random.default_rng(3)
     brightness, positions = np.full(20_000, 12.0), np.zeros((20_000, 2))
     noise = NoiseModel(position_sigma_px=2.0, brightness_sigma=3.0, false_stars=5, missing_stars=7)
@@ -108,7 +108,7 @@ def test_noise_has_the_moments_asked_for():
     assert (np.hypot(*places[~stars].T) <= 20.0).all()
 
 
-def test_measures():
+def test_metrics():
     assert float(boresight_error(359.9, 10.0, 0.1, 10.0)) == pytest.approx(0.2)
     assert float(rotation_error(-179.0, 179.0)) == pytest.approx(2.0)
     np.testing.assert_allclose(error_colours([0.0, 0.05, 7.0], 0.1), [[0, 1, 0], [0.5, 0.5, 0], [1, 0, 0]])

@@ -1,4 +1,4 @@
-"""What the tests of the thesis's algorithms share: the catalogue of its epoch and databases built once a run."""
+"""Shared by the tests of the thesis's algorithms: catalogue at its epoch, databases built once per run."""
 
 from __future__ import annotations
 
