@@ -20,11 +20,11 @@ from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, Requ
 from starhil.protocol.values import Value
 
 DEFAULT_TIMEOUT_S: Final = 1.0
-"""Time-out of a transaction in current public flight software."""
+"""Time-out in current public flight software."""
 UNSOLICITED_KEPT: Final = 1000
 """Longest queue of unsolicited readings; the oldest are dropped."""
 HISTORY_LENGTH: Final = 10_000
-"""Newest transactions, faults and stray replies that a client keeps."""
+"""Number of transactions, faults and stray replies that a client keeps."""
 SETTLE_S: Final = 0.05
 """Pause after a time-out, in which a late reply is discarded."""
 
@@ -41,7 +41,7 @@ class AsyncObcClient:
     timeout_s : float
         Default time-out of a reply, s.
     retries : int
-        Default number of repeats after a time-out. 0 shows a lost reply to the bench.
+        Default number of repeats after a time-out; with 0, the bench sees every lost reply.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class AsyncObcClient:
     async def telemetry(
         self, name: str, *, timeout_s: float | None = None, retries: int | None = None
     ) -> dict[str, Value]:
-        """Ask for a telemetry row and return its physical values by field."""
+        """Read a telemetry row and return its physical values by field."""
         return dict((await self.read(name, timeout_s=timeout_s, retries=retries)).values)
 
     async def command(
@@ -108,22 +108,20 @@ class AsyncObcClient:
         checked: bool = True,
         **fields: Value,
     ) -> Ack:
-        """Send a telecommand and wait for its acknowledge.
-
-        Fields as a mapping, by keyword, or both.
+        """Send a telecommand and wait for its acknowledge; fields as a mapping, by keyword, or both.
 
         Parameters
         ----------
         checked
-            False also sends values outside the limits of the interface definition, for the device
-            to refuse.
+            If false, values outside the limits of the interface definition are sent too, for the device to
+            refuse.
 
         Raises
         ------
         FieldError
-            A value that the definition does not allow; nothing is sent.
+            A value violates the definition; nothing is sent.
         NackError
-            The device refused it; carries the published code.
+            The device refused the telecommand; has the error code.
         """
         data = self.icd.telecommands[name].encode({**(values or {}), **fields}, check=checked)
         return await self.command_raw(name, data, timeout_s=timeout_s, retries=retries)
@@ -131,7 +129,7 @@ class AsyncObcClient:
     async def command_raw(
         self, name: str, data: bytes, *, timeout_s: float | None = None, retries: int | None = None
     ) -> Ack:
-        """Send a telecommand with its parameters as bytes, well-formed or not."""
+        """Send a telecommand with its data as bytes, which may be invalid."""
         row = self.icd.telecommands[name]
         request = self.icd.request(row, data)
         if not row.answers:
@@ -149,7 +147,7 @@ class AsyncObcClient:
         retries: int | None = None,
         checked: bool = True,
     ) -> Ack:
-        """Set a parameter by name, in its own unit; `checked` as with `command`."""
+        """Set a parameter by name, in its unit; `checked` as in `command`."""
         parameter = self.icd.parameters[name]
         number = parameter.to_number(value) if checked or isinstance(value, str) else float(value)
         return await self.command(
@@ -172,7 +170,7 @@ class AsyncObcClient:
         return reading
 
     async def get_parameter(self, name: str) -> Value:
-        """Return the value of a parameter in its own type."""
+        """Return the value of a parameter in its type."""
         reading = await self.read_parameter(name)
         try:
             return self.icd.parameters[name].check(reading["value"])
@@ -187,7 +185,7 @@ class AsyncObcClient:
         Raises
         ------
         BenchError
-            It did not hold in time.
+            The condition did not hold in time.
         """
         deadline = time.monotonic() + within_s
         while True:
@@ -196,7 +194,7 @@ class AsyncObcClient:
                 return reading
             if time.monotonic() >= deadline:
                 raise BenchError(
-                    f"{name}: the condition did not hold within {within_s:g} s; last {dict(reading.values)}"
+                    f"{name}: the condition did not hold within {within_s:g} s; last values {dict(reading.values)}"
                 )
             await asyncio.sleep(every_s)
 
@@ -208,7 +206,7 @@ class AsyncObcClient:
         Parameters
         ----------
         since_s
-            Time on `time.monotonic`: what was received before is dropped too.
+            Time on `time.monotonic`; messages received earlier are dropped too.
         """
         wanted = self.icd.telemetry[name].name
         limit = self.timeout_s if timeout_s is None else timeout_s
@@ -296,7 +294,7 @@ class AsyncObcClient:
         self.stray_replies.append(reply)
 
     def _answers(self, request: Request, reply: Reply) -> bool:
-        """Return whether a reply is the answer to a request; a telecommand may be answered with a telemetry row."""
+        """Return whether a reply answers a request; a telecommand may be answered with a telemetry row."""
         if reply.id is None or (reply.id, reply.klass) == (request.id, request.klass):
             return reply.kind in _ANSWERS[request.kind]
         row, answer = self.icd.rows_by_key.get((request.klass, request.id)), self._row_of(reply)
@@ -318,7 +316,7 @@ class AsyncObcClient:
     def _reading(self, reply: Reply, latency: float) -> Reading:
         row = self._row_of(reply)
         if row is None:
-            raise BadReplyError("a reply without an identifier")
+            raise BadReplyError("a reply without a row ID")
         try:
             values = row.decode(reply.data)
         except ProtocolError as error:

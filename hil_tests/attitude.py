@@ -1,7 +1,7 @@
 """Quaternions (x, y, z, w) from ICRS to the sensor frame, and attitude errors, in plain Python.
 
-The bench has its own quaternion algebra, to share no numerics with the unit under test.
-Conventions (roll, sensor axes, scalar last) are as in the interface definition's attitude rows.
+The bench has its own quaternion algebra so that it shares no numerics with the unit under test. Conventions
+(roll, sensor axes, scalar last) are those of the attitude rows of the interface definition.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from starhil.hil_tests.errors import BenchError
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02
-"""Largest deviation of an attitude quaternion from unit length; four steps of 1e-4 are well within it."""
+"""Largest deviation of an attitude quaternion from unit length; much more than four steps of 1e-4."""
 
 
 class Quaternion(NamedTuple):
@@ -31,8 +31,8 @@ class Quaternion(NamedTuple):
 class AttitudeError:
     """How a measured attitude differs from the truth, in arcseconds, all non-negative.
 
-    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rotation
-    about the boresight, `total_arcsec` the angle of the whole rotation.
+    `cross_boresight_arcsec` is the angle between the two boresights, `roll_arcsec` the rotation about the
+    boresight, and `total_arcsec` the total rotation angle.
     """
 
     cross_boresight_arcsec: float
@@ -46,7 +46,7 @@ def unit(values: Sequence[float]) -> Quaternion:
     Raises
     ------
     BenchError
-        Not four numbers, not finite, or not near unit length.
+        The values are not four finite numbers of about unit length.
     """
     if len(values) != 4:
         raise BenchError(f"a quaternion must have four parts (x, y, z, w), not {len(values)}")
@@ -65,9 +65,9 @@ def from_vector_part(x: float, y: float, z: float) -> Quaternion:
 def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:
     """Return the attitude with this boresight and roll.
 
-    Roll is the angle by which celestial north is turned counter-clockwise in the image from image
-    up; rows of the matrix are x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e, z =
-    b, with n and e the unit vectors to north and east at the boresight b.
+    Roll is the angle by which celestial north is turned counter-clockwise in the image from image up. The
+    rows of the matrix are x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e and z = b, with the
+    unit vectors n and e to north and east at the boresight b.
     """
     ra, dec, roll = (math.radians(v) for v in (ra_deg, dec_deg, roll_deg))
     boresight = (math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec))
@@ -80,7 +80,7 @@ def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternio
 
 
 def _from_rows(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> Quaternion:
-    """Return the quaternion of a rotation matrix, by its rows; its largest part is computed first."""
+    """Return the quaternion of a rotation matrix, given by rows; its largest component is computed first."""
     trace = x[0] + y[1] + z[2]
     squares = (
         1.0 + x[0] - y[1] - z[2],
@@ -112,7 +112,7 @@ def boresight(q: Quaternion) -> tuple[float, float, float]:
 
 
 def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
-    """Compare two attitudes; a quaternion and its negative are one attitude."""
+    """Compare two attitudes; a quaternion and its negative are the same attitude."""
     # rotation from the true into the measured sensor frame: measured * conjugate(truth)
     a, b = measured, truth
     x = -a.w * b.x + a.x * b.w - a.y * b.z + a.z * b.y
@@ -126,7 +126,7 @@ def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
 
 
 def interpolate(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """Return the attitude at `fraction` of the shortest turn from `first` to `second` (slerp)."""
+    """Return the attitude at `fraction` of the shortest rotation from `first` to `second` (slerp)."""
     dot = math.fsum(p * q for p, q in zip(first, second, strict=True))
     target = second if dot >= 0.0 else Quaternion(*(-v for v in second))
     angle = math.acos(min(1.0, abs(dot)))

@@ -1,4 +1,4 @@
-"""The unit under test, with clients and logs on its links, and the emulator if there is one."""
+"""Access to the unit under test: clients and logs on its links, and the emulator if there is one."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 
 @dataclass(frozen=True)
 class LinkOptions:
-    """How the unit is reached and how the clients behave.
+    """Options of the links and of the clients.
 
     Attributes
     ----------
     serial, can : str or None
-        Port and channel; None where the link is not used. With an emulator that the bench started,
-        `auto` takes what its ready line says.
+        Port and channel; None if the link is not used. `auto` means those on the ready line of the emulator
+        that the bench started.
     """
 
     serial: str | None = None
@@ -42,10 +42,9 @@ class LinkOptions:
 
 
 class Bench:
-    """Clients on one unit: a context manager that opens them on first use and closes them all.
+    """Clients of one unit: a context manager that opens them on first use and closes them all.
 
-    Leaving it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end
-    cleanly.
+    On exit it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end cleanly.
 
     Parameters
     ----------
@@ -54,9 +53,9 @@ class Bench:
     icd : InterfaceDefinition
         Names and layouts.
     emulator : EmulatorProcess, optional
-        A process that is not yet started; the bench starts and ends it.
+        Process that has not been started; the bench starts and ends it.
     log_folder : Path, optional
-        Where `serial.log` and `can.log` are written.
+        Folder for `serial.log` and `can.log`.
     """
 
     def __init__(
@@ -126,7 +125,7 @@ class Bench:
         return self._log_of[link]
 
     def close_clients(self) -> None:
-        """Close all clients; the next use opens them again."""
+        """Close all clients; they are opened again on next use."""
         clients, self._clients = list(self._clients.values()), {}
         for client in clients:
             client.close()
@@ -137,7 +136,7 @@ class Bench:
         Raises
         ------
         BenchError
-            The bench has not started the unit, so it cannot restart it.
+            The unit is not an emulator that the bench started.
         """
         if self.emulator is None:
             raise BenchError("only an emulator that the bench started can be restarted: use --start")
@@ -163,10 +162,7 @@ class Bench:
             self._end_emulator(kind)
 
     def _end_emulator(self, kind: type[BaseException] | None) -> None:
-        """End the emulator.
-
-        Report one that ended unexpectedly, also when that caused the error under way.
-        """
+        """End the emulator; report that it ended unexpectedly, which may have caused the current error."""
         if self.emulator is None or not self._started:
             return
         caused_by_emulator = kind is not None and issubclass(kind, BenchError | ProtocolError)

@@ -1,7 +1,7 @@
-"""A CAN bus under full load, measured from the OBC's side: nothing lost, replies right, how late.
+"""Measurement of a CAN bus under full load at the OBC: lost frames, wrong replies, latency.
 
-It talks to a device over its links only, so it measures a real unit as well as the emulator. The
-other traffic comes from a separate process, which also counts the frames that arrive.
+It talks to a device over its links only, so it can measure a real unit as well as the emulator. The other
+traffic comes from a separate process, which also counts the frames that arrive.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from starhil.protocol.transports import open_can
 HOST: Final = 1
 DEVICE: Final = 4
 TALKER: Final = 0x20
-"""CAN address of the other traffic's sender; it sends to LISTENER, an unused address."""
+"""CAN address of the sender of the other traffic; it sends to the unused address LISTENER."""
 LISTENER: Final = 0x21
 ECHO: Final = 0x22
 """CAN address at which the traffic process echoes requests, for the latency of the machine."""
 
 ECHO_ROW: Final = 133
-"""Telemetry identifier of the other traffic."""
+"""Row ID of the other traffic."""
 
 ASKED: Final = (
     "identification",
@@ -43,35 +43,35 @@ ASKED: Final = (
     "unix_time",
     "device_status",
 )
-"""Telemetry that is asked for in turn."""
+"""Telemetry rows that are requested in turn."""
 PAUSE_S: Final = 0.004
 """Mean pause between two requests.
 
-The pauses are random, so that requests hit every phase of image processing.
+The pauses are random so that requests arrive in every phase of image processing.
 """
 REPLY_WITHIN_S: Final = 2.0
 TICK_S: Final = 0.001
-"""Time between two bunches of the other traffic."""
+"""Time between two bursts of the other traffic."""
 SETTLE_S: Final = 5.0
-"""How long the last frames may take to arrive."""
+"""Time that the last frames may take to arrive."""
 
 
 # --- the other traffic ---
 
 
 def _talk(spec: str, rate: float, pipe: Connection) -> None:
-    """Send numbered frames at a rate until stopped; report how many arrived at another port."""
+    """Send numbered frames at a rate until stopped; report how many arrived at a second port."""
     asyncio.run(_talk_until_stopped(spec, rate, pipe))
 
 
 async def _talk_until_stopped(spec: str, rate: float, pipe: Connection) -> None:
-    identifier = CanId(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
+    can_id = CanId(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
     ping = CanId(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
     pong = CanId(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
     seen: list[int] = []
 
     def count(frame: CanFrame) -> None:
-        if frame.id == identifier:
+        if frame.id == can_id:
             seen.append(int.from_bytes(frame.data, "little"))
         elif frame.id == ping:
             listener.send(CanFrame(pong, frame.data))
@@ -87,7 +87,7 @@ async def _talk_until_stopped(spec: str, rate: float, pipe: Connection) -> None:
     while not stop.done():
         due = int((time.monotonic() - begin) * rate)
         for number in range(sent, due):
-            refused += not talker.send(CanFrame(identifier, number.to_bytes(8, "little")))
+            refused += not talker.send(CanFrame(can_id, number.to_bytes(8, "little")))
         sent = max(sent, due)
         await asyncio.sleep(TICK_S)
     seconds = time.monotonic() - begin
@@ -115,10 +115,7 @@ class OtherTraffic:
         self._pipe.send("go")
 
     def stop(self) -> tuple[float, int, int, int, int]:
-        """End the traffic.
-
-        Return seconds, frames sent, lost, out of order, and refused by the port.
-        """
+        """End the traffic; return seconds, and frames sent, lost, out of order, and rejected by the port."""
         self._pipe.send("stop")
         figures: tuple[float, int, int, int, int] = self._receive_report()
         self._process.join()
@@ -129,7 +126,7 @@ class OtherTraffic:
             return self._pipe.recv()  # type: ignore[no-any-return]
         except EOFError:
             raise BenchError(
-                "bus load: the process of the other traffic ended; see its error above"
+                "bus load: the process that sends the other traffic has ended; see its error above"
             ) from None
 
 
@@ -157,12 +154,12 @@ class _CanAsker:
             elif self._answer is not None and not self._answer.done():
                 self._answer.set_result(event)
 
-    async def ask(self, identifier: int) -> Reply | None:
-        """Ask for a row; return the reply, or None if there was none in time."""
+    async def ask(self, row_id: int) -> Reply | None:
+        """Request a row; return the reply, or None if none came in time."""
         self.requests += 1
         self._answer = asyncio.get_running_loop().create_future()
         begin = time.perf_counter()
-        for frame in encode_request_frames(Request.of(identifier), HOST, self._node):
+        for frame in encode_request_frames(Request.of(row_id), HOST, self._node):
             self._send(frame)
         try:
             reply = await asyncio.wait_for(self._answer, REPLY_WITHIN_S)
@@ -173,12 +170,12 @@ class _CanAsker:
         return reply
 
 
-def _is_right(icd: InterfaceDefinition, reply: Reply, identifier: int) -> bool:
-    """Whether a reply is the telemetry that was asked for, with every value within its limits."""
-    if reply.kind is not ReplyKind.TELEMETRY or reply.id != identifier:
+def _is_right(icd: InterfaceDefinition, reply: Reply, row_id: int) -> bool:
+    """Return whether a reply is the requested telemetry, with every value within its limits."""
+    if reply.kind is not ReplyKind.TELEMETRY or reply.id != row_id:
         return False
     try:
-        icd.telemetry_by_id[identifier].decode(reply.data, check=True)
+        icd.telemetry_by_id[row_id].decode(reply.data, check=True)
     except ProtocolError:
         return False
     return True
@@ -193,14 +190,14 @@ async def load_can(
     device: int = DEVICE,
     realtime: bool = False,
 ) -> CanLoad:
-    """Ask a device for telemetry while other nodes fill the bus.
+    """Request telemetry from a device while other nodes load the bus.
 
     Parameters
     ----------
     icd
-        Interface definition of the CubeStar.
+        Interface definition of CubeStar.
     spec
-        The bus, as `open_can` takes it.
+        The bus, as for `open_can`.
     seconds
         Duration.
     rate
@@ -208,7 +205,7 @@ async def load_can(
     device
         CAN address of the device.
     realtime
-        Give the process of the other traffic real-time priority.
+        Whether the process of the other traffic gets real-time priority.
     """
     transport = open_can(spec)
     asker, echo = _CanAsker(device, transport.send), _CanAsker(ECHO, transport.send)

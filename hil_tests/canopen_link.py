@@ -22,11 +22,11 @@ class CanopenHostLink(HostLink[CanFrame]):
     Parameters
     ----------
     icd : InterfaceDefinition
-        The unit; its rows are found in its object dictionary.
+        The unit; its rows must be in its object dictionary.
     spec : str
         A channel for `open_can`.
     node : int, optional
-        Node-ID of the device; the unit's default without.
+        Node ID of the device; default: the unit's.
     log : WireLog, optional
         Log of every frame.
     """
@@ -44,7 +44,7 @@ class CanopenHostLink(HostLink[CanFrame]):
         self._receiver = self
 
     def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- an upload has its own length
-        """Begin the transfers of a request.
+        """Start the transfers of a request.
 
         Raises
         ------
@@ -63,11 +63,11 @@ class CanopenHostLink(HostLink[CanFrame]):
 
     @property
     def busy(self) -> bool:
-        """Whether a transfer is under way."""
+        """Whether a transfer is active."""
         return self._under_way is not None
 
     def feed(self, frame: CanFrame, _now: float) -> list[Reply | LinkFault]:
-        """Continue the transfers with a response of the node; return the reply at their end."""
+        """Continue the transfers with a response of the node; after the last one return the reply."""
         if self._under_way is None or frame.extended or frame.id != SDO_TRANSMIT + self._node:
             return []
         request, transfer = self._under_way
@@ -82,11 +82,11 @@ class CanopenHostLink(HostLink[CanFrame]):
         return []
 
     def flush(self, _now: float) -> list[LinkFault]:
-        """Nothing times out here: the client abandons a transfer by `reset_receiver`."""
+        """Do nothing: transfers do not time out; the client abandons them with `reset_receiver`."""
         return []
 
     def reset_receiver(self) -> None:
-        """Abort the transfer that is under way."""
+        """Abort the active transfer."""
         if self._under_way is not None:
             self._under_way = None
             self._send(bytes([0x80, 0, 0, 0]) + AbortCode.TIMEOUT.to_bytes(4, "little"))

@@ -31,7 +31,7 @@ T = TypeVar("T")
 def _synchronous(
     method: Callable[Concatenate[AsyncObcClient, Parameters], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[ObcClient, Parameters], T]:
-    """Return the method of `ObcClient` that runs one of `AsyncObcClient` in the client's loop."""
+    """Return a method of `ObcClient` that runs a method of `AsyncObcClient` in the client's loop."""
 
     @functools.wraps(method)
     def run(client: ObcClient, /, *args: Parameters.args, **fields: Parameters.kwargs) -> T:
@@ -41,11 +41,11 @@ def _synchronous(
 
 
 class ObcClient:
-    """A synchronous OBC client for scripts, tests and the prompt.
+    """A synchronous OBC client for scripts, tests and interactive use.
 
     Its event loop runs in a separate thread.
 
-    Make one with `ObcClient.open(...)` and use it as a context manager::
+    Create it with `ObcClient.open(...)` and use it as a context manager::
 
         with ObcClient.open(serial="/dev/pts/3") as obc:
             obc.command("set_mode", mode="lost_in_space")
@@ -92,8 +92,8 @@ class ObcClient:
     ) -> Self:
         """Open a client on a serial port (`/dev/…`, `socket://host:port`) or on a CAN channel.
 
-        On CAN it is a CANopen master if that is all that the unit has there.
-        `unit` is the name of a bundled unit, a folder, or a definition.
+        On CAN it is a CANopen master if CANopen is the only protocol of the unit there. `unit` is the name of
+        a bundled unit, a folder, or a definition.
         """
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
@@ -112,7 +112,7 @@ class ObcClient:
         return cls(make_link, icd, timeout_s=timeout_s, retries=retries)
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine in the client's loop and return what it returns."""
+        """Run a coroutine in the client's loop and return its result."""
         return self._loop.run(coroutine)
 
     def close(self) -> None:
@@ -129,22 +129,22 @@ class ObcClient:
 
     @property
     def icd(self) -> InterfaceDefinition:
-        """The interface definition that names come from."""
+        """The interface definition of the unit."""
         return self.core.icd
 
     @property
     def transactions(self) -> deque[Transaction]:
-        """The newest requests, with outcome and latency."""
+        """The latest requests, with outcome and latency."""
         return self.core.transactions
 
     @property
     def faults(self) -> deque[LinkFault]:
-        """The newest input that formed no message."""
+        """The latest invalid inputs."""
         return self.core.faults
 
     @property
     def stray_replies(self) -> deque[Reply]:
-        """The newest replies that answered no request."""
+        """The latest replies without a request."""
         return self.core.stray_replies
 
     read = _synchronous(AsyncObcClient.read)
@@ -161,7 +161,7 @@ class ObcClient:
     def request(
         self, identifier: int, data: bytes = b"", *, klass: str | None = None, timeout_s: float | None = None
     ) -> Reply:
-        """Send a request by row ID, and class where the unit has classes, with raw parameters; return the reply."""
+        """Send a request by row ID (and class, if the unit has classes), data as bytes; return the reply."""
         request = self.icd.request_of(identifier, klass, data)
         row = self.icd.rows_by_key.get((request.klass, identifier))
         size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0

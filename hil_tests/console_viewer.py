@@ -1,7 +1,6 @@
-"""A viewer of a console without a screen, for measurements: `python -m starhil.hil_tests.console_viewer ADDRESS`.
+"""A headless viewer of the console, for measurements: `python -m starhil.hil_tests.console_viewer ADDRESS`.
 
-It asks for what an open page asks for, images and the rows that the page shows first, and reads all that
-comes.
+Like an open page, it subscribes to images and to the rows that the page shows first, and reads everything.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ ROWS: Final = ("identification", "boot_status", "unix_time", "communication_stat
 
 
 async def view(address: str) -> None:
-    """Read what the console sends until it closes."""
+    """Read from the console until it closes the connection."""
     import aiohttp
 
     parts = urlsplit(address)

@@ -21,10 +21,10 @@ from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
-"""The first start on a machine compiles for minutes, later ones take about 3 s."""
+"""The first start on a machine compiles for minutes; later ones take about 3 s."""
 STOP_WITHIN_S: Final = 15.0
 SHOWN_LINES: Final = 5
-"""Last lines of the emulator's stderr in an error message."""
+"""Number of last lines of the emulator's stderr in an error message."""
 
 
 def emulator_command(
@@ -40,7 +40,7 @@ def emulator_command(
     truth_log: Path | None = None,
     extra: Sequence[str] = (),
 ) -> list[str]:
-    """Return the command line of an emulator that ends with this process."""
+    """Return the command line for an emulator that ends with this process."""
     options = {
         "--unit": unit,
         "--serial": serial,
@@ -57,18 +57,18 @@ def emulator_command(
 
 
 def hub_command(*, log: Path | None = None) -> list[str]:
-    """Return the command line of a CAN hub at a free port that ends with this process."""
+    """Return the command line for a CAN hub on a free port that ends with this process."""
     command = [*_starhil_command(), "hub", "--port", "0"]
     return command if log is None else [*command, "--log", str(log)]
 
 
 def installed_command() -> str:
-    """Return the path of the command `starhil`: beside this Python, else on PATH.
+    """Return the path of the command `starhil`: beside the Python interpreter, or else on PATH.
 
     Raises
     ------
     EmulatorProcessError
-        It is not installed.
+        The command is not installed.
     """
     beside_python = Path(sys.executable).with_name("starhil")
     if os.access(beside_python, os.X_OK):
@@ -82,7 +82,7 @@ def installed_command() -> str:
 
 
 def _starhil_command() -> list[str]:
-    """Return the start of a command line for a `starhil` that ends with this process."""
+    """Return the beginning of a command line for a `starhil` that ends with this process."""
     return [sys.executable, "-m", "starhil.hil_tests.end_with_parent", str(os.getpid()), installed_command()]
 
 
@@ -131,15 +131,15 @@ class EmulatorProcess:
         return unquote(self.ready.get("unit", DEFAULT_UNIT))
 
     def check_unit(self, unit: str | None) -> None:
-        """Check that the emulator has the unit that the bench speaks.
+        """Check that emulator and bench have the same unit.
 
         Raises
         ------
         BenchError
-            It has another, from its profile.
+            The emulator has another unit, selected in its profile.
         """
         if unit is None and self.unit != DEFAULT_UNIT:
-            raise BenchError(f"the profile's unit is {self.unit}: give --unit {self.unit} here too")
+            raise BenchError(f"the profile's unit is {self.unit}: add --unit {self.unit}")
 
     def start(self) -> Self:
         """Start the process and wait for its ready line.
@@ -147,7 +147,7 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It ended, or was not ready in time; quotes its last lines of stderr.
+            The process ended or was not ready in time; the text quotes the last lines of stderr.
         """
         begin = time.monotonic()
         self._lines = queue.Queue()
@@ -172,7 +172,9 @@ class EmulatorProcess:
             reader.start()
         try:
             self.ready = self._wait_for_ready(begin + self._ready_within_s)
-        except BaseException:  # on interruption too: no signal reaches the process, which has its own session
+        except (
+            BaseException
+        ):  # on interruption too: the process has its own session, so it receives no signal
             self.kill()
             raise
         return self
@@ -212,7 +214,7 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It was not started.
+            The process has not been started.
         """
         if self._process is None:
             raise EmulatorProcessError("the emulator has not been started")
@@ -220,7 +222,7 @@ class EmulatorProcess:
 
     @property
     def running(self) -> bool:
-        """Whether the process lives."""
+        """Whether the process is running."""
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:
@@ -229,7 +231,7 @@ class EmulatorProcess:
         Raises
         ------
         EmulatorProcessError
-            It ended before, does not end, or ends with another status.
+            The process had already ended, does not end, or ends with another status.
         """
         process = self.process
         if process.poll() is not None:
@@ -249,7 +251,7 @@ class EmulatorProcess:
             raise EmulatorProcessError(f"the emulator ended with status {status}{errors}")
 
     def kill(self) -> None:
-        """Kill the process and its workers (SIGKILL), and release the resources."""
+        """Kill the process and its workers (SIGKILL) and release the resources."""
         process = self.process
         with contextlib.suppress(ProcessLookupError):  # the whole group has ended
             os.killpg(process.pid, signal.SIGKILL)
@@ -269,7 +271,7 @@ class EmulatorProcess:
         self.start()
 
     def memory_bytes(self) -> int:
-        """Return the resident memory of the process and its workers, bytes."""
+        """Return the resident memory of the process and its workers in bytes."""
         group = self.process.pid
         return sum(_resident(folder, group) for folder in Path("/proc").iterdir() if folder.name.isdigit())
 
@@ -284,7 +286,7 @@ class EmulatorProcess:
 
 
 def _resident(folder: Path, group: int) -> int:
-    """Return the resident bytes of a process of the group, 0 for any other."""
+    """Return the resident memory of a process of the group in bytes, 0 for any other process."""
     try:
         fields = (folder / "stat").read_text().rsplit(")", 1)[1].split()
     except (FileNotFoundError, ProcessLookupError):

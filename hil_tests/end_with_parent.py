@@ -1,9 +1,9 @@
-"""Run a command that the kernel ends by SIGTERM when the process that started it has ended.
+"""Run a command to which the kernel sends SIGTERM when the process that started it ends.
 
     python -m starhil.hil_tests.end_with_parent PARENT COMMAND [ARGUMENT…]
 
-PARENT is the process ID of the parent. The request to the kernel survives `exec`, so COMMAND needs
-no support for it. Linux only.
+PARENT is the process ID of the parent. The setting survives `exec`, so COMMAND needs no support for it. Linux
+only.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def exec_with_death_signal(parent: int, command: list[str]) -> None:
     if libc.prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM)) != 0:
         error = ctypes.get_errno()
         raise OSError(error, f"prctl: {os.strerror(error)}")
-    if os.getppid() != parent:  # the parent ended before the request and sends nothing any more
+    if os.getppid() != parent:  # the parent ended before prctl, so no signal will come
         signal.raise_signal(signal.SIGTERM)
     os.execv(command[0], command)  # noqa: S606 -- the command line of the bench, without a shell
 

@@ -1,4 +1,4 @@
-"""Errors of the bench: one line each, with what, where and the remedy."""
+"""Errors of the bench: one line each, with what, where and remedy."""
 
 from __future__ import annotations
 
@@ -7,14 +7,11 @@ from collections.abc import Iterable
 
 
 class BenchError(Exception):
-    """A script, port or device that the bench cannot use.
-
-    One line with what, where and the remedy.
-    """
+    """A script, port or device cannot be used; the text is one line with what, where and remedy."""
 
 
 class ScriptError(BenchError):
-    """An invalid session script; names file, step and key."""
+    """An invalid session script; the text names file, step and key."""
 
 
 class DeviceError(BenchError):
@@ -57,7 +54,7 @@ class BadReplyError(DeviceError):
 
 
 class LinkLostError(DeviceError):
-    """The port or bus under the client is gone."""
+    """The port or bus of the client was lost."""
 
 
 class EmulatorProcessError(BenchError):
@@ -65,7 +62,7 @@ class EmulatorProcessError(BenchError):
 
 
 def near_matches(name: str, known: Iterable[str]) -> str:
-    """Return a hint such as `; did you mean 'quaternion'?`, empty without a near match."""
+    """Return a hint such as `; did you mean 'quaternion'?`, or an empty text without a near match."""
     near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.55)
     if not near:
         return ""

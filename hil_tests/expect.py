@@ -1,7 +1,4 @@
-"""What a session script expects: equal, near, within bounds, one of some.
-
-An attitude against the truth.
-"""
+"""Expectations of a session script: conditions on fields, and limits of the attitude error."""
 
 from __future__ import annotations
 
@@ -25,16 +22,13 @@ from starhil.hil_tests.script_reader import TableReader
 from starhil.protocol.values import Value
 
 RELATIVE_ROUNDING: Final = 1e-6
-"""Numbers given without a tolerance may differ by the rounding of a 32-bit float."""
+"""Numbers without a tolerance may differ by the rounding of a 32-bit float."""
 
 WHOLE_DIGITS: Final = 1e4
-"""Numbers from here on are shown with six decimals, to keep the fraction of a Unix time."""
+"""Numbers from this one on are shown with six decimals, to keep the fraction of a Unix time."""
 
 CLOCK_VARIABLES: Final = ("now", "now_s", "now_ms")
-"""Variables that every script has: the OBC's Unix time in seconds; its whole seconds.
-
-Its milliseconds.
-"""
+"""Predefined variables: Unix time of the OBC in seconds, its whole seconds, and its milliseconds."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +42,7 @@ Operand = Value | Variable
 
 
 def operand(value: Any, reader: TableReader, key: str, known: frozenset[str]) -> Operand:
-    """Read a plain value or a `$name`; the name must have been captured by an earlier step."""
+    """Read a plain value or a `$name`, which an earlier step must have captured."""
     if isinstance(value, str) and value.startswith("$"):
         name = value[1:]
         if name not in known and name not in CLOCK_VARIABLES:
@@ -68,7 +62,7 @@ def resolve(value: Operand, variables: Mapping[str, Value]) -> Value:
 
 
 def show(value: Value) -> str:
-    """Return a value as people read it."""
+    """Format a value for a reader."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, float):
@@ -84,20 +78,20 @@ def show(value: Value) -> str:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What one field must be; every part that is given must hold.
+    """Conditions on one field; all that are given must hold.
 
     Attributes
     ----------
     equals : operand
-        The value, `plus` added if it is a number.
+        The expected value; `plus` is added to a number.
     within : float
-        Greatest absolute difference from `equals`, in the field's unit.
+        Largest absolute difference from `equals`, in the unit of the field.
     angle : bool
-        Compare modulo 360 degrees.
+        Whether to compare modulo 360 degrees.
     minimum, maximum, above : operand
         Bounds, the last one exclusive.
     one_of : tuple of operands
-        Values allowed.
+        Allowed values.
     differs_from : operand
         A value that is not allowed.
     """
@@ -114,7 +108,7 @@ class Expectation:
     differs_from: Operand | None = None
 
     def mismatch(self, value: Value, variables: Mapping[str, Value]) -> str | None:
-        """Return what is wrong with `value`, None if nothing is."""
+        """Return a description of the mismatch, or None if the value meets the conditions."""
         for check in (self._equality, self._bounds, self._choices):
             text = check(value, variables)
             if text is not None:
@@ -172,7 +166,7 @@ def _is_number(value: Value) -> bool:
 
 
 def read_expectation(field: str, value: Any, reader: TableReader, known: frozenset[str]) -> Expectation:
-    """Read what a script says of one field: a plain value, or a table of conditions."""
+    """Read the expectation for one field: a plain value, or a table of conditions."""
     if not isinstance(value, dict):
         return Expectation(field, equals=operand(value, reader, field, known))
     table = TableReader(value, f"{reader.location}: {field}")
@@ -210,11 +204,9 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
 
 @dataclass(frozen=True)
 class AttitudeCheck:
-    """How far a measured attitude may be from the truth, in arcseconds.
+    """Largest allowed attitude errors in arcseconds; None: not checked.
 
-    Parts not given are not judged.
-
-    `truth` is the attitude that the step itself states, None to take the script's.
+    `truth` is the attitude given in the step; None: that of the script.
     """
 
     cross_arcsec: float | None
@@ -225,7 +217,7 @@ class AttitudeCheck:
     def judge(
         self, values: Mapping[str, Value], truth: Quaternion
     ) -> tuple[AttitudeError | None, str | None]:
-        """Return the attitude error of telemetry `values`, and the problem, None if it passed."""
+        """Return the attitude error of telemetry `values`, and the problem or None."""
         try:
             measured = measured_attitude(values)
         except BenchError as refusal:
@@ -242,12 +234,12 @@ class AttitudeCheck:
 
 
 def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
-    """Return the attitude in a telemetry row that has q_x, q_y, q_z and perhaps q_w.
+    """Return the attitude in a telemetry row that has q_x, q_y, q_z and optionally q_w.
 
     Raises
     ------
     BenchError
-        The row says that its attitude is not valid, or holds none.
+        The attitude in the row is flagged invalid, or there is none.
     """
     if values.get("valid") is False:
         raise BenchError(f"the attitude is not valid (reason {show(values.get('reason', '?'))})")

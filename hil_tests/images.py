@@ -26,7 +26,7 @@ from starhil.protocol.values import Value
 
 
 class Downloader(Protocol):
-    """The part of a client that a download needs."""
+    """The methods of a client that a download uses."""
 
     bursts: asyncio.Queue[bytes]
 
@@ -43,14 +43,14 @@ class Downloader(Protocol):
 
 
 FRAME_ATTEMPTS: Final = 3
-"""How often a frame with a wrong checksum is read before the download fails."""
+"""Number of attempts to read a frame with a wrong checksum."""
 POLL_S: Final = 0.04
 """Polling period, as in public flight software."""
 
 BMP_HEADER_SIZE: Final = 54
-"""Bytes of a BMP file's two headers."""
+"""Size of the two headers of a BMP file."""
 BURST_ROUNDS: Final = 20
-"""How often the missing packets of a block are requested."""
+"""Number of requests for the missing packets of a block."""
 BURST_SILENCE_S: Final = 0.5
 """Silence that ends a burst."""
 
@@ -64,11 +64,11 @@ class Image:
     pixels : bytes
         `width * height` bytes, row by row from the top.
     bytes_received : int
-        Payload that crossed the link, repeats included.
+        Payload bytes received, including repeats.
     repeats : int
         Frames or bursts that were requested again.
     seconds : float
-        Duration of the download, capture not included.
+        Duration of the download, without the capture.
     """
 
     pixels: bytes
@@ -121,7 +121,7 @@ async def download_by_frames(client: Downloader, size: str, *, within_s: float) 
 
 
 async def _read_frame(client: Downloader, number: int) -> tuple[bytes, int]:
-    """Read the loaded frame and its checksum; return it and how often it was read."""
+    """Read the loaded frame and check it; return it and the number of attempts."""
     problem = ""
     for attempt in range(1, FRAME_ATTEMPTS + 1):
         data = (await client.read("image_frame"))["data"]
@@ -138,7 +138,7 @@ async def _read_frame(client: Downloader, number: int) -> tuple[bytes, int]:
 
 
 async def _when_not_busy(client: Downloader, name: str, within_s: float, values: Mapping[str, Value]) -> None:
-    """Send a telecommand, again while the device reports busy."""
+    """Send a telecommand, and repeat it while the device reports busy."""
     deadline = time.monotonic() + within_s
     while True:
         try:
@@ -157,7 +157,7 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image and download its file in bursts of up to 1024 numbered packets.
 
-    The header of the file, loaded first, holds its length.
+    The header of the file, loaded first, contains its length.
     """
     await save_image(client, size, within_s=within_s)
     begin = time.monotonic()
@@ -173,10 +173,7 @@ async def download_by_bursts(client: Downloader, size: str, *, within_s: float) 
 
 
 async def _download_block(client: Downloader, offset: int, length: int, within_s: float) -> tuple[bytes, int]:
-    """Load one block of the file and gather its packets.
-
-    Return it and how often packets were requested again.
-    """
+    """Load one block of the file and receive its packets; return it and the number of repeated requests."""
     await _when_not_busy(
         client,
         "load_file_block",
@@ -193,7 +190,7 @@ async def _download_block(client: Downloader, offset: int, length: int, within_s
         await asyncio.sleep(POLL_S)
         state = await client.telemetry("file_block")
     if state["length"] != length:
-        raise BadReplyError(f"file block at {offset}: {state['length']!r} bytes loaded, {length} asked for")
+        raise BadReplyError(f"file block at {offset}: {state['length']!r} bytes loaded, {length} requested")
     count = packet_count(length)
     packets: dict[int, bytes] = {}
     for repeats in range(BURST_ROUNDS):
@@ -214,7 +211,7 @@ async def _download_block(client: Downloader, offset: int, length: int, within_s
 
 
 async def _gather(client: Downloader, packets: dict[int, bytes], count: int) -> None:
-    """Take burst packets until all are there or the line is silent."""
+    """Receive burst packets until all have arrived or the line is silent."""
     while len(packets) < count:
         try:
             async with asyncio.timeout(BURST_SILENCE_S):
@@ -239,10 +236,10 @@ def bmp_file_size(header: bytes) -> int:
     Raises
     ------
     BadReplyError
-        Not the header of a BMP file.
+        The data are not the header of a BMP file.
     """
     if len(header) < BMP_HEADER_SIZE or header[:2] != b"BM":
-        raise BadReplyError(f"the downloaded file is no BMP image: it begins with {header[:8].hex(' ')}")
+        raise BadReplyError(f"the downloaded file is not a BMP image: it begins with {header[:8].hex(' ')}")
     return int(struct.unpack_from("<I", header, 2)[0])
 
 
@@ -252,17 +249,17 @@ def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     Raises
     ------
     BadReplyError
-        Not such a file, or cut short.
+        The data are not such a file, or are truncated.
     """
     if len(data) < BMP_HEADER_SIZE or data[:2] != b"BM":
-        raise BadReplyError(f"the downloaded file of {len(data)} bytes is no BMP image")
+        raise BadReplyError(f"the downloaded file of {len(data)} bytes is not a BMP image")
     (start,) = struct.unpack_from("<I", data, 10)
     width, signed_height, _planes, depth, compression = struct.unpack_from("<iiHHI", data, 18)
     height = abs(signed_height)
     stride = (width + 3) // 4 * 4
     if depth != 8 or compression != 0 or width < 1 or height < 1 or len(data) < start + stride * height:
         raise BadReplyError(
-            f"the downloaded BMP image ({width}x{height}, {depth} bits) is cut short or not 8-bit grey"
+            f"the downloaded BMP image ({width}x{height}, {depth} bits) is truncated or not 8-bit grey"
         )
     rows = [data[start + row * stride : start + row * stride + width] for row in range(height)]
     if signed_height > 0:

@@ -33,10 +33,8 @@ class Interrupted(KeyboardInterrupt):
 def interruptible() -> Iterator[None]:
     """Raise `Interrupted` in the main thread at the first SIGINT, SIGTERM or SIGHUP.
 
-    Ignore those that follow.
-
-    A signal that is ignored already (`nohup`) stays so. In another thread, which no signal reaches,
-    nothing changes.
+    Further signals are ignored, as are signals that were already ignored (`nohup`). In other threads this has
+    no effect, because signals are delivered to the main thread only.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

@@ -20,7 +20,7 @@ from starhil.protocol.transports import CanTransport, open_can
 
 HOST: Final = 1
 WARM_UP: Final = 3
-"""Number of messages ignored at the start."""
+"""Number of messages that are ignored at the start."""
 ANSWER_S: Final = 2.0
 
 SYNC: Final = 0x080
@@ -52,13 +52,15 @@ class _Arrivals:
             self.times.append(time.perf_counter())
 
     def jitter(self, what: str, end: float = inf) -> Jitter:
-        """Sum up the intervals of the messages before `end`.
+        """Summarise the intervals of the messages before `end`.
 
         Raises BenchError if there are too few.
         """
         times = [moment for moment in self.times[WARM_UP:] if moment < end]
         if len(times) < 3:
-            raise BenchError(f"jitter of {what}: only {len(self.times)} messages came; is it switched on?")
+            raise BenchError(
+                f"jitter of {what}: only {len(self.times)} messages were received; is it switched on?"
+            )
         intervals = [later - earlier for earlier, later in pairwise(times)]
         mean = fmean(intervals)
         deviations = [abs(interval - mean) for interval in intervals]
@@ -68,7 +70,7 @@ class _Arrivals:
 async def unsolicited_jitter(
     icd: InterfaceDefinition, spec: str, seconds: float, rate_hz: float, *, device: int
 ) -> Jitter:
-    """Let a device send its clock unsolicited at a rate, and measure the intervals."""
+    """Have a device send its clock unsolicited at a rate, and measure the intervals."""
     row = icd.telemetry["unix_time"]
     receiver = CanHostReceiver(HOST, device)
     answers: asyncio.Queue[Reply] = asyncio.Queue()
@@ -124,17 +126,11 @@ class _Node:
             self._answer.set_result(frame.data)
 
     async def write(self, index: int, subindex: int, value: int, size: int) -> None:
-        """Write an entry of up to four bytes.
-
-        Raises BenchError if the node refuses or does not answer.
-        """
+        """Write an entry of up to four bytes; raise BenchError if the node refuses or does not answer."""
         await self._transfer(0x23 | (4 - size) << 2, index, subindex, value)
 
     async def read(self, index: int, subindex: int) -> int:
-        """Read an entry of up to four bytes.
-
-        Raises BenchError if the node refuses or does not answer.
-        """
+        """Read an entry of up to four bytes; raise BenchError if the node refuses or does not answer."""
         return await self._transfer(0x40, index, subindex, 0)
 
     async def _transfer(self, command: int, index: int, subindex: int, value: int) -> int:
@@ -155,24 +151,24 @@ class _Node:
         return content
 
     async def prepare_tpdo(self, transmission: int, event_ms: int) -> int:
-        """Set up the first TPDO, start the node, and return the TPDO's identifier."""
+        """Configure the first TPDO, start the node, and return the CAN ID of the TPDO."""
         self.send(NMT, bytes((PRE_OPERATIONAL, self._node)))
-        identifier = await self.read(TPDO_COMMUNICATION, 1)
-        await self.write(TPDO_COMMUNICATION, 1, identifier | DISABLED, 4)
+        can_id = await self.read(TPDO_COMMUNICATION, 1)
+        await self.write(TPDO_COMMUNICATION, 1, can_id | DISABLED, 4)
         await self.write(TPDO_COMMUNICATION, 2, transmission, 1)
         await self.write(TPDO_COMMUNICATION, 5, event_ms, 2)
-        await self.write(TPDO_COMMUNICATION, 1, identifier & ~DISABLED, 4)
+        await self.write(TPDO_COMMUNICATION, 1, can_id & ~DISABLED, 4)
         self.send(NMT, bytes((OPERATIONAL, self._node)))
-        return identifier & MAX_STANDARD_ID
+        return can_id & MAX_STANDARD_ID
 
-    def send(self, identifier: int, data: bytes = b"") -> None:
-        """Send a frame with an 11-bit identifier."""
-        self._transport.send(CanFrame(identifier, data, extended=False))
+    def send(self, can_id: int, data: bytes = b"") -> None:
+        """Send a frame with an 11-bit CAN ID."""
+        self._transport.send(CanFrame(can_id, data, extended=False))
 
 
 @asynccontextmanager
 async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> AsyncIterator[_Node]:
-    """Join the bus as master of a node, which is back at its stored settings afterwards."""
+    """Join the bus as master of a node; at the end, reset the node to its stored settings."""
     transport = open_can(spec)
     master = _Node(transport, node)
 
@@ -191,7 +187,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
 
 
 async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
-    """Set a node's heartbeat period and measure the intervals."""
+    """Set the heartbeat period of a node and measure the intervals."""
     arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
     async with _joined(spec, node, arrivals.on_frame) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
@@ -216,10 +212,10 @@ async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node:
 
 
 async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> Jitter:
-    """Make a node's first TPDO synchronous, send SYNC, and measure how long the PDO takes.
+    """Make the first TPDO of a node synchronous, send SYNC, and measure the delay of the TPDO.
 
-    `deviation` holds the delays themselves, `period_ms` their mean. Raises BenchError if a SYNC
-    stays without a PDO.
+    In the result, `deviation` holds the delays and `period_ms` their mean. Raises BenchError if a SYNC is not
+    followed by the TPDO.
     """
     delays: list[float] = []
     sent_at: float | None = None
@@ -243,6 +239,6 @@ async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) 
             await asyncio.sleep(period_s)
     if len(delays) < syncs:
         raise BenchError(
-            f"jitter: {syncs - len(delays)} of {syncs} SYNCs were followed by no PDO of node {node}"
+            f"jitter: {syncs - len(delays)} of {syncs} SYNCs were not followed by a PDO of node {node}"
         )
     return Jitter("SYNC to TPDO", round(1e3 * fmean(delays), 3), len(delays), Spread.of(delays))

@@ -1,8 +1,8 @@
-"""Latency of the links while images are rendered and solved, measured from the OBC's side.
+"""Latency of the links while images are rendered and solved, measured at the OBC.
 
-An emulator process is asked for telemetry over its pty and over a CAN hub, one request at a time,
-after random pauses. In between, the same bytes go to a process that only echoes them over a pty:
-its latency is due to the machine alone; the emulator's latency is compared with it.
+Telemetry is requested from an emulator process over its pty and over a CAN hub, one request at a time, after
+random pauses. In between, the same bytes are sent to a process that only echoes them over a pty. Its latency
+is caused by the machine alone and serves as a reference.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.socketcand import format_send
 
 ROWS: Final = ("identification", "quaternion", "precise_attitude", "star_tracker", "unix_time")
-"""Telemetry rows of the CubeStar, requested in turn; of another unit all rows."""
+"""Telemetry rows of CubeStar that are requested in turn; for another unit, all rows."""
 
 PAUSE_S: Final = 0.004
 """Mean pause between two requests, seconds."""
@@ -41,7 +41,7 @@ DEVICE: Final = 4
 SETTLE_S: Final = 3.0
 """Time for viewers to start and connect, seconds."""
 BAUD: Final = 921_600
-"""High, so that the transmission time (1 ms for the longest reply) is short against the latency."""
+"""High, so that the transmission time (1 ms for the longest reply) is small compared with the latency."""
 
 ECHO: Final = (
     "import os,sys\nf=int(sys.argv[1])\ntry:\n while d:=os.read(f,4096): os.write(f,d)\nexcept OSError: pass"
@@ -87,10 +87,7 @@ class SerialRequester:
         self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
-        """Request a row.
-
-        Return the time until the last byte of the reply, s, or None without a reply.
-        """
+        """Request a row; return the time until the last byte of the reply in s, or None without a reply."""
         row = self._icd.telemetry[name]
         request = self._icd.request(row)
         self._host.expect(request, row.size)
@@ -126,10 +123,7 @@ class HubRequester:
         self._receive_until(b"< ok >")
 
     def ask(self, name: str) -> float | None:
-        """Request a row.
-
-        Return the time until the last frame of the reply, s, or None without a reply.
-        """
+        """Request a row; return the time until the last frame of the reply in s, or None without a reply."""
         row = self._icd.telemetry[name]
         frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
         begin = time.perf_counter()
@@ -144,7 +138,7 @@ class HubRequester:
 
     @staticmethod
     def _is_reply(text: bytes, row_id: int) -> bool:
-        """Return whether a line of the hub is a frame of the device's reply to this OBC."""
+        """Return whether a line from the hub is a frame of the reply to this OBC."""
         words = text.split()
         if words[:2] != [b"<", b"frame"]:
             return False
@@ -152,7 +146,7 @@ class HubRequester:
         return (can_id.id, can_id.source, can_id.destination) == (row_id, DEVICE, HOST)
 
     def _receive_until(self, end: bytes) -> bytes:
-        """Return what comes before an end, and drop both."""
+        """Receive up to an end mark; return the bytes before it."""
         while end not in self._buffer:
             data = self._socket.recv(4096)
             if not data:
@@ -180,7 +174,7 @@ class EchoRequester:
         self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
-        """Send the bytes of a request; return the time until their echo, s, or None without one."""
+        """Send the bytes of a request; return the time until their echo in s, or None without an echo."""
         request = self._stack.encode_request(self._icd.request(self._icd.telemetry[name]))
         begin = time.perf_counter()
         os.write(self._fd, request)
@@ -197,11 +191,11 @@ class EchoRequester:
 
 
 PAIRS: Final = 4
-"""Turns in which the time of a rate is spent without and with viewers."""
+"""Number of alternations between measurements without and with viewers."""
 
 
 class Viewers:
-    """Processes that view the console of an emulator."""
+    """Viewers of the console of an emulator, one process each."""
 
     def __init__(self, address: str, count: int) -> None:
         command = [sys.executable, "-m", "starhil.hil_tests.console_viewer", address]
@@ -235,9 +229,9 @@ def measure(
     worker
         `process` or `thread`.
     report
-        Called with the progress.
+        Called with progress messages.
     viewers
-        Number of viewers of the console; each rate is then measured without and with them, in turns.
+        Number of viewers of the console; each rate is measured alternately without and with them.
     """
     icd = load_unit(unit)
     rows: list[LatencyRow] = []
@@ -278,7 +272,7 @@ def _probes(
 ) -> dict[str, Callable[[str], float | None]]:
     """Open the links that the emulator has, and the echo process for comparison."""
     if "serial" not in ready:
-        raise BenchError(f"bench latency: unit {icd.name} has no serial link to be measured")
+        raise BenchError(f"bench latency: unit {icd.name} has no serial link to measure")
     opened: dict[str, SerialRequester | HubRequester | EchoRequester] = {
         "serial": SerialRequester(ready["serial"], icd)
     }
@@ -292,7 +286,7 @@ def _probes(
 
 @dataclass(frozen=True)
 class _Watched:
-    """The console's address, and how many viewers it gets."""
+    """Address of the console, and number of its viewers."""
 
     address: str
     viewers: int
@@ -307,7 +301,7 @@ def _measure_rate(
     rng: random.Random,
     watched: _Watched,
 ) -> list[LatencyRow]:
-    """Measure the links at one update rate, without viewers and with them in turns."""
+    """Measure the links at one update rate, alternately without and with viewers."""
     counts = (0, watched.viewers) if watched.viewers else (0,)
     taken: dict[int, dict[str, list[float]]] = {count: {link: [] for link in probes} for count in counts}
     lost = {count: dict.fromkeys(probes, 0) for count in counts}
@@ -332,7 +326,7 @@ def _measure_links(
     taken: Mapping[str, list[float]],
     lost: dict[str, int],
 ) -> None:
-    """Ask each link in turn for some time, and add latencies, ms, and losses."""
+    """Send requests on each link in turn for some time, and add latencies in ms and losses."""
     end = time.monotonic() + seconds
     count = 0
     while time.monotonic() < end:

@@ -30,23 +30,23 @@ Item = TypeVar("Item", bytes, CanFrame)
 
 
 class HostLink(ABC, Generic[Item]):
-    """Sends requests, and passes on replies, faults and raw items as they arrive.
+    """Sends requests, and passes on replies, faults and raw items.
 
     Parameters
     ----------
     transport : Transport
         Port or bus.
     description : str
-        What the link is connected to, for error messages.
+        Name of the port or bus, for error messages.
     log : WireLog, optional
         Log of all items.
 
     Attributes
     ----------
     on_reply : callable
-        Called with each reply, unsolicited ones included.
+        Called with each reply, including unsolicited ones.
     on_fault : callable
-        Called for input that forms no message.
+        Called for invalid input.
     on_raw : callable or None
         Called with each item before it is decoded: bytes on serial, frames on CAN.
     """
@@ -72,7 +72,7 @@ class HostLink(ABC, Generic[Item]):
 
     @abstractmethod
     def reset_receiver(self) -> None:
-        """Discard the beginning of a reply that is no longer awaited."""
+        """Discard an incomplete reply that is no longer awaited."""
 
     async def start(self) -> None:
         """Open the port or join the bus."""
@@ -93,7 +93,7 @@ class HostLink(ABC, Generic[Item]):
         Raises
         ------
         LinkLostError
-            The port or bus accepts nothing.
+            The port or bus accepts no data.
         """
         if self._log is not None:
             self._log.sent(item)
@@ -101,7 +101,7 @@ class HostLink(ABC, Generic[Item]):
             raise LinkLostError(f"{self.description}: accepts no data")
 
     def check(self) -> None:
-        """Raise LinkLostError if the port or bus is gone."""
+        """Raise LinkLostError if the port or bus was lost."""
         if self._lost is not None:
             raise LinkLostError(f"{self.description}: {self._lost}")
 
@@ -129,7 +129,7 @@ class HostLink(ABC, Generic[Item]):
 
 
 class SerialHostLink(HostLink[bytes]):
-    """A serial line, framed as the unit's definition says.
+    """A serial line with the framing of the unit's definition.
 
     Parameters
     ----------
@@ -168,7 +168,7 @@ class SerialHostLink(HostLink[bytes]):
         self.send(self._stack.encode_request(request))
 
     def reset_receiver(self) -> None:
-        """Discard the beginning of a reply."""
+        """Discard an incomplete reply."""
         self._receiver = self._stack.host(self._dialect)
 
 

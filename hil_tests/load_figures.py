@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Spread:
-    """Median, 99th percentile and greatest of some durations, milliseconds."""
+    """Median, 99th percentile and maximum of durations in milliseconds."""
 
     p50_ms: float
     p99_ms: float
@@ -42,11 +42,11 @@ class CanLoad:
     """Refusals, replies with a wrong length or value, and framing faults."""
     latency: Spread
     machine: Spread
-    """Latency of an echo process on the same bus: the machine's share."""
+    """Latency of an echo process on the same bus, which is caused by the machine."""
 
     @property
     def good(self) -> bool:
-        """Whether nothing was lost and every reply right."""
+        """Whether nothing was lost and every reply was right."""
         return not (self.lost or self.disordered or self.unanswered or self.wrong) and self.requests > 0
 
 
@@ -59,11 +59,11 @@ class SerialLoad:
     sent_bytes: int
     received_bytes: int
     sent_share: float
-    """Part of the line's capacity that was used, 0 to 1."""
+    """Fraction of the line's capacity that was used, 0 to 1."""
     received_share: float
     exchanges: int
     wrong: int
-    """Wrong replies, framing faults, and error flags that the device reports."""
+    """Wrong replies, framing faults, and error flags reported by the device."""
 
     @property
     def good(self) -> bool:
@@ -80,4 +80,4 @@ class Jitter:
     """Mean interval."""
     messages: int
     deviation: Spread
-    """Distance of each interval from the mean."""
+    """Deviation of each interval from the mean."""

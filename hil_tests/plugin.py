@@ -1,4 +1,4 @@
-"""Pytest plugin: fixtures that put a star sensor on a serial line or a CAN bus, emulated or real.
+"""Pytest plugin: fixtures for a star sensor on a serial line or a CAN bus, emulated or real.
 
 In a test::
 
@@ -6,12 +6,11 @@ In a test::
         starhil_serial.command("set_mode", mode="lost_in_space")
         starhil_serial.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20)
 
-Without options an emulator process is started once per module and ended after it. With
-`--starhil-serial DEV` or `--starhil-can CHANNEL` the same tests run against the unit that is
-connected there. The time-out of a reply is `--starhil-timeout` seconds; a test that needs another
-passes `timeout_s`.
+Without options, an emulator process is started once per module and ended after it. With `--starhil-serial DEV`
+or `--starhil-can CHANNEL`, the same tests run against a connected unit. The time-out of a reply is
+`--starhil-timeout` seconds; a test that needs another one passes `timeout_s`.
 
-pytest loads this module in every run, so it imports the bench only when a fixture is used.
+pytest loads this module in every run, so the bench is imported only when a fixture is used.
 """
 
 from __future__ import annotations
@@ -28,14 +27,14 @@ if TYPE_CHECKING:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options that name a unit or the emulator's profile."""
+    """Add options that name a unit or the profile of the emulator."""
     group = parser.getgroup("starhil", "star sensor under test")
     group.addoption("--starhil-serial", metavar="DEV", help="serial port of a unit, instead of an emulator")
     group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, instead of an emulator")
     group.addoption(
         "--starhil-dialect",
         metavar="a|b|c",
-        help="form of serial replies, of a unit that has several (default b)",
+        help="format of serial replies, for a unit that has several (default b)",
     )
     group.addoption(
         "--starhil-unit",
@@ -56,10 +55,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 def starhil_emulator(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[EmulatorProcess]:
-    """Start an emulator on a pty and on a CAN bus (vcan0, else a private hub).
+    """Start an emulator on a pty and on a CAN bus (vcan0, or else a private hub).
 
-    `.ready` holds its ready line. SIGTERM ends it after the last test of the module; an exit status
-    other than 0 is an error.
+    `.ready` has the fields of its ready line. It is ended with SIGTERM after the last test of the module; an
+    exit status other than 0 is an error.
     """
     from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
     from starhil.hil_tests.private_can_bus import private_can_bus

@@ -9,7 +9,7 @@ from starid.files import write_atomically
 
 
 def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
-    """Write a grey image; the file is complete or not there.
+    """Write a grey image atomically.
 
     Parameters
     ----------

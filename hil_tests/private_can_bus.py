@@ -1,4 +1,4 @@
-"""A CAN bus for one run: vcan0 if the kernel has it, else a TCP hub at a free port."""
+"""A CAN bus for one run: vcan0 if the kernel has it, or else a TCP hub on a free port."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starhil.protocol.transports.can import kernel_can_is_up
 
 
 class HubThread:
-    """A TCP hub at a free port in a thread; a context manager. `channel` is what clients open."""
+    """A TCP hub on a free port in a thread; a context manager. Clients open `channel`."""
 
     def __init__(self) -> None:
         self._loop = LoopThread("can-hub")
@@ -33,7 +33,7 @@ class HubThread:
         return 0 if self._hub is None else self._hub.port
 
     def stop(self) -> None:
-        """End the hub; `start` may follow."""
+        """Stop the hub; it can be started again."""
         if self._hub is not None:
             self._loop.run(self._hub.close())
             self._hub = None
@@ -52,7 +52,7 @@ class HubThread:
 
 @contextmanager
 def private_can_bus() -> Iterator[str]:
-    """Give a run a CAN bus, and yield its channel: vcan0 if the kernel has it, else a private hub."""
+    """Yield the channel of a CAN bus: vcan0 if the kernel has it, or else a private hub."""
     if kernel_can_is_up(DEFAULT_BUS):
         yield DEFAULT_BUS
         return

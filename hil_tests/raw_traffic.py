@@ -1,4 +1,4 @@
-"""Send raw bytes or CAN frames, and compare the answer with a pattern."""
+"""Sending of raw bytes or CAN frames, and comparison of the answer with a pattern."""
 
 from __future__ import annotations
 
@@ -24,34 +24,34 @@ def parse_frame(text: str) -> CanFrame:
     Raises
     ------
     BenchError
-        Not such a text.
+        The text is not in this format.
     """
     compact = text.replace(" ", "")
     match = _FRAME.fullmatch(compact)
     if match is None or ".." in compact:
         raise BenchError(f"not a CAN frame in the format of cansend: {text!r}")
-    identifier, data = match.groups()
+    can_id, data = match.groups()
     try:
         if data == "R":
-            return CanFrame(int(identifier, 16), b"", len(identifier) == 8, remote=True)
-        return CanFrame(int(identifier, 16), bytes.fromhex(data), len(identifier) == 8)
+            return CanFrame(int(can_id, 16), b"", len(can_id) == 8, remote=True)
+        return CanFrame(int(can_id, 16), bytes.fromhex(data), len(can_id) == 8)
     except ProtocolError as error:
         raise BenchError(f"{text!r}: {error}") from None
 
 
 def format_frame(frame: CanFrame) -> str:
     """Format a frame for `cansend`."""
-    identifier = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    return f"{identifier}#{'R' if frame.remote else frame.data.hex().upper()}"
+    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    return f"{can_id}#{'R' if frame.remote else frame.data.hex().upper()}"
 
 
 def pattern(text: str) -> str:
-    """Normalise the pattern of an answer: no blanks, capitals; `..` stands for any byte.
+    """Normalise the pattern of an answer: capitals without blanks; `..` matches any byte.
 
     Raises
     ------
     BenchError
-        Not hexadecimal bytes or a frame.
+        The text is neither hexadecimal bytes nor a frame.
     """
     compact = text.replace(" ", "").upper()
     if _BYTES.fullmatch(compact) is None and _FRAME.fullmatch(compact) is None:
@@ -60,7 +60,7 @@ def pattern(text: str) -> str:
 
 
 def matches(expected: str, seen: str) -> bool:
-    """Return whether hexadecimal bytes or a frame match a pattern; `..` stands for any byte."""
+    """Return whether hexadecimal bytes or a frame match a pattern; `..` matches any byte."""
     return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
 
 
@@ -71,22 +71,20 @@ def send_and_listen(
     wanted: tuple[str, ...] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
-    """Send bytes (serial) or frames (CAN).
-
-    Return the answer as one text of bytes, or as frames of the device.
+    """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.
 
     Parameters
     ----------
     client
         The open link.
     data
-        What to send, in hexadecimal or in the format of `cansend`.
+        Data to send, in hexadecimal or in the format of `cansend`.
     listen_s
-        Shortest time to listen, s.
+        Minimum time to listen, s.
     wanted
         Patterns of the answer.
     timeout_s
-        Longest time to wait for such an answer, s; None: the client's time-out.
+        Maximum time to wait for such an answer, s; None: the time-out of the client.
     """
     return client.run(_send_and_listen(client, data, listen_s, wanted, timeout_s))
 

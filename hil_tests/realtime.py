@@ -1,4 +1,4 @@
-"""Real-time priority for the processes of a link on a busy machine."""
+"""Real-time priority for processes, for use on a busy machine."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PRIORITY = 1
 
 
 def set_realtime_priority(process: int = 0) -> None:
-    """Give a process (0: this one) real-time priority; its later children do not inherit it.
+    """Give a process (0: this one) real-time priority, which its later children do not inherit.
 
     Raises
     ------

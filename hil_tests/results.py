@@ -22,7 +22,7 @@ SKIPPED: Final = "skipped"
 NOT_RUN: Final = "not run"
 """Status of a case that was not run; skipped in a JUnit file."""
 SHOWN_VALUES: Final = 6
-"""Values of a row that the one line of a step shows."""
+"""Number of values of a row shown in the line of a step."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,13 @@ class StepResult:
     status : str
         `passed`, `failed` or `skipped`.
     detail : str
-        What was observed, or what is wrong.
+        What was observed, or the problem.
     seconds : float
-        Duration of the step, repeats and waits included.
+        Duration of the step, including repeats and waits.
     latency_s : float or None
-        Greatest latency of its transactions.
+        Largest latency of its transactions.
     values : mapping
-        The last telemetry read.
+        The telemetry read last.
     figures : mapping
         Numbers that the step computed, such as the attitude error.
     """
@@ -81,7 +81,7 @@ class SessionResult:
     results: tuple[StepResult, ...]
     seconds: float
     interruption: Interrupted | None = None
-    """The signal that ended it before its last step."""
+    """The signal that ended the session before its last step."""
 
     def count(self, status: str) -> int:
         """Return how many steps ended with a status."""
@@ -89,7 +89,7 @@ class SessionResult:
 
     @property
     def passed(self) -> bool:
-        """Whether it ran to its end, no step failed and at least one passed."""
+        """Whether the session was complete, no step failed and at least one passed."""
         return self.interruption is None and self.count(FAILED) == 0 and self.count(PASSED) > 0
 
     def to_json(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ def summarize(values: Mapping[str, Value]) -> str:
 class TestCase:
     """One case of a JUnit file."""
 
-    __test__ = False  # pytest is not to collect it
+    __test__ = False  # pytest must not collect it
 
     suite: str
     name: str
@@ -127,7 +127,7 @@ class TestCase:
 
 
 def prepare_report(path: Path) -> None:
-    """Create the folder of a report; called before the run, so that no run is lost.
+    """Create the folder of a report; called before the run, so that its results are not lost.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def prepare_report(path: Path) -> None:
 
 
 def write_report(path: Path, data: bytes) -> None:
-    """Write a report atomically, or into a device or the standard output; create its folder if needed.
+    """Write a report atomically, or to a device or standard output; create its folder if needed.
 
     Raises
     ------
@@ -192,12 +192,12 @@ def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float
 
 
 def _printable(text: str) -> str:
-    """Replace what XML 1.0 cannot carry."""
+    """Replace characters that XML 1.0 cannot carry."""
     return "".join(ch if ch in "\t\n" or ord(ch) >= 0x20 else "\N{REPLACEMENT CHARACTER}" for ch in text)
 
 
 def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
-    """Return a session's steps as JUnit cases."""
+    """Return the steps of a session as JUnit cases."""
     return [
         TestCase(
             suite,
@@ -214,10 +214,7 @@ def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
 
 
 def percentile(values: Sequence[float], part: float) -> float:
-    """Return the value below which `part` (0 to 1) of the values lie (nearest rank).
-
-    NaN for none.
-    """
+    """Return a percentile of values by the nearest rank, NaN without values; `part` is 0 to 1."""
     if not values:
         return math.nan
     ordered = sorted(values)

@@ -19,14 +19,14 @@ log = logging.getLogger("starhil.bench")
 
 TIMEOUT_S: Final = 5.0
 MAX_WAITING: Final = 5000
-"""Results that may wait for a slow console; more are not shown there."""
+"""Number of results that may wait for a slow console; further ones are not shown."""
 
 ENDED_WITHIN_S: Final = 10.0
-"""Longest time that the end of a run waits for the console, seconds."""
+"""Maximum time for which the end of a run waits for the console, seconds."""
 
 
 class RunFeed:
-    """Sends results in its own thread; a console that fails or ends does not hold up the run.
+    """Sends results in a separate thread; a console that fails or ends does not delay the run.
 
     Parameters
     ----------
@@ -35,9 +35,9 @@ class RunFeed:
     kind
         `session` or `conformance`.
     title, unit
-        What is run, and on which unit.
+        Name of the run, and the unit under test.
     planned
-        Number of results to expect; 0 if it is not known.
+        Expected number of results; 0 if unknown.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class RunFeed:
             log.debug("console: a result was dropped")
 
     def close(self) -> None:
-        """Report the end, once everything before it was sent."""
+        """Report the end of the run, after all results have been sent."""
         try:
             self._waiting.put({"event": "end"}, timeout=ENDED_WITHIN_S)
             self._waiting.put(None, timeout=ENDED_WITHIN_S)
@@ -128,18 +128,18 @@ class RunFeed:
 
 
 def console_address(view: str, emulator: EmulatorProcess | None) -> str:
-    """Return the address of the console; for `auto`, print and return the started emulator's.
+    """Return the address of the console; for `auto`, print and return that of the started emulator.
 
     Raises
     ------
     BenchError
-        `auto`, and no emulator was started.
+        `auto` was given, but no emulator was started.
     """
     if view != "auto":
         return view
     if emulator is None or "view" not in emulator.ready:
         raise BenchError(
-            "--view auto needs --start; otherwise give the address of the ready line of `starhil run --view`"
+            "--view auto needs --start; otherwise give the address from the ready line of `starhil run --view`"
         )
     print(f"console: {emulator.ready['view'].replace('/?', '/runs?')}", file=sys.stderr, flush=True)
     return emulator.ready["view"]

@@ -26,9 +26,8 @@
     within_s = 20                   # ask again until the expectations hold
     attitude = { within_arcsec = 30, roll_within_arcsec = 120 }
 
-Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names
-come from the interface definition; the error for an unknown one names file, step and near
-matches.
+Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names are those
+of the interface definition; the error for an unknown name gives file, step and near matches.
 """
 
 from __future__ import annotations
@@ -79,7 +78,7 @@ from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import Parameter, Value
 
 LISTED: Final = "; `starhil icd list` lists all"
-"""Hint where no known name is near."""
+"""Hint if no known name is similar."""
 
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 
@@ -90,7 +89,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     Raises
     ------
     ScriptError
-        The file cannot be read, is no TOML, or does not match the interface definition; names file,
+        The file cannot be read, is not TOML, or does not match the interface definition; the text gives file,
         step and near matches.
     """
     try:
@@ -104,7 +103,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
 
 
 class _Checker:
-    """Validates the tables of one file; holds the variables that earlier steps captured."""
+    """Validates the tables of one file, with the variables that earlier steps captured."""
 
     def __init__(self, path: Path, icd: InterfaceDefinition) -> None:
         self._path = path
@@ -129,7 +128,7 @@ class _Checker:
         tables = reader.sub_tables("step")
         reader.reject_unknown_keys()
         if not tables:
-            reader.fail("holds no step: write [[step]] and one of the actions under it")
+            reader.fail("has no steps: write [[step]] and one of the actions below it")
         steps = tuple(self._step(number, item) for number, item in enumerate(tables, start=1))
         return Script(self._path, title, doc, truth, emulator, timeout_s, retries, keep_going, link, steps)
 
@@ -193,7 +192,7 @@ class _Checker:
         return reader.choice("link", LINKS) if reader.has("link") else None
 
     def _answer_row(self, action: Action) -> Row | None:
-        """Return the row of the action's answer, None if it has no values."""
+        """Return the row of the answer to an action, or None if it has no values."""
         if isinstance(action, Read | Listen | Sample):
             return action.row
         if isinstance(action, GetParameter):
@@ -222,7 +221,7 @@ class _Checker:
             reader.fail("'attitude' needs a step that reads a row with a quaternion (attitude, quaternion)")
         check = read_attitude_check(reader.sub("attitude"))
         if check.truth is None and not self._has_truth:
-            reader.fail("'attitude' has no truth to compare with: give it here or in a table [truth]")
+            reader.fail("'attitude' has no truth to compare with: give one here or in a table [truth]")
         return check
 
     def _captures(self, reader: TableReader, row: Row | None) -> dict[str, str]:
@@ -243,9 +242,9 @@ class _Checker:
             )
 
     def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> Expectation:
-        """Reject an expectation that can never hold: wrong type, or no name of the enumeration.
+        """Reject an expectation that can never hold: wrong type, or unknown name of an enumeration.
 
-        Hexadecimal text is converted to bytes for a field of bytes.
+        For a field of bytes, hexadecimal text is converted.
         """
         if row is None:
             return expectation
@@ -299,7 +298,7 @@ class _Checker:
         raw = reader.hex_bytes("with_hex") if reader.has("with_hex") else None
         given = reader.value("with", {})
         if not isinstance(given, dict) or (given and raw is not None):
-            reader.fail("give the parameters as a table 'with' or as bytes 'with_hex'")
+            reader.fail("give the parameters as a table 'with' or as bytes 'with_hex', not both")
         place = TableReader(given, f"{reader.location}: with")
         for name in given:
             self._check_field(place, row, name)
@@ -356,11 +355,11 @@ class _Checker:
             except ProtocolError as error:
                 reader.fail(str(error))
         elif isinstance(value, str):
-            reader.fail("'value' must be a number where a refusal is expected")
+            reader.fail("'value' must be a number if a refusal is expected")
         return SetParameter(parameter, value, refused), f"set parameter {parameter.name}"
 
     def get_parameter(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a parameter to be asked for."""
+        """Read a request for a parameter."""
         parameter = self._parameter(reader, "get_parameter")
         return GetParameter(parameter), f"get parameter {parameter.name}"
 
@@ -388,9 +387,7 @@ class _Checker:
         except (BenchError, ValueError) as error:
             reader.fail(f"'send' or 'answer': {error}")
         if len(kinds) != 1:
-            reader.fail(
-                "'send' takes bytes in hexadecimal or CAN frames in the format of cansend, not both or none"
-            )
+            reader.fail("'send' takes bytes in hexadecimal or CAN frames in the format of cansend, not both")
         listen_s = reader.number("listen_s", 0.3, minimum=0.0)
         return Send(kinds.pop(), data, answer, listen_s), "send raw data"
 
@@ -405,7 +402,7 @@ class _Checker:
         return Restart(signal), f"restart the emulator ({signal})"
 
     def _file_name(self, reader: TableReader, key: str, default: str | None = None) -> str:
-        """Read the name of a file to write, which stays inside the log folder."""
+        """Read the name of a file to write in the log folder."""
         name = reader.text(key, default)
         if name in {"", ".."} or Path(name).name != name or "\0" in name:
             reader.fail(f"'{key}' must be a plain file name; the file is written to the log folder")

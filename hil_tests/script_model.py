@@ -26,9 +26,9 @@ class Command:
     row: Row
     values: Mapping[str, Operand]
     raw: bytes | None
-    """Raw parameters instead of `values`, for malformed telecommands."""
+    """Data as bytes instead of `values`, for malformed telecommands."""
     refused: str | None
-    """Name of the expected error code; None if the device must accept."""
+    """Name of the expected error code; None if the telecommand must be accepted."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Listen:
 
 @dataclass(frozen=True)
 class Sample:
-    """Read a telemetry row over and over into a CSV file."""
+    """Read a telemetry row repeatedly into a CSV file."""
 
     row: Row
     every_s: float
@@ -72,14 +72,14 @@ class SetParameter:
 
 @dataclass(frozen=True)
 class GetParameter:
-    """Read a parameter by name; expectations are on the fields of the row `parameter`."""
+    """Read a parameter by name; expectations refer to the fields of the row `parameter`."""
 
     parameter: Parameter
 
 
 @dataclass(frozen=True)
 class DownloadImage:
-    """Have an image saved, download it and write it as a PNG file."""
+    """Save an image in the unit, download it and write it as a PNG file."""
 
     file: str
     size: str
@@ -137,7 +137,7 @@ class Step:
     repeat: int
     every_s: float
     within_s: float | None
-    """Try again until the expectations hold, at most this long."""
+    """Repeat until the expectations hold, for at most this long."""
     timeout_s: float | None
     retries: int
     max_latency_s: float | None

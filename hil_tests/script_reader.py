@@ -12,14 +12,14 @@ from starhil.hil_tests.errors import ScriptError, near_matches
 
 @dataclass
 class TableReader:
-    """One table of a script, whose known keys are read one by one.
+    """One table of a script; reading a key makes it known.
 
     Attributes
     ----------
     table : mapping
         The parsed TOML table.
     location : str
-        Location, with which error messages begin: `first_light.toml: step 3 (read attitude)`.
+        Beginning of error messages, such as `first_light.toml: step 3 (read attitude)`.
     """
 
     table: Mapping[str, Any]
@@ -31,7 +31,7 @@ class TableReader:
         raise ScriptError(f"{self.location}: {text}")
 
     def has(self, key: str) -> bool:
-        """Return whether the key is present; it counts as known from now on."""
+        """Return whether the key is present, and make it known."""
         self._known.add(key)
         return key in self.table
 
@@ -43,7 +43,7 @@ class TableReader:
         """Return a text; without a default the key is required."""
         value = self.value(key, default)
         if not isinstance(value, str):
-            self.fail(f"'{key}' must be a text" + ("" if self.has(key) else ", and is missing"))
+            self.fail(f"'{key}' must be a text" + ("" if self.has(key) else ", but is missing"))
         return value
 
     def flag(self, key: str, *, default: bool) -> bool:
@@ -57,7 +57,7 @@ class TableReader:
         """Return a finite number not below `minimum`; without a default the key is required."""
         value = self.value(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            self.fail(f"'{key}' must be a number" + ("" if self.has(key) else ", and is missing"))
+            self.fail(f"'{key}' must be a number" + ("" if self.has(key) else ", but is missing"))
         if value < minimum:
             self.fail(f"'{key}' must be at least {minimum:g}, not {value:g}")
         return float(value)
@@ -95,7 +95,7 @@ class TableReader:
         return tuple(values)
 
     def choice(self, key: str, allowed: Collection[str], default: str | None = None) -> str:
-        """Return a text that is one of those allowed."""
+        """Return a text that must be one of the allowed ones."""
         value = self.text(key, default)
         if value not in allowed:
             self.fail(

@@ -1,6 +1,6 @@
-"""Load on both directions of a serial line at once, with a check of every reply.
+"""Full load in both directions of a serial line, with a check of every reply.
 
-It talks to a device over its line only, so it measures a real unit as well as the emulator.
+It talks to a device over the line only, so it can measure a real unit as well as the emulator.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from starhil.protocol.transports import SerialTransport, open_serial
 
 REPLY_WITHIN_S: Final = 2.0
 MAPS_BETWEEN_STARS: Final = (6, 6, 6, 7)
-"""Long telecommands after each long telemetry: with these, as many bytes go out as come in."""
+"""Number of long telecommands per long telemetry row, which balances both directions of the line."""
 PIPELINE: Final = 60
-"""Exchanges under way at once, so that both directions of the line stay busy."""
+"""Number of concurrent exchanges, so that both directions of the line stay busy."""
 
 
 class _SerialPipeline:
-    """Keeps several exchanges under way: long telecommands out, long telemetry back."""
+    """Keeps several exchanges active: long telecommands out, long telemetry back."""
 
     def __init__(self, icd: InterfaceDefinition, dialect: Dialect) -> None:
         stars = icd.telemetry["identified_stars"]
@@ -46,7 +46,7 @@ class _SerialPipeline:
 
     @property
     def under_way(self) -> int:
-        """Requests whose replies are still to come."""
+        """Number of requests without a reply yet."""
         return len(self._under_way)
 
     def next_request(self) -> bytes:
@@ -56,14 +56,14 @@ class _SerialPipeline:
         return self.request(request, size)
 
     def request(self, request: Request, size: int) -> bytes:
-        """Note a request as under way and return it as bytes."""
+        """Record a request as active and return it as bytes."""
         self._under_way.append((request, size))
         if len(self._under_way) == 1:
             self._receiver.expect(request, size)
         return encode_request(request)
 
     def take(self, data: bytes) -> None:
-        """Decode message by message, since dialect b must know the next request."""
+        """Decode message by message, because in dialect b each reply needs its request."""
         self.received += len(data)
         start = 0
         while start < len(data):
@@ -75,10 +75,7 @@ class _SerialPipeline:
         self._came.set()
 
     async def drain(self, left: int) -> bool:
-        """Wait until no more than `left` requests are under way.
-
-        False if the line is silent for `REPLY_WITHIN_S` before.
-        """
+        """Wait until at most `left` requests are active; return False after `REPLY_WITHIN_S` of silence."""
         while self.under_way > left:
             self._came.clear()
             try:
@@ -108,13 +105,13 @@ async def load_serial(
     Parameters
     ----------
     icd
-        Interface definition of the CubeStar.
+        Interface definition of CubeStar.
     spec
-        The port, as `open_serial` takes it.
+        The port, as for `open_serial`.
     seconds
         Duration.
     baud, dialect
-        As the device has them.
+        Bit rate and dialect of the device.
     """
     pipeline = _SerialPipeline(icd, dialect)
     transport = open_serial(spec, baud)
@@ -146,7 +143,7 @@ async def load_serial(
 async def _error_flags(
     icd: InterfaceDefinition, transport: SerialTransport, pipeline: _SerialPipeline
 ) -> int:
-    """Count the error flags that the device reports of its serial link."""
+    """Return the number of error flags that the device reports for its serial link."""
     row = icd.telemetry["communication_status"]
     transport.send(pipeline.request(Request.of(row.id), row.size))
     if not await pipeline.drain(0) or len(pipeline.last) != row.size:

@@ -55,7 +55,7 @@ class Outcome:
     Attributes
     ----------
     problem : str or None
-        What is wrong; None if it passed.
+        The problem; None if the attempt passed.
     detail : str
         What was observed.
     values : mapping
@@ -63,7 +63,7 @@ class Outcome:
     figures : dict
         Computed numbers.
     latency_s : float or None
-        Greatest latency.
+        Largest latency.
     """
 
     problem: str | None = None
@@ -74,16 +74,16 @@ class Outcome:
 
 
 class SessionRunner:
-    """Runs one script on one bench.
+    """Runs a script on a bench.
 
     Parameters
     ----------
     script : Script
         Script from `load_script`.
     bench : Bench
-        Bench, with its emulator started.
+        Bench whose emulator has been started.
     folder : Path
-        Folder of CSV and image files.
+        Folder for CSV and image files.
     on_result : callable
         Called with each result.
     truth_path : Path, optional
@@ -110,10 +110,10 @@ class SessionRunner:
         self._truth_log = None if path is None else TruthLogReader(path)
 
     def run(self) -> SessionResult:
-        """Run all steps; after a failed one skip the rest unless the script sets `keep_going`.
+        """Run all steps; after a failed one skip the others, unless the script sets `keep_going`.
 
-        A signal, whether it comes in a step or while a result is shown, ends the run; what has
-        run keeps its result.
+        A signal, whether during a step or while a result is shown, ends the run; the results of earlier steps
+        are kept.
         """
         begin = time.monotonic()
         planned = [(step, link) for step in self._script.steps for link in self._links_of(step)]
@@ -178,7 +178,7 @@ class SessionRunner:
         )
 
     def _try_until_passed(self, step: Step, link: str) -> Outcome:
-        """Try an action once, or until its expectations hold or its time is up."""
+        """Try an action once, or repeatedly until its expectations hold or its time is over."""
         deadline = None if step.within_s is None else time.monotonic() + step.within_s
         while True:
             outcome = self._try_once(step, link)
@@ -271,7 +271,7 @@ class SessionRunner:
 
     @staticmethod
     def _expect_acceptance_or_refusal(act: Callable[[], float], refused: str | None) -> Outcome:
-        """Send a request that must be accepted, or refused with the code that `refused` names."""
+        """Send a request that must be accepted, or refused with the code named by `refused`."""
         try:
             latency = act()
         except NackError as error:
@@ -351,10 +351,10 @@ class SessionRunner:
         detail = f"{count} samples in {action.file}, " + " ".join(f"{k}={v:.4g}" for k, v in figures.items())
         problem = None
         if good < action.at_least:
-            problem = f"{len(problems)} of {count} samples not as expected; the last one: {problems[-1]}"
+            problem = f"{len(problems)} of {count} samples did not meet the expectations; the last one: {problems[-1]}"
         elif count < action.min_samples:
             problem = (
-                f"only {count} samples came in {action.for_s:g} s, expected at least {action.min_samples}"
+                f"only {count} samples arrived in {action.for_s:g} s, expected at least {action.min_samples}"
             )
         return Outcome(problem, detail, last.values, figures, max(latencies))
 
@@ -413,7 +413,7 @@ class SessionRunner:
             if self._truth_log is None:
                 raise BenchError(f"step {step.number}: no truth to compare the attitude with")
             if "time_of_exposure" not in reading.values:
-                raise BenchError(f"step {step.number}: {reading.name} carries no time; read precise_attitude")
+                raise BenchError(f"step {step.number}: {reading.name} has no time; read precise_attitude")
             truth = self._truth_log.at(float(reading["time_of_exposure"]))
         error, problem = check.judge(reading.values, truth)
         if error is not None:
@@ -431,7 +431,7 @@ class SessionRunner:
 
 
 def _whole_as_integer(value: Value) -> Value:
-    """Return a whole float, such as a captured value, as an integer."""
+    """Convert a float with an integer value, such as a captured one, to an integer."""
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 

@@ -59,12 +59,12 @@ class SessionRequest:
 
 
 def find_script(path: Path) -> Path:
-    """Return the script file; a bare name refers to a shipped script.
+    """Return the script file; a plain name refers to a bundled script.
 
     Raises
     ------
     ScriptError
-        There is none; offers near names.
+        There is no such script; the text suggests similar names.
     """
     if path.is_file():
         return path
@@ -72,7 +72,7 @@ def find_script(path: Path) -> Path:
     if str(path) in shipped:
         return shipped[str(path)]
     raise ScriptError(
-        f"{path}: no such session script{near_matches(path.stem, shipped)} (shipped: {', '.join(shipped)})"
+        f"{path}: no such session script{near_matches(path.stem, shipped)} (bundled: {', '.join(shipped)})"
     )
 
 
@@ -110,7 +110,7 @@ def run_session(request: SessionRequest) -> SessionResult:
         if result is None:
             raise
         end = StepResult(
-            len(script.steps) + 1, "the emulator lasts until it is ended", "", FAILED, str(error), 0.0
+            len(script.steps) + 1, "the emulator runs until it is ended", "", FAILED, str(error), 0.0
         )
         show(end)
         result = replace(result, results=(*result.results, end))
@@ -135,7 +135,7 @@ def _open_bench(
     folder: Path,
     stack: ExitStack,
 ) -> Bench:
-    """Open the bench with its links, and start the emulator if that is asked for."""
+    """Open the bench with its links, and start the emulator if requested."""
     emulator = None
     if request.start:
         if options.can == "auto":
@@ -153,7 +153,7 @@ def _open_bench(
 def _shown_on_console(
     view: str | None, script: Script, bench: Bench, stack: ExitStack, show: Callable[[StepResult], None]
 ) -> Callable[[StepResult], None]:
-    """Return what shows a result on the console too, if there is one."""
+    """Return a function that shows a result, also on the console if there is one."""
     if view is None:
         return show
     address = console_address(view, bench.emulator)
@@ -189,7 +189,7 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
             options, serial="auto" if "serial" in wanted else None, can="auto" if "can" in wanted else None
         )
     if not request.start and options.serial == "auto":
-        raise BenchError("--serial auto needs --start: without it name the port")
+        raise BenchError("--serial auto needs --start; otherwise name the port")
     return replace(options, timeout_s=script.timeout_s, retries=script.retries)
 
 

@@ -1,4 +1,4 @@
-"""A temporary folder for one run; the next run removes it if this one was killed."""
+"""A temporary folder for one run; if the run is killed, the next one removes it."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from pathlib import Path
 from typing import Final
 
 LOCK_NAME: Final = "owner.lock"
-"""File locked while the owner of the folder lives; the kernel releases the lock."""
+"""File that is locked while the owner of the folder is running; the kernel releases the lock."""
 
 
 @contextmanager
 def temporary_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
-    """Create a temporary folder and remove it at the end, with those whose owner was killed.
+    """Create a temporary folder and remove it at the end, together with folders whose owner was killed.
 
     Parameters
     ----------
     prefix
-        Beginning of its name; abandoned folders with the same prefix are removed.
+        Prefix of its name; abandoned folders with the same prefix are removed.
     base
-        Folder to make it in; default: the system's temporary folder.
+        Parent folder; default: the system's temporary folder.
     """
     root = Path(tempfile.gettempdir()) if base is None else base
     for folder in root.glob(f"{prefix}*"):
@@ -43,12 +43,12 @@ def _remove_abandoned(folder: Path) -> None:
     """Remove a folder that no process has locked."""
     try:
         lock = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CLOEXEC)
-    except OSError:  # another kind of folder, one being created, or another user's
+    except OSError:  # another kind of folder, a folder being created, or another user's folder
         return
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         shutil.rmtree(folder)
-    except OSError:  # its owner lives, or another process is removing it
+    except OSError:  # its owner is running, or another process is removing it
         return
     finally:
         os.close(lock)

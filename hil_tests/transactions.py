@@ -1,4 +1,4 @@
-"""Transactions of an OBC client: acknowledgements and readings, with their latency."""
+"""Transactions of an OBC client: acknowledgements and readings, with latency."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ class Ack:
 
     name: str
     latency_s: float
-    """From handing the request to the port until the last byte of the reply, s."""
+    """Time from passing the request to the port until the last byte of the reply, s."""
 
 
 @dataclass(frozen=True)

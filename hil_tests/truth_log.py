@@ -1,4 +1,4 @@
-"""Reader of the truth log that an emulator writes (`starhil run --truth-log`), while it grows."""
+"""Reader of the truth log of an emulator (`starhil run --truth-log`), also while it is being written."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class TruthLogReader:
     Parameters
     ----------
     path : Path
-        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four of
-        the quaternion.
+        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four columns of the
+        quaternion.
     """
 
     def __init__(self, path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Time-stamped logs of every byte on a link: text for serial, candump format for CAN."""
+"""Timestamped logs of every byte on a link: text for serial, candump format for CAN."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from starhil.protocol.candump import format_candump
 
 
 class WireLog(ABC):
-    """A text log of what a link sends and receives, written line by line as it happens.
+    """A text log of sent and received items, written line by line.
 
     Parameters
     ----------
     path : Path
-        File to write; an existing one is replaced.
+        File to write; an existing file is replaced.
     now : callable
         Seconds since 1970-01-01 UTC.
     """
@@ -32,11 +32,11 @@ class WireLog(ABC):
         """Format one line, without the newline."""
 
     def sent(self, item: bytes | CanFrame) -> None:
-        """Log an item at the moment that it is handed to the transport."""
+        """Log an item that is passed to the transport."""
         self._write("TX", item)
 
     def received(self, item: bytes | CanFrame) -> None:
-        """Log an item at the moment that the transport hands it over."""
+        """Log an item that the transport has received."""
         self._write("RX", item)
 
     def note(self, text: str) -> None:
@@ -46,7 +46,7 @@ class WireLog(ABC):
             self._file.write(line + "\n")
 
     def _comment(self, time_s: float, text: str) -> str | None:  # noqa: ARG002 -- no comments by default
-        """Return a comment line, None where the format has none."""
+        """Return a comment line, or None if the format has no comments."""
         return None
 
     def _write(self, direction: str, item: bytes | CanFrame) -> None:
@@ -54,7 +54,7 @@ class WireLog(ABC):
             self._file.write(self._line(self._now(), direction, item) + "\n")
 
     def close(self) -> None:
-        """Close the file; what comes later is not logged."""
+        """Close the file; later items are not logged."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -67,8 +67,8 @@ class WireLog(ABC):
 class SerialLog(WireLog):
     """A readable log of a serial line: time, direction, bytes in hexadecimal.
 
-    One line for each piece handed to or by the port, for example `(1760000000.123456) TX 1F 7F 80
-    1F FF`. Lines that start with `#` are notes.
+    There is one line for each chunk that is sent or received, for example `(1760000000.123456) TX 1F 7F 80 1F
+    FF`. Lines that start with `#` are notes.
     """
 
     def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:
@@ -84,7 +84,7 @@ class SerialLog(WireLog):
 
 
 class CandumpLog(WireLog):
-    """A CAN log as `candump -L` writes it, so that can-utils, tshark and others read it."""
+    """A CAN log in the format of `candump -L`, which can-utils, tshark and others can read."""
 
     def __init__(self, path: Path, bus: str, *, now: Callable[[], float] = time.time) -> None:
         super().__init__(path, now=now)

@@ -1,11 +1,11 @@
 """CAN framing of the CubeSpace family: 29-bit CAN IDs and segments that count down, as sans-I/O receivers.
 
-CAN ID: message type[28:24], telecommand or telemetry id[23:16], source[15:8], destination[7:0]. Up to 8 bytes
+CAN ID: message type[28:24], telecommand or telemetry ID[23:16], source[15:8], destination[7:0]. Up to 8 bytes
 of data fit one frame. Longer data are split into segments of 7 bytes, each followed by a byte that counts the
 remaining segments down to 0; the last segment may be shorter.
 
-The CAN ID is packed by shifts: every frame needs it, and a `construct.BitStruct` takes 78 µs to build and 15
-µs to parse where the shifts take 3 µs and 7 µs.
+The CAN ID is packed by shifts because this is done for every frame: shifts take 3 µs to build and 7 µs to
+parse an ID, a `construct.BitStruct` 78 µs and 15 µs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ MAX_MESSAGE: Final = 256 * SEGMENT_DATA
 """Longest message that the segment counter allows."""
 
 MAX_OPEN_MESSAGES: Final = 32
-"""Segmented messages that a receiver keeps open at once; one more replaces the oldest."""
+"""Maximum number of incomplete messages in a receiver; one more replaces the oldest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class CanFrame:
     """Time of reception, seconds since 1970, or None."""
 
     def __post_init__(self) -> None:
-        """Reject what cannot exist on a CAN bus."""
+        """Reject a frame that cannot exist on a CAN bus."""
         if not 0 <= self.id <= (MAX_EXTENDED_ID if self.extended else MAX_STANDARD_ID):
             kind = "a 29-bit" if self.extended else "an 11-bit"
             raise ProtocolError(f"{self.id:#x} is not {kind} CAN ID")
@@ -115,7 +115,7 @@ class CanId:
 
 
 def segment(data: bytes) -> list[bytes]:
-    """Split a message into frame payloads: the message itself, or segments that count down to 0."""
+    """Split a message into frame payloads: the message itself, or segments with a counter."""
     if len(data) <= MAX_FRAME_DATA:
         return [data]
     if len(data) > MAX_MESSAGE:
@@ -139,14 +139,14 @@ def encode_request_frames(request: Request, source: int, destination: int) -> li
 def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
     """Return the frames of a reply from the device at `source` to `reply.destination`.
 
-    Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is first, body …
-    and last, each with the counter. Burst packets are segmented telemetry with the burst's id. Public sources
-    confirm the three types, but neither this layout nor the burst layout; both are ours.
+    Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is sent as first,
+    body and last frames, each with the counter. Burst packets are segmented telemetry with the burst's ID.
+    Public sources confirm the three types, but not the layout of these messages or of bursts; both are ours.
     """
     if reply.kind is ReplyKind.ECHO:
         raise ProtocolError("CAN has no echo messages")
     if reply.id is None:
-        raise ProtocolError(f"a {reply.kind.value} on CAN needs an id")
+        raise ProtocolError(f"a {reply.kind.value} on CAN needs an ID")
     long = len(reply.data) > MAX_FRAME_DATA
     match reply.kind:
         case ReplyKind.ACK:
@@ -182,10 +182,10 @@ class _Assembly:
     left: int
     """Remaining segments."""
     time: float
-    """When the last segment arrived (s)."""
+    """Time at which the last segment arrived, s."""
     data: bytearray
     broken: bool = False
-    """A segment was lost: the rest is skipped, without another fault."""
+    """Whether a segment was lost: the remaining ones are skipped, without another fault."""
 
 
 class _Assembler:
@@ -215,18 +215,18 @@ class _Assembler:
         return faults
 
     def has(self, key: int) -> bool:
-        """Return whether a message with this key is open."""
+        """Return whether a message with this key is incomplete."""
         return key in self._open
 
     def drop(self, key: int) -> bool:
-        """Abandon the message with this key; return whether there was one."""
+        """Drop the message with this key; return whether there was one."""
         return self._open.pop(key, None) is not None
 
     def add(self, key: int, payload: bytes, now: float) -> tuple[bytes | None, LinkFault | None]:
         """Add a segment; return the message if it is complete, and the fault if there is one.
 
-        A segment out of order breaks its message. Its further segments are skipped until one counts 0, which
-        ends the message, or counts at least as high as the first, which starts a new one.
+        A segment out of order breaks its message. Further segments are skipped up to one whose counter is 0,
+        which ends the message, or at least that of the first segment, which starts a new one.
         """
         if not payload:
             self.drop(key)
@@ -264,7 +264,7 @@ class _Assembler:
         if len(self._open) >= MAX_OPEN_MESSAGES:
             oldest = min(self._open, key=lambda other: self._open[other].time)
             del self._open[oldest]
-            fault = LinkFault(FaultKind.CAN_OVERLONG, f"{oldest:08X}: too many messages open at once")
+            fault = LinkFault(FaultKind.CAN_OVERLONG, f"{oldest:08X}: too many incomplete messages")
         self._open[key] = _Assembly(left, left, now, bytearray(chunk))
         return fault
 
@@ -286,26 +286,26 @@ _Event = TypeVar("_Event")
 
 
 class _Receiver(ABC, Generic[_Event]):
-    """Common base of both ends: frames in, messages and faults out."""
+    """Base of both ends: CAN frames in, messages and faults out."""
 
     def __init__(self, address: int, max_size: int, timeout_s: float) -> None:
         self.address = address
-        """Own address; may change at any time."""
+        """Address of this end; may change at any time."""
         self._assembler = _Assembler(max_size, timeout_s)
 
     @property
     def busy(self) -> bool:
-        """Whether a segmented message is open, so that `flush` may become due."""
+        """Whether a segmented message is incomplete, so that `flush` may become due."""
         return self._assembler.busy
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Abandon segmented messages that have been silent for the timeout."""
+        """Abandon segmented messages without a new segment for the timeout."""
         return self._assembler.flush(now)
 
     def feed(self, frame: CanFrame, now: float) -> list[_Event | LinkFault]:
         """Return the messages and faults that a frame completes.
 
-        `now` is its arrival (s, any origin).
+        `now` is its time of arrival (s, any origin).
         """
         events: list[_Event | LinkFault] = list(self.flush(now))
         if frame.extended and not frame.remote:
@@ -323,7 +323,7 @@ class _Receiver(ABC, Generic[_Event]):
 
 
 class CanDeviceReceiver(_Receiver[Request]):
-    """The device's end: frames in, requests and faults out.
+    """The device's end: CAN frames in, requests and faults out.
 
     Frames to other addresses are ignored.
     """
@@ -356,7 +356,7 @@ class CanDeviceReceiver(_Receiver[Request]):
             case _:
                 yield LinkFault(
                     FaultKind.CAN_TYPE,
-                    f"{frame.id:08X}: type {can_id.type} with id {can_id.id} is not a request",
+                    f"{frame.id:08X}: type {can_id.type} with ID {can_id.id} is not a request",
                 )
 
 
@@ -371,10 +371,10 @@ _REPLY_TYPES: Final[dict[int, ReplyKind]] = {
 
 
 class CanHostReceiver(_Receiver[Reply]):
-    """The OBC's end: frames in, replies and faults out.
+    """The OBC's end: CAN frames in, replies and faults out.
 
-    Frames to other addresses and requests of other masters are ignored, and if `device` is set, frames of
-    other devices.
+    Frames to other addresses, requests from other masters and, if `device` is set, frames from other devices
+    are ignored.
     """
 
     def __init__(

@@ -1,10 +1,10 @@
 """Codecs of the rows of an interface definition: physical values to wire bytes and back.
 
 construct declares and packs the layout of a row; `Field` converts between raw and physical values, with
-limits and error texts that name row and field. Against scalars in construct and shifts of our own, the
-declaration of bit fields in construct costs nothing to encode and 1.4 times the time to decode, at most: 146
-and 110 µs for the 39 fields of `star_tracker`, 21 and 15 µs for the 3 of `quaternion`. `Struct.compile` would
-save up to half of that, but takes 1.3 ms per row at first use.
+limits, and with error messages that name row and field. Bit fields are declared in construct too: compared
+with custom shifts, encoding takes the same time and decoding at most 1.4 times as long (146 against 110 µs
+for the 39 fields of `star_tracker`, 21 against 15 µs for the 3 of `quaternion`). `Struct.compile` would save
+up to half of that, but takes 1.3 ms per row at first use.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text",
 STRUCT_CODES: Final = dict(
     zip(("u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"), "BbHhLlQqfd", strict=True)
 )
-"""Type of a scalar → its code in a format of `struct`."""
+"""Type of a scalar → its format character in `struct`."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Slot:
     """Consecutive bytes of a row: one scalar, or the raw bytes of a field."""
 
     index: int
-    """Position among the row's slots."""
+    """Position among the slots of the row."""
     type: str
     """u8 … i64, f32, f64, or `bytes`."""
     offset: int
@@ -56,7 +56,7 @@ class Slot:
 
     @cached_property
     def bits_key(self) -> str:
-        """Name of the slot's group of bits in the construct; no field can have this name."""
+        """Name of the slot's bit group in the construct; no field can have this name."""
         return f"bits of slot {self.index}"
 
     @property
@@ -91,18 +91,18 @@ class Field:
     provenance: str = "ours"
     doc: str = ""
     wrap: bool = False
-    """Telemetry sends the lowest bits of a value beyond its range (a counter) instead of the
-    nearest limit."""
+    """Whether telemetry sends a value beyond its range modulo the range (a counter) instead of as the nearest
+    limit."""
     value: str | None = None
     """Name of the quantity that a telemetry field reports."""
     argument: str | None = None
-    """Name of the action's argument that a telecommand field gives."""
+    """Name of the action's argument that a telecommand field sets."""
     const: int | float | None = None
-    """The only value of the field."""
+    """Value that is always sent, and required in a telecommand."""
     telecommand: str | None = None
     """Telecommand whose last accepted value a telemetry field reports."""
     aliases: Mapping[str, str] = dataclass_field(default_factory=dict)
-    """Values of the quantity that go out as another member of the enumeration."""
+    """Values of the quantity that are sent as another member of the enumeration."""
 
     @property
     def type(self) -> str:
@@ -121,7 +121,7 @@ class Field:
 
     @property
     def scaled(self) -> bool:
-        """Whether the physical value is a scaled integer and so a float."""
+        """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0
 
     @cached_property
@@ -148,13 +148,13 @@ class Field:
 
     @cached_property
     def divisor(self) -> int | None:
-        """1/scale if that is an integer: division by it gives the nearest decimal."""
+        """1/scale if this is an integer; dividing by it gives the nearest decimal number."""
         inverse = round(1.0 / self.scale)
         return inverse if inverse and abs(inverse * self.scale - 1.0) < 1e-12 else None
 
     @cached_property
     def empty(self) -> bool | int | float | str | bytes:
-        """The value if none is given: the default, else the value nearest zero within the limits."""
+        """The value if none is given: the default, otherwise the value nearest zero within the limits."""
         if self.const is not None:
             return self.const
         if self.default is not None:
@@ -335,11 +335,11 @@ def _slot_layout(slot: Slot, fields: list[Field]) -> Any:
 
 @dataclass(frozen=True, repr=False)
 class Row:
-    """A telecommand or telemetry row: id, name, layout, and the codec of its values."""
+    """A telecommand or telemetry row: ID, name, layout, and the codec of its values."""
 
     kind: RowKind
     id: int
-    """Identifier on the wire."""
+    """ID on the wire."""
     name: str
     size: int
     """Bytes of data."""
@@ -350,18 +350,18 @@ class Row:
     provenance: str = "ours"
     source: str = ""
     klass: str = ""
-    """Name of the row's class, where the unit's rows have classes."""
+    """Name of the row's class, if the unit has classes."""
     action: str | None = None
-    """What a telecommand does."""
+    """Name of the action that a telecommand performs."""
     arguments: Mapping[str, bool | int | float | str] = dataclass_field(default_factory=dict)
-    """Arguments of the action that no field gives."""
+    """Fixed arguments of the action."""
     answers: tuple[str, ...] = ("reply",)
-    """Answers in their order: `echo`, `reply`, `row:NAME`."""
+    """Answers in order: `echo`, `reply`, `row:NAME`."""
     zeros: bool = False
-    """Whether fields that are bound to nothing are sent as zeros on purpose."""
+    """Whether fields without a binding are sent as zeros."""
 
     def __repr__(self) -> str:
-        """Return kind, id and name."""
+        """Return kind, ID and name."""
         return f"Row({self.kind} {self.id} {self.name})"
 
     @cached_property
@@ -371,7 +371,7 @@ class Row:
 
     @cached_property
     def layout(self) -> Any:
-        """The construct of the row's bytes: raw values by field name, bits in a group per slot."""
+        """The construct of the row: raw values by field name, bits in one group per slot."""
         return construct.Struct(
             *(
                 _slot_layout(slot, [field for field in self.fields if field.slot is slot])
@@ -387,19 +387,19 @@ class Row:
         Parameters
         ----------
         values:
-            Values by field name. In telemetry a missing value becomes the default or zero; a telecommand
-            needs every field that has no default.
+            Values by field name. In telemetry, a missing value becomes the default or zero; in a telecommand,
+            only fields with a default may be missing.
         check:
-            Reject values outside the limits. If false, reject only what the type cannot hold (for tests that
-            send invalid values on purpose).
+            Whether to reject values outside the limits. If false, only values that the type cannot hold are
+            rejected (for tests that send invalid values on purpose).
         saturate:
-            Clip numbers to the limits, or wrap counters, instead of rejecting them, as the unit does with
-            telemetry.
+            Whether to clip numbers to the limits, or wrap counters, instead of rejecting them, as a unit does
+            in telemetry.
 
         Raises
         ------
         FieldError
-            The text names row.field, the value and the allowed values.
+            A value is invalid; the text names row.field, the value and the allowed values.
         """
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()
@@ -419,11 +419,10 @@ class Row:
         return bytes(self.layout.build(raw))
 
     def decode(self, data: bytes, *, check: bool | None = None) -> dict[str, Value]:
-        """Decode the row's bytes to physical values by name.
+        """Decode the bytes of the row to physical values by name.
 
-        With `check`, a value outside the limits raises FieldError. By default telecommands are checked (the
-        device protects itself) and telemetry is not (the OBC sees what arrived). A wrong length always raises
-        LengthError.
+        With `check`, a value outside the limits raises FieldError. By default, telecommands are checked and
+        telemetry is not, so that the OBC sees what arrived. A wrong length always raises LengthError.
         """
         if len(data) != self.size:
             raise LengthError(f"{self.kind} {self.name} ({self.id}): {len(data)} bytes, must be {self.size}")
@@ -446,5 +445,5 @@ class Row:
         ]
 
     def example(self) -> dict[str, Value]:
-        """Return accepted values: defaults, else the values nearest zero within the limits."""
+        """Return values that are accepted: defaults, otherwise the values nearest zero within the limits."""
         return {name: item.empty for name, item in self.named_fields.items()}

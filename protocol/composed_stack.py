@@ -1,4 +1,4 @@
-"""A serial link composed of a framing, a check and headers, at both ends, sans-I/O."""
+"""Both ends of a serial link composed of a framing, a check and headers, sans-I/O."""
 
 from __future__ import annotations
 
@@ -98,11 +98,11 @@ class ComposedStack(SerialStack):
     classes
         Classes of the rows.
     rows
-        Rows by what the link must know of them.
+        Kind, sizes and answers of the rows.
     byte_order
-        That of the unit.
+        Byte order of the unit.
     framings, checks
-        Those of the unit's plugin, by name.
+        Framings and checks defined by the unit's plugin, by name.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class ComposedStack(SerialStack):
                 raise IcdError(f"link.serial.{other}_header: role {role} belongs to the other direction")
 
     def row(self, klass: str, row_id: int) -> RowShape | None:
-        """Return the row of a message; the class counts only where the link carries one."""
+        """Return the row of a message; the class matters only if the link carries one."""
         if "class" in self.request_header.roles:
             return self._rows.get((klass, row_id))
         return self._rows.get((klass, row_id)) or self._rows_by_id.get(row_id)
@@ -178,7 +178,7 @@ class ComposedStack(SerialStack):
         interpret: Callable[[bytes], _Message | LinkFault | None],
         measure: Callable[[bytes], int | None],
     ) -> Deframer[_Message]:
-        """Return a deframer of the bodies that `interpret` reads and `measure` sizes."""
+        """Return a deframer that calls `measure` for the size of a body and `interpret` for its message."""
         return self.framing.deframer(Receiving(interpret, measure, self.max_size, self.link.timeout))
 
     def encode_request(self, request: Request) -> bytes:
@@ -197,7 +197,7 @@ class ComposedStack(SerialStack):
         return self.close(self.request_header.pack(values, request.klass, len(request.data)), request.data)
 
     def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:  # noqa: ARG002 -- one style
-        """Return a reply as bytes on the line; none for a refusal that the unit's header cannot express."""
+        """Return a reply as bytes on the line; empty for a refusal that the unit's header cannot express."""
         if reply.kind is ReplyKind.ECHO:
             echo = Request(
                 RequestKind.TELECOMMAND, reply.id or 0, reply.data, reply.destination, reply.klass, reply.sequence,
@@ -241,7 +241,7 @@ class ComposedStack(SerialStack):
         )
 
     def open(self, header: Header, body: bytes) -> tuple[Envelope, bytes] | LinkFault:
-        """Return what the header of a body says and its data, or the fault it has."""
+        """Return header and data of a body, or its fault."""
         end = len(body) - self.check.size
         try:
             envelope = header.unpack(body[: max(end, 0)])
@@ -294,7 +294,7 @@ class ComposedStack(SerialStack):
         )
 
     def _request_size(self, body: bytes) -> int | None:
-        """Return the size of a request that begins with these bytes, or None if they are too few."""
+        """Return the size of a request that begins with these bytes, or None if more are needed."""
         framing = self.link.framing
         if isinstance(framing, FixedFraming) and framing.request_size is not None:
             return framing.request_size
@@ -307,7 +307,7 @@ class ComposedStack(SerialStack):
         return row.request_size
 
     def measure(self, header: Header, body: bytes, data_size: Callable[[Envelope], int]) -> int | None:
-        """Return the size of the body that begins with these bytes, or None if they are too few.
+        """Return the size of the body that begins with these bytes, or None if more are needed.
 
         `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.
         """
@@ -324,8 +324,8 @@ class ComposedStack(SerialStack):
 class ComposedHostReceiver:
     """The OBC's end of a composed link.
 
-    An echo of the request is verified and consumed; it is reported as the ACK of a telecommand that has no
-    other answer.
+    An echo of the request is verified and consumed. For a telecommand without another answer it is reported
+    as the ACK.
     """
 
     def __init__(self, stack: ComposedStack) -> None:
@@ -338,19 +338,19 @@ class ComposedHostReceiver:
 
     @property
     def busy(self) -> bool:
-        """Whether a message has begun and not ended, so that `flush` may become due."""
+        """Whether a message is incomplete, so that `flush` may become due."""
         return self._deframer.busy
 
     def feed(self, data: bytes, now: float) -> list[Reply | LinkFault]:
-        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
         return self._deframer.feed(data, now)
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Abandon a message that has been silent for the timeout."""
+        """Abandon an incomplete message after a silence of the timeout."""
         return self._deframer.flush(now)
 
     def expect(self, request: Request, reply_size: int) -> None:
-        """Set the next request, and the data bytes of its telemetry (0 for a telecommand)."""
+        """Set the next request, and the data size of its telemetry in bytes (0 for a telecommand)."""
         row = self._stack.row(request.klass, request.id)
         answers = row.answers if row is not None else ("reply",)
         self._pending = request
@@ -359,7 +359,7 @@ class ComposedHostReceiver:
         self._only_echo = "reply" not in answers
 
     def _size(self, body: bytes) -> int | None:
-        """Return the size of the echo or reply that begins with these bytes, or None if they are too few."""
+        """Return the size of the echo or reply that begins with these bytes, or None if more are needed."""
         if self._echo is not None:
             return len(self._echo)
         return self._stack.measure(self._stack.reply_header, body, self._data_size)
@@ -372,7 +372,7 @@ class ComposedHostReceiver:
         if row is not None:
             return row.reply_size
         if self._pending is None or self._reply_size is None:
-            raise HeaderError("reply to no request")
+            raise HeaderError("reply without a request")
         return self._reply_size
 
     def _reply_of(self, body: bytes) -> Reply | LinkFault | None:
@@ -387,7 +387,7 @@ class ComposedHostReceiver:
         pending = self._pending
         row_id = values.get("id", None if pending is None else pending.id)
         if row_id is None:
-            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes to no request")
+            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
         klass = envelope.klass
         if not klass and pending is not None and pending.id == row_id:
             klass = pending.klass

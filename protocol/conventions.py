@@ -1,4 +1,4 @@
-"""Conventions in which a unit reports attitude, vectors and time, once for all its rows."""
+"""Conventions in which all rows of a unit report attitude, vectors and time."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SENSOR_AXES: Final = ("+x", "+y", "+z")
 DAY_NS: Final = 86_400 * NANOSECONDS
 
 EPOCHS: Final = {"unix": "1970-01-01", "gps": "1980-01-06", "j2000": "2000-01-01T12:00:00"}
-"""Named epochs; leap seconds are not counted, as Unix time does not count them."""
+"""Named epochs as Unix times; like Unix time, they do not count leap seconds."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Conventions:
     byte_order: Literal["little", "big"] = "little"
 
     def __post_init__(self) -> None:
-        """Reject axes that are not a right-handed frame, and an unknown epoch."""
+        """Reject axes that do not form a right-handed frame, and an unknown epoch."""
         (a, b, c), (d, e, f), (g, h, i) = self.rows
         if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
             raise IcdError(
@@ -60,11 +60,11 @@ class Conventions:
         return round(date.timestamp()) * NANOSECONDS
 
     def reported_ns(self, unix_ns: int) -> int:
-        """Return a Unix time as the unit counts it, nanoseconds since its epoch."""
+        """Convert a Unix time to nanoseconds since the unit's epoch."""
         return unix_ns % DAY_NS if self.epoch_ns is None else unix_ns - self.epoch_ns
 
     def unix_ns(self, reported_ns: int, now_ns: int) -> int:
-        """Return the Unix time of a time as the unit counts it; `now_ns` gives the day where it counts from midnight."""
+        """Convert time since the unit's epoch to Unix time, ns; `now_ns` gives the day of a midnight epoch."""
         return (
             now_ns - now_ns % DAY_NS + reported_ns if self.epoch_ns is None else reported_ns + self.epoch_ns
         )

@@ -1,7 +1,7 @@
 """The device model: the parameters, quantities and actions of the emulated star sensor, for any interface.
 
-`configs/units/model.toml` declares them; units bind the fields of their rows to them by name. The functions
-that compute quantities and perform actions belong to the emulator.
+They are declared in `configs/units/model.toml`; units bind the fields of their rows to them by name. The
+functions that compute quantities and perform actions are in the emulator.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ MODEL_FILE: Final = UNITS_FOLDER / "model.toml"
 _NUMBER: Final = re.compile(r"\[(\d+)\]")
 
 PARAMETER: Final = "parameter."
-"""Quantities of this name report a parameter of the device."""
+"""Quantities with this prefix report a parameter of the device."""
 HEALTH: Final = "health."
-"""Quantities of this name report a number of the profile's table `[health]`."""
+"""Quantities with this prefix report a number from the profile's table `[health]`."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class DeviceModel:
     enums: Mapping[str, EnumDefinition]
 
     def quantity(self, name: str) -> QuantityModel | None:
-        """Return the declaration of a quantity, such as `attitude.w`, `stars[3].x` or `parameter.exposure`, or None."""
+        """Return the declaration of a quantity such as `attitude.w` or `stars[3].x`, or None."""
         if name.startswith(PARAMETER):
             parameter = self.parameters.get(name.removeprefix(PARAMETER))
             return None if parameter is None else _of_parameter(name, parameter)
         if name.startswith(HEALTH):
             return QuantityModel(
-                name=name, type="float", unit="*", doc="A number of the profile's table [health]."
+                name=name, type="float", unit="*", doc="A number from the profile's table [health]."
             )
         found = self.quantities.get(generic(name))
         numbers = [int(number) for number in _NUMBER.findall(name)]
@@ -62,11 +62,11 @@ class DeviceModel:
         return found
 
     def near_quantities(self, name: str) -> str:
-        """Return a hint at quantities whose names are similar."""
+        """Return a hint that names similar quantities."""
         return did_you_mean(name, [*self.quantities, *(PARAMETER + known for known in self.parameters)])
 
     def argument(self, action: ActionModel, name: str) -> ArgumentModel | None:
-        """Return the declaration of an action's argument, or None."""
+        """Return the declaration of an argument of an action, or None."""
         numbers = [int(number) for number in _NUMBER.findall(name)]
         found = next((item for item in action.arguments if item.name == generic(name)), None)
         if found is None or any(not 1 <= number <= (found.count or 0) for number in numbers):
@@ -80,13 +80,13 @@ def generic(name: str) -> str:
 
 
 def number_in(name: str) -> int | None:
-    """Return the number in brackets of a name, or None."""
+    """Return the number in the brackets of a name, or None."""
     found = _NUMBER.search(name)
     return None if found is None else int(found[1])
 
 
 def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return `; did you mean …?` with the names most similar to one that does not exist, or nothing."""
+    """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
     near = difflib.get_close_matches(name, list(known), n=3)
     return f"; did you mean {', '.join(near)}?" if near else ""
 

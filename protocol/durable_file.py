@@ -1,4 +1,4 @@
-"""Replace a file so that it is the old one or the new one, whenever the process or the machine stops."""
+"""Replace a file so that an interruption or power cut leaves either the old or the new one."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import Path
 
 
 def replace_durably(path: Path, data: bytes) -> None:
-    """Write a new file beside an old one, flush it to the disk, and rename it over the old one; the folder must exist.
+    """Write a new file beside the old one, flush it to disk, and rename it; the folder must exist.
 
-    One process at a time may do so: the temporary file has a fixed name, so that an interrupted call leaves
+    Only one process at a time may do so: the temporary file has a fixed name, so that interrupted calls leave
     at most one.
 
     Raises
     ------
     OSError
-        It cannot be written; the old file remains.
+        The file cannot be written; the old one remains.
     """
     temporary = path.with_name(f"{path.name}.new")
     try:

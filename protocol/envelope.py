@@ -11,12 +11,12 @@ from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel, Order
 from starhil.protocol.values import SCALAR_SIZES, IcdError
 
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
-"""Roles whose values wrap around in their field."""
+"""Roles whose values wrap around."""
 NANOSECONDS: Final = 1_000_000_000
 
 
 class HeaderError(ProtocolError):
-    """A header that no message of the unit has."""
+    """A header that is invalid for this unit."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class HeaderField:
         return self.classes is None or klass in self.classes
 
     def to_bytes(self, value: int) -> bytes:
-        """Return a value as bytes."""
+        """Encode a value."""
         if self.role in WRAPPING:
             value &= (1 << 8 * self.size) - 1
         try:
@@ -64,18 +64,18 @@ class HeaderField:
             ) from None
 
     def from_bytes(self, data: bytes) -> int:
-        """Return the value of bytes."""
+        """Decode a value."""
         return int.from_bytes(data, self.order, signed=self.signed)
 
 
 @dataclass(frozen=True)
 class Envelope:
-    """What a header says, by role, and how long the header is."""
+    """Content of a header by role, and its size."""
 
     values: Mapping[str, int]
     size: int
     klass: str
-    """Class by name, or an empty text."""
+    """Name of the class, or an empty text."""
 
 
 class Header:
@@ -86,11 +86,11 @@ class Header:
     models
         Fields as in the definition.
     byte_order
-        That of the unit.
+        Byte order of the unit.
     classes
         Name of the class of each code.
     overhead
-        Bytes of `start`, `check` and `end`, for what a length may count.
+        Sizes of `start`, `check` and `end`, which a length may include.
     where
         Field path for error messages.
     """
@@ -109,7 +109,7 @@ class Header:
         self._classes = classes
         self._overhead = overhead
         self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
-        """Roles that the header carries, in messages of any class."""
+        """Roles that the header carries in any class of messages."""
         self.defaults: Final = {
             role: default
             for field in self.fields
@@ -119,27 +119,27 @@ class Header:
             )
             if role
         }
-        """Value of each role where a message has none."""
+        """Value of each role for messages that do not set it."""
 
     def roles_in(self, klass: str) -> frozenset[str]:
         """Return the roles that the header carries in messages of a class."""
         return frozenset(role for field in self.fields if field.in_class(klass) for role in field.roles)
 
     def size(self, klass: str) -> int:
-        """Return the bytes of the header in messages of a class."""
+        """Return the size of the header in messages of a class."""
         return sum(field.size for field in self.fields if field.in_class(klass))
 
     def count_ns(self, role: str) -> int:
-        """Return the nanoseconds a count of `ticks` or `time`."""
+        """Return the nanoseconds per count of `ticks` or `time`."""
         return next(round(field.scale * NANOSECONDS) for field in self.fields if field.role == role)
 
     def length(self, header_size: int, data_size: int) -> int:
-        """Return the value of the length field in a message of these sizes."""
+        """Return the value of the length field in a message."""
         field = next(field for field in self.fields if field.role == "length")
         return self._counted(field, header_size, data_size)
 
     def pack(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
-        """Return the header of a message with this much data.
+        """Return the header of a message with `data_size` bytes of data.
 
         Raises ProtocolError if a value does not fit its field.
         """
@@ -159,9 +159,9 @@ class Header:
         return b"".join(packed)
 
     def unpack(self, body: bytes) -> Envelope | None:
-        """Return what the header of a body says, or None if the body is too short for one.
+        """Decode the header of a body; return None if the body is too short.
 
-        Raises HeaderError for a constant that differs or a class that the unit does not have.
+        Raises HeaderError for a wrong constant or an unknown class.
         """
         values: dict[str, int] = {}
         klass = ""
@@ -190,13 +190,13 @@ class Header:
         return Envelope(values, position, klass)
 
     def data_size(self, envelope: Envelope) -> int:
-        """Return the bytes of data that the length of a header promises.
+        """Return the data size according to the length in a header.
 
-        Raises HeaderError if the length is less than the size of the parts it counts.
+        Raises HeaderError if the length is less than the size of the other parts that it includes.
         """
         data = envelope.values["length"] - self.length(envelope.size, 0)
         if data < 0:
-            raise HeaderError(f"length {envelope.values['length']} is shorter than what it counts")
+            raise HeaderError(f"length {envelope.values['length']} is less than the parts that it includes")
         return data
 
     def _counted(self, field: HeaderField, header_size: int, data_size: int) -> int:
@@ -243,5 +243,5 @@ def _bits(models: Sequence[HeaderBitModel], width: int, where: str) -> tuple[_Bi
         bits.append(_Bit(model.role, shift, (1 << model.width) - 1, model.const, default))
         shift += model.width
     if models and shift != width:
-        raise IcdError(f"{where}: the bits make {shift}, must be {width}")
+        raise IcdError(f"{where}: the bits add up to {shift}, must be {width}")
     return tuple(bits)

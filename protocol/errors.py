@@ -1,4 +1,4 @@
-"""The base class of this package's errors, and the reason of a failed system call as text."""
+"""Base class of the errors of this package, and the reason of a failed system call as text."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ class ProtocolError(Exception):
 
 
 def reason(error: Exception) -> str:
-    """Return the reason of a failure: the system's text for the error number, else the error's own text.
+    """Return the reason of a failure: the system's message for the error number, or else the error's text.
 
-    The texts of an event loop repeat the address. An invalid host name has a negative error number or is a
-    ValueError.
+    Messages of the event loop would repeat the address. An invalid host name has a negative error number or
+    raises ValueError.
     """
     number = getattr(error, "errno", None)
     if isinstance(number, int) and number > 0:

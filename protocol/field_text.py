@@ -1,9 +1,9 @@
-"""Fields written as text, one line of an ICD's table in a few words.
+"""Short form of fields: one line of an ICD table as text.
 
-`TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` a named one, `bytes NAME SIZE` and `text NAME
-SIZE` a string, and `bits NAME[:WIDTH] …` flags and groups of bits from the lowest up, which fill whole bytes.
-`-` stands for no name or no unit. Braces repeat the field as in a shell: `i16 mag{0,1}_{x,y,z} uT 0.01` is
-six fields, `u8 css{0..9}` ten.
+`TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` an enumeration, `bytes NAME SIZE` and `text
+NAME SIZE` a string, and `bits NAME[:WIDTH] …` flags and groups of bits, lowest first, which fill whole bytes.
+`-` means no name or no unit. Braces repeat the field as in a shell: `i16 mag{0,1}_{x,y,z} uT 0.01` is six
+fields, `u8 css{0..9}` is ten.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from starhil.protocol.icd_schema import FieldModel
 from starhil.protocol.values import IcdError
 
 MAX_NAMES: Final = 256
-"""Fields that one text may stand for."""
+"""Maximum number of fields that one text may expand to."""
 
 _BRACES: Final = re.compile(r"\{([^{}]*)\}")
 
 
 def fields_of(text: str) -> list[FieldModel]:
-    """Return the fields of a text.
+    """Expand a text to fields.
 
-    Raises IcdError with what is wrong, without row and file.
+    Raises IcdError, whose text does not name row and file.
     """
     type_, *words = text.split() or [""]
     if not words:
@@ -44,7 +44,7 @@ def _scalars(type_: str, name: str, *words: str) -> list[dict[str, Any]]:
     kinds = {"enum": ("enum",), "byte": ("size",), "text": ("size",)}
     keys = kinds.get(type_[:4], ("unit", "scale"))
     if len(words) > len(keys):
-        raise IcdError(f"after the name comes {' and '.join(keys)} at most")
+        raise IcdError(f"only {' and '.join(keys)} may follow the name")
     table: dict[str, Any] = {"type": type_}
     for key, word in zip(keys, words, strict=False):
         if word != "-":
@@ -63,7 +63,7 @@ def _bits(words: list[str]) -> list[dict[str, Any]]:
                 filled.append([])
                 room = 8
             if not 1 <= width <= room:
-                raise IcdError(f"{item}: {width} bits do not fit the {room} that its byte has left")
+                raise IcdError(f"{item}: {width} bits do not fit into the remaining {room} bits of the byte")
             filled[-1].append(_named(item) | {"width": width})
             room -= width
     if room:

@@ -1,7 +1,6 @@
-"""Fair use of one event loop by many connections, and the socket options of TCP connections.
+"""Fair sharing of an event loop by many connections, and socket options for TCP.
 
-Each connection reads a limited amount per turn of the loop, and no traffic waits behind the backlog of
-another sender.
+Each connection reads a limited amount per turn of the loop, and no sender waits for the backlog of another.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ from collections.abc import Hashable, Sequence
 from typing import Final
 
 TURN: Final = 4 * 1024
-"""Most bytes that one connection reads per turn of the loop: about 100 CAN frames as text, 10 ms of
-work for a device."""
+"""Maximum number of bytes that a connection reads per turn of the loop: about 100 CAN frames as text, or 10
+ms of work for a device."""
 
 WINDOW: Final = 16 * 1024
-"""Size of each buffer along a connection, bytes; buffered bytes delay later ones."""
+"""Size of each buffer of a connection, bytes; buffered bytes delay later ones."""
 
 
 KEEPALIVE: Final = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 2, socket.TCP_KEEPCNT: 3}
@@ -26,7 +25,7 @@ KEEPALIVE: Final = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 2, socket.TCP_
 answer."""
 
 UNREAD_LIMIT_MS: Final = 10_000
-"""A server is lost when it has not acknowledged sent data for this time."""
+"""A server that has not acknowledged sent data for this time is lost."""
 
 
 class TurnProtocol(asyncio.BufferedProtocol):
@@ -50,7 +49,7 @@ class TurnProtocol(asyncio.BufferedProtocol):
 
 
 def limit_buffers(transport: asyncio.BaseTransport) -> None:
-    """Limit the kernel's buffers of a TCP connection, which hold megabytes by default."""
+    """Limit the kernel buffers of a TCP connection, which hold megabytes by default."""
     connection = _tcp_socket(transport)
     if connection is not None:
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, WINDOW)
@@ -58,10 +57,10 @@ def limit_buffers(transport: asyncio.BaseTransport) -> None:
 
 
 def detect_lost_peer(transport: asyncio.BaseTransport, *, must_read: bool = False) -> None:
-    """Close a silent TCP connection within about ten seconds of the other machine's disappearance.
+    """Close a silent TCP connection within about ten seconds after the other machine has disappeared.
 
-    With `must_read` a peer that is alive but reads nothing for that long is lost too. That is right for a
-    server, but not for a client program that is halted in a debugger.
+    With `must_read`, a peer that is alive but reads nothing for that long is lost too. Use it for servers,
+    but not for clients, which may be halted in a debugger.
     """
     connection = _tcp_socket(transport)
     if connection is None:
@@ -79,15 +78,15 @@ def _tcp_socket(transport: asyncio.BaseTransport) -> socket.socket | None:
 
 
 class FairQueue:
-    """Lines that wait for one receiver; their senders take turns, one line each.
+    """Queue of lines for one receiver, in which senders take turns, one line each.
 
-    Lines of one sender keep their order. When the queue is full, the sender with the most waiting bytes loses
-    its oldest line: the stalest one.
+    Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses
+    its oldest line.
 
     Parameters
     ----------
     limit
-        Most bytes that may wait.
+        Maximum number of waiting bytes.
     """
 
     def __init__(self, limit: int) -> None:
@@ -95,10 +94,10 @@ class FairQueue:
         self._lines: dict[Hashable, deque[bytes]] = {}
         self._sizes: dict[Hashable, int] = {}
         self.size = 0
-        """Bytes that wait."""
+        """Number of waiting bytes."""
 
     def put(self, sender: Hashable, lines: Sequence[bytes]) -> int:
-        """Add lines of a sender; return how many lines of any sender were dropped."""
+        """Add lines of a sender; return how many lines were dropped, of any sender."""
         if not lines:
             return 0
         added = sum(map(len, lines))

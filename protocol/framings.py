@@ -1,8 +1,8 @@
-"""Framings of serial links, selected by data: where a message begins and ends in a stream of bytes.
+"""Framings of serial links: how the beginning and end of a message are marked in a stream of bytes.
 
 A framing turns a body (header, data and check) into bytes, and makes deframers, which do the reverse. A
-deframer is sans-I/O: it is fed bytes with their time of arrival and returns what its `interpret` makes of
-each body, and the faults.
+deframer is sans-I/O: it is fed bytes with their time of arrival and returns faults and the messages to which
+`interpret` decodes the bodies.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ _Message = TypeVar("_Message")
 
 
 class BodySizeError(ProtocolError):
-    """The beginning of a body that no message has."""
+    """The beginning of a body that is not that of any message."""
 
 
 @dataclass(frozen=True)
 class Receiving(Generic[_Message]):
-    """What a deframer needs to know of the messages."""
+    """How a deframer handles bodies: interpretation, size and limits."""
 
     interpret: Callable[[bytes], _Message | LinkFault | None]
-    """Returns the message of a body, the fault it has, or None if it is consumed."""
+    """Returns the message in a body, its fault, or None if the body is consumed."""
     measure: Callable[[bytes], int | None]
-    """Returns the size of the body that begins with these bytes, None if they are too few.
+    """Returns the size of the body that begins with these bytes, or None if more are needed.
 
     Raises BodySizeError.
     """
@@ -49,19 +49,19 @@ class Deframer(ABC, Generic[_Message]):
     @property
     @abstractmethod
     def busy(self) -> bool:
-        """Whether a message has begun and not ended."""
+        """Whether a message is incomplete."""
 
     @abstractmethod
     def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
 
     @abstractmethod
     def flush(self, now: float) -> list[LinkFault]:
-        """Abandon a message that has been silent for the timeout."""
+        """Abandon an incomplete message after a silence of the timeout."""
 
 
 class _Collector(Deframer[_Message]):
-    """Base of the deframers that collect bytes until a message is whole."""
+    """Base of the deframers that collect bytes until a message is complete."""
 
     def __init__(self, receiving: Receiving[_Message]) -> None:
         check_receiver_limits(receiving.max_size, receiving.timeout_s)
@@ -90,11 +90,11 @@ class _Collector(Deframer[_Message]):
 
     @abstractmethod
     def _consume(self, data: bytes) -> None:
-        """Add to the events what these bytes complete."""
+        """Process bytes and add the messages and faults that they complete."""
 
     @abstractmethod
     def _abandon(self) -> int:
-        """Forget everything received; return the bytes of a message that is incomplete and not yet reported."""
+        """Drop the buffer; return the number of bytes of an incomplete message that has not been reported."""
 
     def _add(self, result: _Message | LinkFault | None) -> None:
         if result is not None:
@@ -108,10 +108,10 @@ class _Collector(Deframer[_Message]):
 
 
 class Framing(ABC):
-    """One way to mark messages in a stream of bytes."""
+    """A way to mark messages in a stream of bytes."""
 
     start: bytes = b""
-    """Bytes before a body that a check may cover."""
+    """Bytes before a body, which a check may cover."""
     end: bytes = b""
 
     @abstractmethod
@@ -146,7 +146,7 @@ class Slip(Framing):
         return self._before + escaped + self.end
 
     def decode(self, frame: bytes) -> bytes | LinkFault:
-        """Return the body of what lies between two end bytes."""
+        """Return the body of the bytes between two end bytes."""
         first, *rest = frame.split(self.escape)
         body = [first]
         for piece in rest:
@@ -158,7 +158,7 @@ class Slip(Framing):
         return b"".join(body)
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
-        """Return a deframer that takes what lies between end bytes."""
+        """Return a deframer for the messages between end bytes."""
         return _SlipDeframer(receiving, self)
 
 
@@ -209,7 +209,7 @@ class _SlipDeframer(_Collector[_Message]):
 
 
 class Escaped(Framing):
-    """`escape start … escape end`, with every escape byte within doubled."""
+    """`escape start … escape end`, with escape bytes in between doubled."""
 
     def __init__(self, model: EscapedFraming) -> None:
         if len({model.escape, model.start, model.end}) < 3:
@@ -224,7 +224,7 @@ class Escaped(Framing):
         return self.start + body.replace(self._escape, self._escape * 2) + self.end
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
-        """Return a deframer that ignores what lies between messages."""
+        """Return a deframer that ignores bytes between messages."""
         return _EscapedDeframer(receiving, self._model)
 
 
@@ -256,7 +256,7 @@ class _EscapedDeframer(Deframer[_Message]):
 
 
 class Counted(Framing):
-    """`start`, a body whose size its header or its row gives, `end`."""
+    """`start`, a body whose size is given by its header or its row, `end`."""
 
     def __init__(self, start: list[int], end: list[int]) -> None:
         self.start = bytes(start)
@@ -267,7 +267,7 @@ class Counted(Framing):
         return self.start + body + self.end
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
-        """Return a deframer that searches on from the byte after the start of a bad message."""
+        """Return a deframer that after a bad message continues at the byte after its start."""
         return _CountedDeframer(receiving, self)
 
 
@@ -277,7 +277,7 @@ class _CountedDeframer(_Collector[_Message]):
         self._start, self._end = framing.start, framing.end
         self._buffer = bytearray()
         self._reported = 0
-        """Bytes at the beginning of the buffer that a fault has reported already."""
+        """Number of bytes at the beginning of the buffer that a fault has already reported."""
         self._in_junk = False
 
     @property
@@ -292,7 +292,7 @@ class _CountedDeframer(_Collector[_Message]):
             pass
 
     def _at_start(self) -> bool:
-        """Drop junk before the next start; return whether a whole start is there."""
+        """Drop junk before the next start; return whether a complete start was found."""
         head = len(self._start)
         if not head:
             return True
@@ -301,14 +301,14 @@ class _CountedDeframer(_Collector[_Message]):
         return found >= 0
 
     def _partial_start(self) -> int:
-        """Return where a start may begin whose rest has not arrived."""
+        """Return the position of a start that may be incomplete."""
         for size in range(min(len(self._start) - 1, len(self._buffer)), 0, -1):
             if self._buffer.endswith(self._start[:size]):
                 return len(self._buffer) - size
         return len(self._buffer)
 
     def _take_message(self) -> bool:
-        """Take the message at the start of the buffer; return whether to search on."""
+        """Take the message at the start of the buffer; return whether to continue."""
         head = len(self._start)
         try:
             size = self._measure(bytes(self._buffer[head:]))
@@ -334,7 +334,7 @@ class _CountedDeframer(_Collector[_Message]):
         return True
 
     def _reject(self, fault: LinkFault, extent: int) -> bool:
-        """Report the message at the start of the buffer unless it lies within one that is reported; search on in it."""
+        """Report the message at the start of the buffer unless it is part of a reported one; search within it."""
         if self._reported <= 0:
             self._add(fault)
             self._reported = extent
@@ -361,7 +361,7 @@ class _CountedDeframer(_Collector[_Message]):
 
 
 class Delimited(Framing):
-    """`start`, a body in bytes or hexadecimal digits, `end`."""
+    """`start`, a body as bytes or hexadecimal digits, `end`."""
 
     def __init__(self, model: DelimitedFraming) -> None:
         self.start = bytes(model.start)
@@ -380,7 +380,7 @@ class Delimited(Framing):
         return self.start + text + self.end
 
     def decode(self, text: bytes) -> bytes | LinkFault:
-        """Return the body of what lies between start and end."""
+        """Return the body of the text between start and end."""
         if not self._hex:
             return text
         try:
@@ -389,7 +389,7 @@ class Delimited(Framing):
             return LinkFault(FaultKind.UART_PROTOCOL, f"{text[:8]!r} is not hexadecimal")
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
-        """Return a deframer that takes what lies before each end."""
+        """Return a deframer for the text before each end."""
         return _DelimitedDeframer(
             receiving, self, 2 * receiving.max_size if self._hex else receiving.max_size
         )

@@ -1,10 +1,10 @@
 """A CAN bus over TCP for machines without kernel CAN: an asyncio server of the socketcand text protocol.
 
-Each client opens a bus by name and receives every frame that the other clients of that bus send, in the order
-of each sender. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all. Senders take
-turns in that queue. When it is full, frames of the sender with the most waiting bytes are dropped for that
-client and counted, so a flood delays and loses only its own frames. A malformed command is answered by an
-error and changes nothing.
+Each client opens a bus by name and receives every frame that other clients send on this bus; frames of one
+sender stay in order. Up to `BACKLOG_LIMIT` bytes wait for a client that reads slowly or not at all. Senders
+take turns in that queue. When it is full, frames of the sender with the most waiting bytes are dropped for
+that client and counted, so a flood delays and loses only its own frames. A malformed command is answered by
+an error and has no effect.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ DEFAULT_PORT: Final = 29536
 DEFAULT_BUS: Final = "vcan0"
 
 BACKLOG_LIMIT: Final = 256 * 1024
-"""Most bytes that wait for one slow client: about 4500 frames, half a second of a bus at 1 Mbit/s.
+"""Maximum number of bytes that wait for a slow client: about 4500 frames, half a second at 1 Mbit/s.
 
-A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read and delay later
-ones.
+A kernel CAN socket holds fewer than 300 frames by default. Waiting frames are stale when read, and delay
+later ones.
 """
 
 SETTLE_S: Final = 1.0
@@ -60,7 +60,7 @@ class HubStatistics:
     delivered: int = 0
     """Frames delivered to clients."""
     dropped: int = 0
-    """Frames dropped because a client does not read."""
+    """Frames dropped because a client did not read."""
     errors: int = 0
     """Malformed or unknown commands."""
 
@@ -127,10 +127,7 @@ class _Client(TurnProtocol):
             self._transport.abort()
 
     def deliver(self, sender: _Client, lines: list[bytes]) -> int:
-        """Send frames of another client, at once or when there is room.
-
-        Return how many were dropped.
-        """
+        """Send frames of another client as soon as there is room; return how many were dropped."""
         if self._transport is None:
             return len(lines)
         if self._waiting.size or self._full or self._settle is not None:
@@ -140,7 +137,7 @@ class _Client(TurnProtocol):
 
     @property
     def backlog(self) -> int:
-        """Bytes that wait for this client."""
+        """Number of bytes that wait for this client."""
         return self._waiting.size + (
             self._transport.get_write_buffer_size() if self._transport is not None else 0
         )
@@ -197,16 +194,16 @@ class _Client(TurnProtocol):
 
 
 class CanHub:
-    """The server: `await start()`, then clients come to `host:port` until `await close()`.
+    """The server: after `await start()`, clients may connect to `host:port` until `await close()`.
 
     Parameters
     ----------
     host, port:
-        Address to listen at; with port 0, `port` is the free port chosen by `start`.
+        Address to listen on; with port 0, `port` is the free port chosen by `start`.
     log:
         Candump log of all frames.
     now:
-        Clock of the timestamps (s since 1970).
+        Clock for timestamps (s since 1970).
     """
 
     def __init__(
@@ -308,7 +305,7 @@ class CanHub:
             self._flusher = asyncio.get_running_loop().call_later(FLUSH_LOG_S, self._flush_log)
 
     def _abandon_log(self, error: OSError) -> None:
-        """Log once that the log ends here; the bus continues without it."""
+        """Report once that the CAN log ends here; the bus continues without it."""
         log, self._log = self._log, None
         _LOGGER.warning("CAN hub: log %s ends here: %s; the bus continues", self._log_path, reason(error))
         if log is not None:

@@ -1,4 +1,4 @@
-"""The interface definition of a unit: the TOML files of its folder, validated, indexed by name and id."""
+"""The interface definition of a unit: the TOML files of its folder, validated, indexed by name and ID."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ __all__ = [
 _Item = TypeVar("_Item")
 
 OTHER_ERROR: Final = "other"
-"""Key in the table of errors for those that it does not name."""
+"""Key in `[errors]` for all errors that the table does not name."""
 
 
 class UnknownNameError(ProtocolError, KeyError):
     """A name that is not in the interface definition; the text suggests similar ones."""
 
     def __str__(self) -> str:
-        """Return the plain text (KeyError would quote it)."""
+        """Return the text without quotes, which KeyError would add."""
         return str(self.args[0])
 
 
@@ -59,7 +59,7 @@ class Names(dict[str, _Item]):
 
 @dataclass(frozen=True)
 class RawTable:
-    """A table of a definition that another module reads, and its file."""
+    """A table of a definition that another module validates, and its file."""
 
     file: Path
     document: Mapping[str, object]
@@ -67,7 +67,7 @@ class RawTable:
 
 @dataclass(frozen=True)
 class InterfaceDefinition:
-    """The interface between a device and its OBC: rows, enumerations and parameters."""
+    """The interface between a device and an OBC: rows, enumerations and parameters."""
 
     name: str
     version: str
@@ -78,20 +78,19 @@ class InterfaceDefinition:
     parameters: Names[Parameter]
     """The parameters that the unit exposes."""
     device_parameters: Names[Parameter]
-    """All parameters of the device: those exposed as the unit has them, the others as the device model has
-    them."""
+    """All parameters of the device; those that the unit exposes have the unit's limits and defaults."""
     sections: tuple[Section, ...] = ()
     """Documentation that accompanies the rows, such as conventions."""
     canopen: RawTable | None = None
-    """Layout of the rows in the object dictionary, if the unit has CANopen."""
+    """Layout of the object dictionary, if the unit has CANopen."""
     link: LinkModel = field(default_factory=LinkModel)
     """The links of the unit."""
     conventions: Conventions = field(default_factory=Conventions)
     classes: tuple[MessageClass, ...] = ()
     errors: Mapping[str, int] = field(default_factory=dict)
-    """Number on the wire of each error, by name; empty: the published numbers."""
+    """Error codes on the wire by name; empty: the published codes."""
     first_telemetry_id: int | None = None
-    """Ids from this one up are telemetry, whether or not there is such a row."""
+    """IDs from this one on are telemetry, even if there is no such row."""
     plugin: Plugin = field(default_factory=Plugin)
 
     @property
@@ -101,31 +100,31 @@ class InterfaceDefinition:
 
     @cached_property
     def telecommands_by_id(self) -> Mapping[int, Row]:
-        """Telecommands by id."""
+        """Telecommands by ID."""
         return {row.id: row for row in self.telecommands.values()}
 
     @cached_property
     def telemetry_by_id(self) -> Mapping[int, Row]:
-        """Telemetry by id."""
+        """Telemetry by ID."""
         return {row.id: row for row in self.telemetry.values()}
 
     @cached_property
     def rows_by_key(self) -> Mapping[tuple[str, int], Row]:
-        """Rows by class and id."""
+        """Rows by class and ID."""
         return {(row.klass, row.id): row for row in self.rows}
 
     @cached_property
     def parameters_by_id(self) -> Mapping[int, Parameter]:
-        """Parameters by id."""
+        """Parameters by ID."""
         return {parameter.id: parameter for parameter in self.parameters.values()}
 
     def row_by_id(self, row_id: int) -> Row | None:
-        """Return the telecommand or telemetry row with this id, or None."""
+        """Return the telecommand or telemetry row with this ID, or None."""
         telemetry = self.kind_of_id(row_id) is RequestKind.TELEMETRY
         return (self.telemetry_by_id if telemetry else self.telecommands_by_id).get(row_id)
 
     def telemetry_row(self, row_id: int, klass: str | None = None) -> Row | None:
-        """Return the telemetry row with this id, of a class or of the first class that has it, or None."""
+        """Return the telemetry row with this ID in a class (default: the first that has it), or None."""
         names = [item.name for item in self.classes if klass in (None, item.name)] or [""]
         found = (self.rows_by_key.get((name, row_id)) for name in names)
         return next((row for row in found if row is not None and row.kind == "telemetry"), None)
@@ -138,13 +137,13 @@ class InterfaceDefinition:
 
     @staticmethod
     def request(row: Row, data: bytes = b"", source: int = 0) -> Request:
-        """Return the request of a row."""
+        """Return the request for a row."""
         return Request(RequestKind(row.kind), row.id, data, source, klass=row.klass)
 
     def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
-        """Return a request by ID, which need not belong to a row, and by class if the unit has classes.
+        """Return a request by ID, which need not be that of a row, and by class if the unit has classes.
 
-        Default class: of the first row with this ID, else the first class.
+        The default class is that of the first row with this ID, or the first class if there is none.
         """
         if not self.classes:
             return Request(self.kind_of_id(row_id), row_id, data)
@@ -156,7 +155,7 @@ class InterfaceDefinition:
         return Request(kinds[klass], row_id, data, klass=klass)
 
     def error_number(self, code: ErrorCode) -> ErrorCode | int:
-        """Return the number by which the unit reports an error."""
+        """Return the unit's code for an error."""
         if not self.errors:
             return code
         name = code.name.lower()
@@ -170,17 +169,17 @@ class InterfaceDefinition:
         return self.canopen is not None and self.link.serial is None and self.link.can is None
 
     def error_name(self, number: int) -> str:
-        """Return the name of an error by the number in which the unit reports it."""
+        """Return the name of an error by the unit's code."""
         numbers = self.errors or {code.name.lower(): int(code) for code in ErrorCode}
         return next((name for name, known in numbers.items() if known == number), "unpublished code")
 
     def enum(self, name: str) -> EnumDefinition:
-        """Return an enumeration of the unit, else of the device model."""
+        """Return an enumeration of the unit or, if it has none of this name, of the device model."""
         return self.enums[name] if name in self.enums else self.model.enums[name]
 
     @property
     def rows(self) -> Iterator[Row]:
-        """All rows: telecommands, then telemetry, each in order of id."""
+        """All rows: telecommands, then telemetry, each in order of ID."""
         return chain(
             sorted(self.telecommands.values(), key=lambda row: row.id),
             sorted(self.telemetry.values(), key=lambda row: row.id),
@@ -190,7 +189,7 @@ class InterfaceDefinition:
 def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
     """Read the interface definition of a unit: a bundled unit by name, a folder of TOML files, or one file.
 
-    Bundled units are read once. Raises IcdError, whose text names file, row and field.
+    Bundled units are cached. Raises IcdError, whose text names file, row and field.
     """
     path = find_unit(name_or_folder)
     return _load_bundled(path) if path.parent == UNITS_FOLDER else _load(path)

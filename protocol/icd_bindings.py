@@ -1,4 +1,4 @@
-"""Checks what the fields of a unit are bound to: quantities, arguments of actions, parameters."""
+"""Checks of the bindings of a unit's fields to quantities, arguments of actions and parameters."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ ANY_UNIT = "*"
 
 
 def check_row(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
-    """Check the bindings of a row's fields.
+    """Check the bindings of the fields of a row.
 
-    Raises IcdError with the field, and with similar names where one is unknown.
+    Raises IcdError, whose text names the field and, for an unknown name, similar ones.
     """
     action = _action(row, model, plugin, where)
     for field in row.named_fields.values():
@@ -35,9 +35,9 @@ def check_row(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
 
 
 def unbound(icd: InterfaceDefinition) -> list[str]:
-    """Return the rows and fields that the device cannot serve, as they are bound to nothing."""
+    """Return an error for each row or field without a binding, which the device cannot serve."""
     missing = [
-        f"unit {icd.name}: telecommand {row.name}: no `action`; `nothing` accepts it and does nothing"
+        f"unit {icd.name}: telecommand {row.name}: no `action`; use `nothing` to accept the telecommand without effect"
         for row in icd.telecommands.values()
         if row.action is None
     ]
@@ -73,7 +73,7 @@ def _action(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> ActionM
 def _check_value(field: Field, row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
     name = str(field.value)
     if row.kind != "telemetry":
-        raise IcdError(f"{where}: `value` is for telemetry; a telecommand's field has an `argument`")
+        raise IcdError(f"{where}: `value` is for telemetry; a field of a telecommand has an `argument`")
     found = quantity_of(name, model, plugin)
     if found is None:
         raise IcdError(f"{where}: no quantity named {name!r}{model.near_quantities(name)}")
@@ -105,13 +105,13 @@ def _check_argument(
         wrong = [item for item in names if item not in model.enums[found.enum].values]
         if wrong:
             hint = did_you_mean(wrong[0], model.enums[found.enum].values)
-            raise IcdError(f"{where}: {wrong[0]!r} is no value of argument {name}{hint}")
+            raise IcdError(f"{where}: {wrong[0]!r} is not a value of argument {name}{hint}")
 
 
 def _check_fit(
     field: Field, found: QuantityModel | ArgumentModel, what: str, model: DeviceModel, where: str
 ) -> None:
-    """Check that a field can hold the values of a quantity or argument, and that its unit is convertible."""
+    """Check that a field can hold the values of a quantity or argument, and that the units are compatible."""
     if found.unit != ANY_UNIT and factor(found.unit, field.unit) is None:
         raise IcdError(
             f"{where}: unit {field.unit!r}, but {what} is in {found.unit!r}; use one of "
@@ -125,13 +125,15 @@ def _check_fit(
     }.get(found.type, field.kind in ("integer", "float", "bits", "enum", "flag"))
     if names and field.kind not in ("enum", "text"):
         members = "" if found.enum is None else f": {', '.join(model.enums[found.enum].values)}"
-        raise IcdError(f"{where}: {what} has names{members}; give them numbers with `enum` or `map`")
+        raise IcdError(f"{where}: {what} has named values{members}; assign numbers with `enum` or `map`")
     if not fits:
-        raise IcdError(f"{where}: {what} is of type {found.type}, which a {field.kind} field does not hold")
+        raise IcdError(
+            f"{where}: {what} is of type {found.type}, which a field of kind {field.kind} cannot hold"
+        )
 
 
 def _check_members(field: Field, found: QuantityModel, model: DeviceModel, where: str) -> None:
-    """Check that an enumeration has a number for every value that the quantity may have."""
+    """Check that an enumeration has a number for every value of the quantity."""
     if field.enum is None or field.default is not None:
         return
     wanted = ["true", "false"] if found.type == "bool" else []
@@ -140,7 +142,7 @@ def _check_members(field: Field, found: QuantityModel, model: DeviceModel, where
     missing = [name for name in wanted if name not in field.enum.values and name not in field.aliases]
     if missing:
         raise IcdError(
-            f"{where}: quantity {field.value} may be {', '.join(missing)}, which has no number; add it, or a `default`"
+            f"{where}: quantity {field.value} may be {', '.join(missing)}, which has no number; add one, or a `default`"
         )
 
 

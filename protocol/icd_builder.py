@@ -1,4 +1,4 @@
-"""Reads the TOML files of a unit and builds its interface definition, or lists all errors in them."""
+"""Builds the interface definition of a unit from its TOML files, or lists all errors in them."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
 
 SETS: Final = "set_"
-"""Beginning of the names of telecommands that telemetry reads back."""
+"""Prefix of the names of telecommands that can be read back."""
 HIGHEST_ID: Final = 0xFF
-"""Highest id where the link does not say how an id is sent."""
+"""Highest ID if the link does not limit it."""
 
 _MODELS: Final[dict[str, type[BaseModel]]] = {
     "unit": schema.UnitModel,
@@ -47,10 +47,10 @@ _MODELS: Final[dict[str, type[BaseModel]]] = {
 
 
 def read_definition(path: Path) -> tuple[InterfaceDefinition | None, list[str]]:
-    """Read a folder of TOML files, or one file; return the definition, or None and its errors."""
+    """Read a folder of TOML files, or one file; return the definition or None, and the errors."""
     files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
     if not files:
-        return None, [f"{path}: no .toml file of an interface definition in this folder"]
+        return None, [f"{path}: no .toml file in this folder"]
     builder = _Builder(path)
     for file in files:
         builder.read(file)
@@ -59,7 +59,7 @@ def read_definition(path: Path) -> tuple[InterfaceDefinition | None, list[str]]:
 
 
 def _key_path(document: object, location: tuple[int | str, ...]) -> str:
-    """Return a key's dotted path, with names of rows and fields instead of positions."""
+    """Return the dotted path of a key, with names of rows and fields instead of indices."""
     steps: list[str] = []
     here = document
     for step in location:
@@ -73,7 +73,7 @@ def _key_path(document: object, location: tuple[int | str, ...]) -> str:
 
 
 def _known_keys(location: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that the table of an unknown key may have."""
+    """Return the known keys of the table that has an unknown one."""
     tables = [step for step in location[:-1] if isinstance(step, str)]
     model = _MODELS.get(tables[-1], schema.FileModel) if tables else schema.FileModel
     return [item.alias or name for name, item in model.model_fields.items()]
@@ -122,17 +122,17 @@ class _Builder:
         self._files.append((file, model))
 
     def _attempt(self, step: Callable[..., None], *arguments: object) -> None:
-        """Do one step of building; record its error."""
+        """Run one step of building and record its error."""
         try:
             step(*arguments)
         except IcdError as error:
             self.errors.append(str(error))
 
     def build(self) -> InterfaceDefinition | None:
-        """Build the definition; None if an error leaves nothing to build on."""
+        """Build the definition; return None if an error makes this impossible."""
         if (
             self.errors
-        ):  # rows refer to each other across files: errors in one file would cause false ones in others
+        ):  # rows refer to rows in other files, so errors in one would cause false ones in others
             return None
         for file, model in self._files:
             for name, table in (
@@ -171,13 +171,13 @@ class _Builder:
         return definition
 
     def _check_link(self, definition: InterfaceDefinition) -> None:
-        """Check that the parts of the links fit one another and the rows."""
+        """Check that the parts of the links are compatible with each other and with the rows."""
         link = definition.link
         for row in definition.rows:
             if "echo" in row.answers:
                 where = f"{self._path}: {row.kind} {row.name}: answer 'echo'"
                 if link.serial is not None and isinstance(link.serial.framing, CubeSpaceFraming):
-                    raise IcdError(f"{where}: link.serial has no echoes with framing cubespace")
+                    raise IcdError(f"{where}: link.serial with framing cubespace has no echoes")
                 if link.can is not None:
                     raise IcdError(f"{where}: link.can has no echoes")
         if link.serial is None:
@@ -291,11 +291,11 @@ class _Builder:
         if model.name in self._enums:
             raise IcdError(f"{file}: enum {model.name}: defined twice")
         if len(set(model.values.values())) != len(model.values):
-            raise IcdError(f"{file}: enum {model.name}: two names have one number")
+            raise IcdError(f"{file}: enum {model.name}: two names have the same number")
         self._enums[model.name] = EnumDefinition(model.name, model.doc, dict(model.values))
 
     def enum_of(self, name: str | None, where: str) -> EnumDefinition:
-        """Return an enumeration of the unit, else of the device model."""
+        """Return an enumeration of the unit or, if it has none of this name, of the device model."""
         if name is None:
             raise IcdError(f"{where}: type enum needs `enum`, the name of an enumeration")
         if name in self._enums:
@@ -327,15 +327,15 @@ class _Builder:
             raise IcdError(f"{where}: defined twice")
         same_id = next((other.name for other in self._parameters.values() if other.id == model.id), None)
         if same_id is not None:
-            raise IcdError(f"{where}: id {model.id} is already used by {same_id}")
+            raise IcdError(f"{where}: ID {model.id} is already used by {same_id}")
         base = self._model.parameters.get(model.name)
         if base is None:
             hint = did_you_mean(model.name, self._model.parameters)
-            raise IcdError(f"{where}: the device has no parameter of this name{hint}")
+            raise IcdError(f"{where}: the device has no parameter with this name{hint}")
         changes = model.model_dump(exclude_none=True, exclude={"id"})
         whole = base.model_copy(update=changes)
         if whole.unit != base.unit:
-            raise IcdError(f"{where}: unit {whole.unit!r}, but the device has it in {base.unit!r}")
+            raise IcdError(f"{where}: unit {whole.unit!r}, but in the device it is {base.unit!r}")
         enum = self.enum_of(whole.enum, where) if whole.type == "enum8" else None
         low, high = self._limits(whole, enum, where)
         parameter = Parameter(
@@ -355,14 +355,14 @@ class _Builder:
         if model.type == "bool":
             return 0.0, 1.0
         if model.min is None or model.max is None or not model.min <= model.max:
-            raise IcdError(f"{where}: needs min and max, min not above max")
+            raise IcdError(f"{where}: needs min and max, with min not above max")
         low, high = INTEGER_RANGES.get(model.type, (float("-inf"), float("inf")))
         if model.min < low or model.max > high:
             raise IcdError(f"{where}: limits {model.min:g} to {model.max:g} do not fit type {model.type}")
         return model.min, model.max
 
     def check_parameter(self, name: str | None, unit: str, where: str) -> str | None:
-        """Check that a field's parameter exists and has the field's unit."""
+        """Check that the parameter of a field exists and has the unit of the field."""
         if name is None:
             return None
         if name not in self._device_parameters:
@@ -371,7 +371,7 @@ class _Builder:
             )
         if self._device_parameters[name].unit != unit:
             raise IcdError(
-                f"{where}: unit {unit!r}, but parameter {name} has {self._device_parameters[name].unit!r}; they must agree"
+                f"{where}: unit {unit!r}, but parameter {name} is in {self._device_parameters[name].unit!r}; they must agree"
             )
         return name
 
@@ -410,7 +410,7 @@ class _Builder:
                     f"{where}: no class named {model.class_!r}{did_you_mean(model.class_, self._classes)}"
                 )
             if found.kind.value != kind:
-                raise IcdError(f"{where}: class {model.class_} is of {found.kind.value}, not of {kind}")
+                raise IcdError(f"{where}: class {model.class_} is for {found.kind.value}, not for {kind}")
             return model.class_
         names = [item.name for item in self._classes.values() if item.kind.value == kind]
         if len(names) > 1 or (self._classes and not names):
@@ -422,10 +422,10 @@ class _Builder:
         first = self._unit.first_telemetry_id
         if first is not None and (row.id >= first) != (row.kind == "telemetry"):
             side = f"{first} and up" if row.kind == "telemetry" else f"below {first}"
-            raise IcdError(f"{where}: id {row.id} is not a {row.kind} id ({side})")
+            raise IcdError(f"{where}: ID {row.id} is not a {row.kind} ID ({side})")
         highest = self._highest_id
         if row.id > highest:
-            raise IcdError(f"{where}: id {row.id} is above {highest}")
+            raise IcdError(f"{where}: ID {row.id} is above {highest}")
         if row.name in rows:
             raise IcdError(f"{where}: name used twice")
         code = self._code(row)
@@ -433,11 +433,11 @@ class _Builder:
             (other.name for other in rows.values() if (self._code(other), other.id) == (code, row.id)), None
         )
         if same is not None:
-            raise IcdError(f"{where}: id {row.id} is already used by {same}")
+            raise IcdError(f"{where}: ID {row.id} is already used by {same}")
 
     @property
     def _highest_id(self) -> int:
-        """Highest id that the link can carry."""
+        """Highest ID that the link can carry."""
         link = self._tables.get("link", (self._path, None))[1]
         if not isinstance(link, LinkModel) or link.serial is None:
             return HIGHEST_ID
@@ -460,13 +460,13 @@ class _Builder:
             raise IcdError(f"{where}: needs `provenance`, here or in [unit]")
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
-            raise IcdError(f"{where}: last_id {last} is below id {model.id}")
+            raise IcdError(f"{where}: last_id {last} is below ID {model.id}")
         if kind == "telemetry" and (
             model.action is not None or model.arguments or model.readback is not None
         ):
             raise IcdError(f"{where}: only telecommands have an action or a readback")
         if model.readback is not None and not model.name.startswith(SETS):
-            raise IcdError(f"{where}: a telecommand with a readback is named {SETS}…")
+            raise IcdError(f"{where}: the name of a telecommand with a readback must begin with {SETS}")
         klass = self._class_of(kind, model, where)
         for number, row_id in enumerate(range(model.id, last + 1), 1):
             single = model.last_id is None
@@ -478,7 +478,7 @@ class _Builder:
             for item in model.fields or ():
                 layout.add(item)
             if model.size is not None and layout.size != model.size:
-                raise IcdError(f"{where}: size is {model.size} but the fields make {layout.size} bytes")
+                raise IcdError(f"{where}: size is {model.size} but the fields add up to {layout.size} bytes")
             yield Row(
                 kind=kind,
                 id=row_id,
@@ -507,11 +507,11 @@ class _Builder:
             if kind not in ("echo", "reply", "row") or (kind == "row") != bool(name):
                 raise IcdError(f"{where}: must be echo, reply or row:NAME")
             if kind == "row" and (name not in rows or rows[name].kind != "telemetry"):
-                raise IcdError(f"{where}: no telemetry of this name{did_you_mean(name, rows)}")
+                raise IcdError(f"{where}: no telemetry row with this name{did_you_mean(name, rows)}")
 
 
 def _readbacks(telecommands: list[schema.RowModel]) -> Iterator[schema.RowModel]:
-    """Yield the telemetry that reports what telecommands were last accepted with."""
+    """Yield the telemetry rows that report the last accepted values of telecommands."""
     for model in telecommands:
         if model.readback is not None:
             name = model.name.removeprefix(SETS)

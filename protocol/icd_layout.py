@@ -1,4 +1,4 @@
-"""Places the fields of a row one after another, as its definition lists them."""
+"""Layout of the fields of a row, in the order of the definition."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NUMBER: Final = "[n]"
 
 
 class Definitions(Protocol):
-    """What the rest of the definition says that fields refer to."""
+    """The parts of a definition to which fields refer."""
 
     byte_order: Order
 
@@ -25,17 +25,17 @@ class Definitions(Protocol):
         ...
 
     def check_parameter(self, name: str | None, unit: str, where: str) -> str | None:
-        """Check that a field's parameter exists and has the field's unit."""
+        """Check that the parameter of a field exists and has the unit of the field."""
         ...
 
 
 class Layout:
-    """The fields of one row and the bytes that they fill.
+    """The fields of one row, and the bytes that they occupy.
 
     Parameters
     ----------
     number
-        Number of the row among those that one entry expands to; None if it is one row.
+        Number of the row if the entry expands to several, otherwise None.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Layout:
         self.size = 0
 
     def include(self, row: Row) -> None:
-        """Append the fields of another row; telemetry reports a telecommand's fields as last accepted."""
+        """Append the fields of another row; fields of a telecommand report the last accepted values."""
         moved = {slot.index: self._slot(slot.type, slot.size, slot.order) for slot in row.slots}
         for item in row.fields:
             field = replace(item, slot=moved[item.slot.index])
@@ -80,18 +80,18 @@ class Layout:
             raise IcdError(f"{where}: `repeat` allows no other keys but `doc`")
         group = [single for item in repeat.fields for single in self._of_text(item)]
         if any(item.repeat is not None or item.count is not None for item in group):
-            raise IcdError(f"{where}: a repeated group holds neither `repeat` nor `count`")
+            raise IcdError(f"{where}: a repeated group cannot contain `repeat` or `count`")
         for number in range(repeat.first, repeat.first + repeat.count):
             for item in group:
                 self._place(item, where, f"_{number}", number)
 
     def _of_text(self, model: FieldModel) -> list[FieldModel]:
-        """Return the fields of a text, or the field itself."""
+        """Expand the text of a field to fields; return any other field itself."""
         if model.text is None:
             return [model]
         where = f"{self._where}: field {model.text!r}"
         if model.model_fields_set != {"text"}:
-            raise IcdError(f"{where}: `text` stands alone")
+            raise IcdError(f"{where}: `text` allows no other keys")
         try:
             return fields_of(model.text)
         except IcdError as error:
@@ -163,7 +163,7 @@ class Layout:
             self._append(self._bit(model, bit, slot, shift, here, suffix, number))
             shift += bit.width
         if shift != 8 * slot.size:
-            raise IcdError(f"{where}: the bits make {shift}, must be {8 * slot.size}")
+            raise IcdError(f"{where}: the bits add up to {shift}, must be {8 * slot.size}")
 
     def _bit(
         self,
@@ -242,7 +242,7 @@ class Layout:
 def mapped(
     table: Mapping[str, Scalar | list[Scalar]], where: str
 ) -> tuple[EnumDefinition, Mapping[str, str]]:
-    """Return the enumeration of a `map`, and the values that go out as another one of it."""
+    """Return the enumeration of a `map`, and the values that are sent as another member."""
     values: dict[str, int] = {}
     aliases: dict[str, str] = {}
     for wire, given in table.items():
@@ -261,7 +261,7 @@ def mapped(
 
 
 def text_of(value: object) -> str:
-    """Return a value as the members of a `map` are named."""
+    """Return the name of a value as a member of a `map`."""
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -275,11 +275,11 @@ def _kind(model: FieldModel, type_: str, enum: EnumDefinition | None) -> FieldKi
 
 
 def _numbered(name: str | None, number: int | None, where: str) -> str | None:
-    """Put the number of a repetition into the name of a quantity or argument."""
+    """Replace `[n]` in the name of a quantity or argument by the number of a repetition."""
     if name is None or NUMBER not in name:
         return name
     if number is None:
-        raise IcdError(f"{where}: {name}: [n] has no number outside of count, repeat and last_id")
+        raise IcdError(f"{where}: {name}: [n] is only allowed with count, repeat or last_id")
     return name.replace(NUMBER, f"[{number}]")
 
 

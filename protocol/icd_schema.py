@@ -35,11 +35,11 @@ class UnitModel(_Model):
     doc: str
     """Description, one sentence."""
     source: str = ""
-    """Public source of the confirmed rows that name no source."""
+    """Public source of confirmed rows without a `source`."""
     first_telemetry_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Lowest telemetry ID; lower IDs are telecommands. Omit it if the class or the row decides."""
+    """Lowest telemetry ID; lower IDs are telecommands. Omit it if IDs do not distinguish them."""
     provenance: Provenance | None = None
-    """Provenance of the rows that name none."""
+    """Default provenance of rows."""
     plugin: str | None = None
     """Python file beside the definition, with custom quantities, actions, framings or checks."""
 
@@ -50,10 +50,10 @@ class ConventionsModel(_Model):
     quaternion: Literal["rotation", "attitude"] = "rotation"
     """`rotation`: v_sensor = q v q*; `attitude`: the conjugate, the q of an attitude matrix A(q)."""
     scalar_sign: Literal["positive", "any"] = "positive"
-    """`positive`: the scalar part is never negative; `any`: the sign that is closer to the last reported
-    quaternion."""
+    """`positive`: the scalar part is never negative; `any`: the sign that gives the quaternion closer to the
+    last reported one."""
     axes: Annotated[list[Axis], Field(min_length=3, max_length=3)] = ["+x", "+y", "+z"]
-    """Axes of the reported frame in terms of the sensor's (+x right in the image, +y down, +z boresight)."""
+    """Axes of the reported frame in the sensor frame (+x right in the image, +y down, +z boresight)."""
     epoch: str = "unix"
     """Epoch of all times: `unix`, `gps`, `j2000`, `midnight` (of the current day), or a date such as
     `2000-01-01`."""
@@ -62,7 +62,7 @@ class ConventionsModel(_Model):
 
 
 class ClassModel(_Model):
-    """A class of rows, with the codes that stand for it in a message."""
+    """A class of rows, with its codes in a message."""
 
     name: Name
     """Name that rows refer to."""
@@ -71,9 +71,9 @@ class ClassModel(_Model):
     code: Code | None = None
     """Code in a request."""
     reply: Code | None = None
-    """Code in a reply; default: the request's."""
+    """Code in a reply; default: `code`."""
     unsolicited: Code | None = None
-    """Code in unsolicited telemetry; default: the reply's."""
+    """Code in unsolicited telemetry; default: `reply`."""
     answer: list[str] | None = None
     """Answers of its rows, in order: `echo`, `reply`, `row:NAME`; default: `["reply"]`."""
 
@@ -95,10 +95,10 @@ class _BoundModel(_Model):
     name: Name | None = None
     """Name of the field; a field without a name is sent as zeros."""
     enum: str | None = None
-    """Name of an enumeration, of the unit or of the device model."""
+    """Name of an enumeration of the unit or the device model."""
     default: Scalar | None = None
-    """Value used if a client omits the field of a telecommand, or if a telemetry field has no value or no
-    number for it."""
+    """Value if a client omits the field of a telecommand, or if the quantity of a telemetry field has no
+    value or a value without a number."""
     parameter: str | None = None
     """Parameter that the field sets or reports."""
     value: str | None = None
@@ -121,7 +121,7 @@ class BitModel(_BoundModel):
 
 
 class RepeatModel(_Model):
-    """A group of fields, sent `count` times; `[n]` in the name of a quantity or argument is the number of the repetition."""
+    """A group of fields, sent `count` times; `[n]` in a quantity or argument is the repetition's number."""
 
     count: Annotated[int, Field(ge=1, le=256)]
     """Number of repetitions; the names of their fields end in _1, _2 …, unless `first` is given."""
@@ -132,13 +132,13 @@ class RepeatModel(_Model):
 
 
 class FieldModel(_BoundModel):
-    """One field of a row; unused and sent as zeros if it has no name. A string instead of a table is its `text`."""
+    """One field of a row; unused and sent as zeros if it has no name. A string means a table with `text`."""
 
     text: str | None = None
     """Short form of one or several fields, such as `i16 mag{0,1}_{x,y,z} uT 0.01`, instead of all other
     keys."""
     count: Annotated[int, Field(ge=2, le=64)] | None = None
-    """Expands to the fields name_1 … name_count; `[n]` in a quantity's or argument's name is the number."""
+    """Expands to the fields name_1 … name_count; `[n]` in a quantity or argument is the number."""
     repeat: RepeatModel | None = None
     """A repeated group instead of a single field."""
     type: FieldType | None = None
@@ -177,8 +177,8 @@ class RowModel(_Model):
     id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
     """ID on the wire."""
     last_id: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the row's
-    number."""
+    """Expands to the rows name_1 … with the IDs `id` to `last_id` and the same layout; `[n]` is the number of
+    the row."""
     name: Name
     """Name for clients, sessions and exports."""
     class_: str | None = Field(default=None, alias="class")
@@ -199,18 +199,18 @@ class RowModel(_Model):
     unbound: Literal["zeros"] | None = None
     """`zeros`: fields without a binding are sent as zeros; default: they are an error."""
     readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """ID of the telemetry that reports the arguments that a telecommand named `set_…` was last accepted with;
-    it has the name without `set_`."""
+    """ID of a telemetry row that reports the last accepted values of this telecommand. The telecommand's name
+    is `set_…`; the telemetry row has the rest of it."""
     action: str | None = None
     """Action that a telecommand performs."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     answer: list[str] | None = None
-    """Answers, in order: `echo`, `reply`, `row:NAME`; default: the class's."""
+    """Answers, in order: `echo`, `reply`, `row:NAME`; default: those of the class."""
 
 
 class ParameterModel(_Model):
-    """A device parameter that the unit exposes; omitted keys keep the device model's values."""
+    """A device parameter that the unit exposes; omitted keys have the values of the device model."""
 
     id: Annotated[int, Field(ge=1, le=254)]
     """ID in set_parameter and select_parameter."""
@@ -219,7 +219,7 @@ class ParameterModel(_Model):
     type: ParameterType | None = None
     """Type on the wire."""
     unit: str | None = None
-    """Unit; must be the device model's."""
+    """Unit; must be that of the device model."""
     min: float | None = None
     """Lowest value."""
     max: float | None = None

@@ -1,7 +1,7 @@
 """Transfer of images and files, for both ends: image frames with a checksum, burst packets and the hole map.
 
-Image frames follow the CubeSense node, bursts the CubeComputer. No public source gives the checksum rules;
-both are ours.
+Image frames follow the CubeSense node, bursts the CubeComputer. The checksum algorithms are not public; both
+are ours.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ PACKET_DATA: Final = 20
 """Bytes of the file in one burst packet."""
 
 MAP_PARTS: Final = 8
-"""Telecommands and telemetry rows that carry the hole map."""
+"""Number of parts of the hole map, each a telecommand and a telemetry row."""
 
 MAP_PART_SIZE: Final = 16
 """Bytes of one part of the hole map."""
 
 MAX_PACKETS: Final = MAP_PARTS * MAP_PART_SIZE * 8
-"""Packets that the hole map covers."""
+"""Number of packets that the hole map covers."""
 
 MAX_BLOCK: Final = MAX_PACKETS * PACKET_DATA
 """Bytes of the largest block."""
@@ -66,7 +66,7 @@ def parse_burst_packet(packet: bytes) -> tuple[int, bytes]:
 
 
 class HoleMap:
-    """The arrived packets of a block: bit n of part k (from 1) is packet 128 (k - 1) + n."""
+    """Which packets of a block have arrived: bit n of part k (from 1) is packet 128 (k - 1) + n."""
 
     def __init__(self, arrived: Iterable[int] = ()) -> None:
         self._bits = bytearray(MAP_PARTS * MAP_PART_SIZE)

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from starhil.protocol.messages import DEFAULT_TIMEOUT_S
 
 HEX: Final = {"format": "hex"}
-"""Schema of numbers that the reference shows in hexadecimal."""
+"""Schema of numbers that the reference pages show in hexadecimal."""
 Byte = Annotated[int, Field(ge=0, le=0xFF, json_schema_extra=HEX)]
 Order = Literal["little", "big"]
 CheckType = Literal["u8", "u16", "u32", "u64"]
@@ -79,7 +79,7 @@ class SlipFraming(_Model):
 
 
 class LengthFraming(_Model):
-    """`start`, a message whose size the header's `length` field gives, `end`."""
+    """`start`, a message whose size is given by the header field `length`, `end`."""
 
     kind: Literal["length"]
     """Selects this framing."""
@@ -90,7 +90,7 @@ class LengthFraming(_Model):
 
 
 class FixedFraming(_Model):
-    """`start`, a message whose size its row gives, `end`."""
+    """`start`, a message whose size is given by its row, `end`."""
 
     kind: Literal["fixed"]
     """Selects this framing."""
@@ -171,7 +171,7 @@ class XorCheck(_CheckModel):
 
 
 class CrcCheck(_CheckModel):
-    """CRC with the parameters of the Rocksoft model, as CRC catalogues list them."""
+    """CRC with the parameters of the Rocksoft model, as listed in CRC catalogues."""
 
     kind: Literal["crc"]
     """Selects this check."""
@@ -220,17 +220,17 @@ class HeaderBitModel(_Model):
     const: Annotated[int, Field(ge=0)] | None = None
     """Value that is sent, and required on reception."""
     default: Annotated[int, Field(ge=0)] | None = None
-    """Value that is sent if the message has none; not checked on reception, except an address."""
+    """Value that is sent if the message sets none; not checked on reception, except for an address."""
 
 
 class HeaderFieldModel(_Model):
     """One field of a header.
 
-    Roles: `address` is the device's address in both directions; `source` (in a request) and `destination` (in
-    a reply) are the OBC's. `class`, `id` and `status` are the codes of class, row and error. `length` is
-    described by `includes`. `ack` is 0 in a refusal, else 1; `final` is 1 in the last reply to a request. A
-    reply repeats the `sequence` and `flags` of its request. `ticks` is the time since start, `time` the
-    unit's time.
+    Roles: `address` is the address of the device, in both directions; `source` (in a request) and
+    `destination` (in a reply) are the address of the OBC. `class`, `id` and `status` are the codes of class,
+    row and error. `length` is described by `includes`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
+    the last reply to a request. A reply repeats the `sequence` and `flags` of its request. `ticks` is the
+    time since start, `time` the time of the unit's clock.
     """
 
     role: Role | None = None
@@ -240,7 +240,7 @@ class HeaderFieldModel(_Model):
     const: int | None = None
     """Value that is sent, and required on reception."""
     default: int | None = None
-    """Value that is sent if the message has none; not checked on reception, except an address."""
+    """Value that is sent if the message sets none; not checked on reception, except for an address."""
     order: Order | None = None
     """Byte order; default: the unit's."""
     scale: Annotated[float, Field(gt=0)] = 1.0

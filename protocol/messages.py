@@ -9,16 +9,16 @@ from typing import Final
 from starhil.protocol.errors import ProtocolError
 
 FIRST_TELEMETRY_ID: Final = 128
-"""Ids from this one up are telemetry, those below are telecommands."""
+"""IDs from this one on are telemetry, lower IDs are telecommands."""
 
 DEFAULT_MAX_SIZE: Final = 512
-"""Longest message that a receiver accepts, as the published host library's buffer."""
+"""Longest message that a receiver accepts: the buffer size of the published host library."""
 
 DEFAULT_TIMEOUT_S: Final = 0.5
 """Silence within a message after which it is abandoned."""
 
 BURST_ID: Final = 119
-"""Id of the packets of a file burst."""
+"""ID of the packets of a file burst."""
 
 
 class ErrorCode(IntEnum):
@@ -58,16 +58,16 @@ class ReplyKind(Enum):
 
 
 class FaultKind(Enum):
-    """Faults of bytes or frames that did not yield a message."""
+    """Kinds of faults in received bytes or CAN frames."""
 
     UART_PROTOCOL = "uart_protocol"
-    """Bytes outside a message or that violate the framing."""
+    """Bytes outside a message, or bytes that violate the framing."""
     UART_INCOMPLETE = "uart_incomplete"
     """A message began and did not end."""
     UART_OVERLONG = "uart_overlong"
     """A message longer than the receiver accepts."""
     UART_CHECK = "uart_check"
-    """A message whose check is wrong."""
+    """A message with a wrong check."""
     UART_ADDRESS = "uart_address"
     """A message to another address."""
     CAN_SEQUENCE = "can_sequence"
@@ -79,7 +79,7 @@ class FaultKind(Enum):
     CAN_TYPE = "can_type"
     """A message type that a device or host does not accept."""
     CAN_OVERLONG = "can_overlong"
-    """A segmented message longer than the receiver accepts, or too many open at once."""
+    """A segmented message longer than the receiver accepts, or too many incomplete messages."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,31 +88,31 @@ class Request:
 
     kind: RequestKind
     id: int
-    """Id on the wire, 0 to 255."""
+    """ID on the wire, 0 to 255."""
     data: bytes = b""
     source: int = 0
     """Address of the sender; 0 on a serial line whose messages carry none."""
     klass: str = ""
-    """Class of the row, where the unit's rows have classes."""
+    """Class of the row, if the unit has classes."""
     sequence: int = 0
-    """Number of the message, where its header has one; the reply repeats it."""
+    """Sequence number in the header, if any; the reply repeats it."""
     flags: int = 0
-    """Flags of its header; the reply repeats them."""
+    """Flags in the header, if any; the reply repeats them."""
 
     @classmethod
     def of(cls, row_id: int, data: bytes = b"", source: int = 0) -> Request:
-        """Return a request whose kind follows from its id."""
+        """Return a request whose kind follows from its ID."""
         kind = RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
         return cls(kind, row_id, data, source)
 
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A device's answer to a request, or a message that it sends unprompted."""
+    """The answer of a device to a request, or an unsolicited message."""
 
     kind: ReplyKind
     id: int | None
-    """Id of the answered request or of the message; None if the serial dialect does not carry it.
+    """ID of the answered request or of the message; None if the serial dialect does not carry it.
     """
     data: bytes = b""
     code: ErrorCode | int = ErrorCode.OK
@@ -122,19 +122,19 @@ class Reply:
     source: int = 0
     """Address of the sender (set on the OBC side); 0 on a serial line whose messages carry none."""
     klass: str = ""
-    """Class of the row, where the unit's rows have classes."""
+    """Class of the row, if the unit has classes."""
     sequence: int = 0
     flags: int = 0
     final: bool = True
-    """Whether no further reply to the same request follows."""
+    """Whether this is the last reply to the request."""
     uptime_ns: int = 0
-    """Time since the device started, where the header carries `ticks`."""
+    """Time since the device started, if the header carries `ticks`."""
     time_ns: int = 0
-    """Time of the device's clock since the unit's epoch, where the header carries `time`."""
+    """Time of the device's clock since the unit's epoch, if the header carries `time`."""
 
     @classmethod
     def echo(cls, request: Request) -> Reply:
-        """Return the repetition of a request."""
+        """Return the echo of a request."""
         return cls(
             ReplyKind.ECHO,
             request.id,
@@ -148,21 +148,21 @@ class Reply:
 
 @dataclass(frozen=True, slots=True)
 class MessageClass:
-    """A class of rows: the codes that stand for it on the wire, None where the header has no class."""
+    """A class of rows, with its codes on the wire; None if the header has no class."""
 
     name: str
     kind: RequestKind
     code: int | None = None
-    """In a request."""
+    """Code in a request."""
     reply: int | None = None
-    """Code in a reply; default: the request's."""
+    """Code in a reply; default: `code`."""
     unsolicited: int | None = None
-    """Code in unsolicited telemetry; default: the reply's."""
+    """Code in unsolicited telemetry; default: `reply`."""
 
 
 @dataclass(frozen=True, slots=True)
 class LinkFault:
-    """Input that yielded no message: the kind for the counters, the detail as text."""
+    """Input that is not a valid message: the kind for counters, and a text."""
 
     kind: FaultKind
     detail: str

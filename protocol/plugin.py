@@ -1,6 +1,6 @@
-"""The way out of the data: functions of a unit's own, in a Python file beside its definition.
+"""Custom functions of a unit, in a Python file beside its definition.
 
-In `unit.py`, beside the TOML files of a unit whose `[unit]` says `plugin = "unit.py"`::
+Example of `unit.py` beside the TOML files of a unit with `plugin = "unit.py"` in `[unit]`::
 
     from starhil.protocol.plugin import action, check, framing, quantity
 
@@ -12,10 +12,10 @@ In `unit.py`, beside the TOML files of a unit whose `[unit]` says `plugin = "uni
     def blink(device, arguments):
         device.reset("command")
 
-An action's function returns nothing, messages that follow the answer, or `bytes`, the data of the answer; a
-list of them is as many answers. A quantity's function gets the `starhil.emulator.device.snapshot.Snapshot` of
-the device, an action's the device and its arguments by name. Framings and checks are used by
-`starhil.protocol.composed_stack`.
+The function of a quantity is called with a `starhil.emulator.device.snapshot.Snapshot` of the device. The
+function of an action is called with the device and the arguments by name; it returns nothing, messages that
+follow the answer, or `bytes`, which are the data of the answer; a list of `bytes` makes several answers.
+Framings and checks are used by `starhil.protocol.composed_stack`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class PluginQuantity:
 
 @dataclass(frozen=True)
 class Plugin:
-    """What the plugin of a unit defines, by name."""
+    """Functions defined by the plugin of a unit, by name."""
 
     quantities: dict[str, PluginQuantity] = field(default_factory=dict)
     actions: dict[str, Callable[[Any, Mapping[str, Any]], Any]] = field(default_factory=dict)
@@ -55,19 +55,19 @@ _loading: ContextVar[Plugin | None] = ContextVar("plugin that is being loaded", 
 
 
 def quantity(name: str, *, unit: str = "", doc: str = "") -> Callable[[Function], Function]:
-    """Make a function of the device's snapshot a quantity that rows can bind with `value`."""
+    """Register a function of a snapshot as a quantity, to which rows can be bound with `value`."""
     return _registering("quantities", name, lambda function: PluginQuantity(function, unit, doc))
 
 
 def _registering(
     table: str, name: str, entry: Callable[[Any], Any] = lambda function: function
 ) -> Callable[[Function], Function]:
-    """Return what enters a function, or what `entry` makes of it, in a table of the plugin being loaded."""
+    """Return a decorator that registers a function, or the result of `entry`, in the plugin being loaded."""
 
     def register(function: Function) -> Function:
         plugin = _loading.get()
         if plugin is None:
-            raise IcdError("a plugin's functions are registered only while its unit is being loaded")
+            raise IcdError("functions of a plugin can be registered only while its unit is being loaded")
         getattr(plugin, table)[name] = entry(function)
         return function
 
@@ -75,24 +75,24 @@ def _registering(
 
 
 def action(name: str) -> Callable[[Function], Function]:
-    """Make a function of device and arguments an action of telecommands."""
+    """Register a function of device and arguments as an action."""
     return _registering("actions", name)
 
 
 def framing(name: str) -> Callable[[Function], Function]:
-    """Make a class a framing of serial links."""
+    """Register a class as a framing."""
     return _registering("framings", name)
 
 
 def check(name: str) -> Callable[[Function], Function]:
-    """Make a function of bytes a check of serial links."""
+    """Register a function of bytes as a check."""
     return _registering("checks", name)
 
 
 def load_plugin(file: Path) -> Plugin:
-    """Run the plugin of a unit and return what it defines.
+    """Run the plugin of a unit and return the functions that it defines.
 
-    Raises IcdError with the plugin's own error in one line.
+    Raises IcdError with the error of the plugin in one line.
     """
     plugin = Plugin()
     token = _loading.set(plugin)

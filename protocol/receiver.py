@@ -12,7 +12,7 @@ Message_co = TypeVar("Message_co", covariant=True)
 
 
 class Receiver(Protocol[Arriving_contra, Message_co]):
-    """The receiving side of a framing."""
+    """The receiving side of a link."""
 
     @property
     def busy(self) -> bool:
@@ -20,7 +20,7 @@ class Receiver(Protocol[Arriving_contra, Message_co]):
         ...
 
     def feed(self, item: Arriving_contra, now: float, /) -> Sequence[Message_co | LinkFault]:
-        """Return what an item completes; `now` is its arrival (s, any origin)."""
+        """Return the messages and faults that an item completes; `now` is the time of arrival, s."""
         ...
 
     def flush(self, now: float) -> list[LinkFault]:

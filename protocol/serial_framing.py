@@ -1,8 +1,7 @@
 """Serial framing of the CubeSpace family: `1F 7F <id> <data> 1F FF` with 0x1F doubled, as a sans-I/O state machine.
 
-Three public dialects of replies are in use: a (CubeComputer: the reply carries the id), b (stand-alone
-CubeSense node: it does not) and c (generation 2: the start byte distinguishes ACK, NACK, event and
-unsolicited telemetry).
+Replies have three public dialects: a (CubeComputer: with ID), b (stand-alone CubeSense node: without ID) and
+c (generation 2: the start byte distinguishes ACK, NACK, event and unsolicited telemetry).
 """
 
 from __future__ import annotations
@@ -59,16 +58,16 @@ class _State(Enum):
     IDLE_ESCAPED = auto()
     """Outside a message, after an escape byte."""
     FIRST = auto()
-    """At the first byte after the start: the id, if the message has one."""
+    """At the first byte after the start: the ID, if the message has one."""
     FIRST_ESCAPED = auto()
-    """After an escape byte at the position of the id."""
+    """After an escape byte at the position of the ID."""
     BODY = auto()
     BODY_ESCAPED = auto()
 
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """The content between start and end of a message, without the stuffing."""
+    """The content of a message between start and end, unstuffed."""
 
     start: int
     """Start byte: 7F, or 07, 0F, 2F, 4F in dialect c."""
@@ -78,8 +77,8 @@ class Packet:
 class Deframer:
     """Finds packets in a stream of bytes; each run of junk yields one fault.
 
-    A run of junk ends at the next start of a message or after a silence of the timeout. An id of 0x1F is
-    ambiguous in practice: some senders double it, others do not. Both forms are read as id 0x1F unless they
+    A run of junk ends at the next start of a message or after a silence of the timeout. An ID of 0x1F is
+    ambiguous in practice: some senders double it, others do not. Both forms are read as ID 0x1F, unless they
     are a start or an end.
     """
 
@@ -109,11 +108,11 @@ class Deframer:
 
     @property
     def busy(self) -> bool:
-        """Whether a message has begun and not ended."""
+        """Whether a message is incomplete."""
         return self._state not in (_State.IDLE, _State.IDLE_ESCAPED)
 
     def feed(self, data: bytes, now: float) -> list[Packet | LinkFault]:
-        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
         self._events = list(self.flush(now))
         if data:
             self._last_time = now
@@ -123,7 +122,7 @@ class Deframer:
         return self._events
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Abandon a message that has been silent for the timeout."""
+        """Abandon an incomplete message after a silence of the timeout."""
         if now - self._last_time < self._timeout_s:
             return []
         state, in_junk, size = self._state, self._in_junk, len(self._body)
@@ -197,7 +196,7 @@ class Deframer:
             if body:
                 self._events.append(Packet(self._start, body))
             else:
-                self._events.append(LinkFault(FaultKind.UART_PROTOCOL, "message without an id"))
+                self._events.append(LinkFault(FaultKind.UART_PROTOCOL, "message without an ID"))
         elif byte in self._starts:
             text = f"message of {len(self._body)} bytes interrupted by the start of another"
             self._events.append(LinkFault(FaultKind.UART_INCOMPLETE, text))
@@ -216,7 +215,7 @@ class Deframer:
         self._body.clear()
 
     def _abandon(self, kind: FaultKind, text: str) -> None:
-        """Drop the message; the rest of it belongs to the same run of junk."""
+        """Drop the message; its remaining bytes belong to the same run of junk."""
         self._events.append(LinkFault(kind, text))
         self._reset(in_junk=True)
 
@@ -239,7 +238,7 @@ def encode_packet(start: int, body: bytes) -> bytes:
 def encode_request(request: Request, *, stuff_id: bool = True) -> bytes:
     """Frame a telecommand or telemetry request as an OBC sends it, the same in all dialects.
 
-    Without `stuff_id` an id of 0x1F is sent once, as some flight software does.
+    Without `stuff_id`, an ID of 0x1F is not doubled, as in some flight software.
     """
     if stuff_id:
         return encode_packet(START, bytes((request.id,)) + request.data)
@@ -247,10 +246,10 @@ def encode_request(request: Request, *, stuff_id: bool = True) -> bytes:
 
 
 def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
-    """Frame a device's reply in a dialect.
+    """Frame a reply of a device in a dialect.
 
-    In dialects a and b the NACK of a telemetry request is the error code instead of the telemetry; no public
-    source shows that form, it is ours. Burst packets have the same form in all dialects.
+    In dialects a and b, the NACK of a telemetry request has the error code instead of the telemetry; this is
+    ours, as no public source shows it. Burst packets are the same in all dialects.
 
     Raises
     ------
@@ -285,7 +284,7 @@ def _encode_generation_2(reply: Reply) -> bytes:
 
 def _require_id(reply: Reply) -> int:
     if reply.id is None:
-        raise ProtocolError(f"a {reply.kind.value} in this serial dialect needs an id")
+        raise ProtocolError(f"a {reply.kind.value} in this serial dialect needs an ID")
     return reply.id
 
 
@@ -293,30 +292,30 @@ _Message = TypeVar("_Message", Request, Reply)
 
 
 class _Receiver(ABC, Generic[_Message]):
-    """Common base of both ends: bytes in, messages and faults out."""
+    """Base of both ends: bytes in, messages and faults out."""
 
     def __init__(self, deframer: Deframer) -> None:
         self._deframer = deframer
 
     @property
     def busy(self) -> bool:
-        """Whether a message has begun and not ended, so that `flush` may become due."""
+        """Whether a message is incomplete, so that `flush` may become due."""
         return self._deframer.busy
 
     def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        """Return what these bytes complete; `now` is their arrival (s, any origin)."""
+        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
         return [
             event if isinstance(event, LinkFault) else self._interpret(event)
             for event in self._deframer.feed(data, now)
         ]
 
     def flush(self, now: float) -> list[LinkFault]:
-        """Abandon a message that has been silent for the timeout."""
+        """Abandon an incomplete message after a silence of the timeout."""
         return self._deframer.flush(now)
 
     @abstractmethod
     def _interpret(self, packet: Packet) -> _Message | LinkFault:
-        """Return the message of a packet, or the fault if it has none."""
+        """Return the message in a packet, or its fault."""
 
 
 class DeviceReceiver(_Receiver[Request]):
@@ -333,7 +332,7 @@ class DeviceReceiver(_Receiver[Request]):
 class HostReceiver(_Receiver[Reply]):
     """The OBC's end: bytes in, replies and faults out, in one dialect.
 
-    Dialects a and b do not identify a message, so `expect` must be called before a request is sent.
+    In dialects a and b, replies cannot be interpreted alone: call `expect` before each request.
     """
 
     def __init__(
@@ -350,7 +349,7 @@ class HostReceiver(_Receiver[Reply]):
         self._expected: tuple[Request, int] | None = None
 
     def expect(self, request: Request, reply_size: int) -> None:
-        """Set the next request, and the data bytes of its telemetry (0 for a telecommand)."""
+        """Set the next request, and the data size of its telemetry in bytes (0 for a telecommand)."""
         self._expected = (request, reply_size)
 
     def _interpret(self, packet: Packet) -> Reply | LinkFault:
@@ -364,7 +363,7 @@ class HostReceiver(_Receiver[Reply]):
             size = expected[1] if expected is not None and expected[0].id == body[0] else None
             return self._generation_1(body[0], body[1:], size)
         if self._expected is None:
-            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes to no request")
+            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
         request, size = self._expected
         return self._generation_1(request.id, body, size)
 
@@ -416,7 +415,7 @@ class HostReceiver(_Receiver[Reply]):
 
 
 class PacingSchedule:
-    """Times at which bytes leave a serial line, one after another at its bit rate."""
+    """Schedule of bytes on a serial line at its bit rate."""
 
     def __init__(self, baud: int, bits_per_byte: int = 10) -> None:
         if baud <= 0 or bits_per_byte <= 0:
@@ -428,7 +427,7 @@ class PacingSchedule:
     def reserve(self, now: float, size: int) -> tuple[float, float]:
         """Reserve the line for `size` bytes.
 
-        Return when the first begins and when the last has left.
+        Returns the times at which the first byte begins and the last one ends.
         """
         begin = max(now, self._free_at)
         self._free_at = begin + size * self.seconds_per_byte

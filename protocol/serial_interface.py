@@ -1,4 +1,4 @@
-"""The two ends of a serial link, for emulator and OBC of any unit."""
+"""Interfaces of a serial link of any unit, at both ends."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ class HostEnd(Receiver[bytes, Reply], Protocol):
     """The OBC's end."""
 
     def expect(self, request: Request, reply_size: int) -> None:
-        """Set the next request, and the data bytes of its telemetry (0 for a telecommand)."""
+        """Set the next request, and the data size of its telemetry in bytes (0 for a telecommand)."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class RowShape:
-    """What a link must know of a row: its kind, sizes and answers."""
+    """The properties of a row on which a link depends: kind, sizes and answers."""
 
     klass: str
     id: int
     kind: RequestKind
     request_size: int = 0
-    """Data bytes of the request: parameters of a telecommand."""
+    """Number of data bytes in the request."""
     reply_size: int = 0
     """Number of data bytes in the reply."""
     answers: tuple[str, ...] = ("reply",)
@@ -40,7 +40,7 @@ class SerialStack(ABC):
     baud: int
 
     def supports_unsolicited(self, style: Dialect | None = None) -> bool:  # noqa: ARG002 -- for those with styles
-        """Return whether unsolicited telemetry can be sent in this style."""
+        """Return whether this style has unsolicited telemetry."""
         return True
 
     @abstractmethod
@@ -57,7 +57,7 @@ class SerialStack(ABC):
 
     @abstractmethod
     def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:
-        """Return a reply as bytes on the line; none if the unit has no such reply.
+        """Return a reply as bytes on the line; empty if the unit has no such reply.
 
         Raises ProtocolError if the link cannot carry it.
         """

@@ -1,7 +1,7 @@
-"""The serial link of a unit as its definition describes it, sans-I/O.
+"""The serial link of a unit according to its definition, sans-I/O.
 
-A unit of the CubeSpace family keeps the codec of `serial_framing`, with its three reply dialects; every other
-unit is composed of the parts in `framings`, `checks` and `envelope` (`composed_stack`).
+Units of the CubeSpace family use the codec in `serial_framing`, with its three reply dialects. The link of any
+other unit is composed of parts from `framings`, `checks` and `envelope` (`composed_stack`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class CubeSpaceStack(SerialStack):
     Attributes
     ----------
     dialect
-        The unit's only dialect, for any style; None if it has all.
+        The only dialect of the unit, used for any style; None if it has all three.
     """
 
     def __init__(self, link: SerialLinkModel) -> None:
@@ -47,7 +47,7 @@ class CubeSpaceStack(SerialStack):
         return HostReceiver(self._style(style), max_size=self._max_size, timeout_s=self._timeout_s)
 
     def supports_unsolicited(self, style: Dialect | None = None) -> bool:
-        """Return whether unsolicited telemetry can be sent in this dialect."""
+        """Return whether this dialect has unsolicited telemetry."""
         return self._style(style).supports_unsolicited
 
     def encode_request(self, request: Request) -> bytes:
@@ -76,7 +76,7 @@ def build_stack(
     Raises
     ------
     IcdError
-        Parts that do not fit one another.
+        Parts of the link are incompatible.
     """
     if isinstance(link.framing, CubeSpaceFraming):
         return CubeSpaceStack(link)
@@ -84,39 +84,37 @@ def build_stack(
 
 
 def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | None:
-    """Return the dialect of a unit's serial replies; None if it has no dialects.
+    """Return the dialect of serial replies of a unit; None if it has no dialects.
 
     Parameters
     ----------
     icd
         Definition of the unit.
     wanted
-        What a user has chosen; None for the default: the unit's only dialect, else b.
+        The user's choice; None for the default: the only dialect of the unit, otherwise b.
 
     Raises
     ------
     IcdError
-        The unit does not have what the user has chosen.
+        The unit does not have this dialect.
     """
     framing = None if icd.link.serial is None else icd.link.serial.framing
     if not isinstance(framing, CubeSpaceFraming):
         if wanted is not None:
-            raise IcdError(f"unit {icd.name} has no reply dialects; leave the choice of one out")
+            raise IcdError(f"unit {icd.name} has no reply dialects; do not select one")
         return None
     if framing.dialect is not None and wanted not in (None, framing.dialect):
-        raise IcdError(
-            f"unit {icd.name} has dialect {framing.dialect} alone; leave the choice of another out"
-        )
+        raise IcdError(f"unit {icd.name} has only dialect {framing.dialect}; do not select another")
     return Dialect(framing.dialect or wanted or Dialect.B)
 
 
 def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
-    """Return the serial link of a unit's definition.
+    """Return the serial link of a definition.
 
     Raises
     ------
     IcdError
-        The unit has none, or its parts do not fit one another.
+        The unit has none, or parts of it are incompatible.
     """
     link = icd.link.serial
     if link is None:

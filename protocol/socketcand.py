@@ -1,8 +1,8 @@
 """The socketcand text protocol, sans-I/O: split a stream into commands `< … >`, convert frames to text and back.
 
-One extension: after `< remote >` (answered by `< ok >`) a client may send and receive remote frames. Their
-CAN ID has eight digits with the kernel's flags 40000000 (remote) and 80000000 (29-bit). Other clients never
-receive remote frames, because the plain protocol cannot distinguish them from data frames.
+There is one extension: after `< remote >` (answered by `< ok >`), a client may send and receive remote frames.
+Their CAN ID has eight digits with the kernel's flags 40000000 (remote) and 80000000 (29-bit). Other clients do
+not receive remote frames, because the plain protocol cannot distinguish them from data frames.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ def parse_send(command: bytes) -> CanFrame:
 
 
 def parse_can_id(digits: bytes) -> tuple[bool, bool, int]:
-    """Parse a CAN ID of up to three digits (11-bit) or eight (29-bit).
+    """Parse a CAN ID of up to three digits (11-bit) or eight digits (29-bit).
 
-    Return extended, remote, number.
+    Returns whether it is extended, whether the frame is remote, and the number.
     """
     number = int(digits, 16)
     extended, remote = len(digits) == 8, False

@@ -1,4 +1,4 @@
-"""Example exchanges of a unit: what a request of each row and its answers look like on each link, byte for byte."""
+"""Example exchanges of a unit: the request for each row and its answers on each link, as bytes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HOST_ADDRESS, DEVICE_ADDRESS = 1, 4
 
 @dataclass(frozen=True)
 class Exchange:
-    """A request of a row and the answers to it on a link, as hexadecimal bytes; on CAN with the identifier of each frame."""
+    """A request for a row and its answers on a link, as hexadecimal bytes, on CAN with CAN IDs."""
 
     row: Row
     link: str
@@ -26,7 +26,7 @@ class Exchange:
 
 
 def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
-    """Yield an exchange for each row on each link, with the values that the fields have where nothing else is known.
+    """Yield an exchange for each row on each link, with the default values of the fields.
 
     Raises ProtocolError for a row whose defaults contradict its limits.
     """

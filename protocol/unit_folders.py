@@ -24,9 +24,9 @@ def bundled_units() -> list[str]:
 
 
 def find_unit(name_or_folder: str | Path) -> Path:
-    """Return the path of a unit: a bundled unit by name, else an existing folder or TOML file.
+    """Return the path of a unit: a bundled unit by name, or an existing folder or TOML file.
 
-    Raises IcdError that offers similar names.
+    Raises IcdError, whose text suggests similar names.
     """
     path = Path(name_or_folder).expanduser()
     shipped = bundled_units()

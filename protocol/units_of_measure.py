@@ -1,4 +1,4 @@
-"""Units of measure of quantities and fields, and the factors between units of one kind."""
+"""Units of measure of quantities and fields, and the factors between compatible units."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PER_SI_UNIT: Final[dict[str, dict[str, float]]] = {
     "current": {"A": 1.0, "mA": 1e3},
     "power": {"W": 1.0, "mW": 1e3},
 }
-"""Counts of each unit in one unit of the SI, by kind."""
+"""Number of each unit in one SI unit, by kind."""
 
 
 def convertible(unit: str) -> list[str]:
@@ -29,7 +29,7 @@ def convertible(unit: str) -> list[str]:
 
 
 def factor(unit: str, wanted: str) -> float | None:
-    """Return what a value is multiplied with to change its unit, or None if there is no such factor."""
+    """Return the factor that converts a value from one unit to another, or None if they are incompatible."""
     if unit == wanted:
         return 1.0
     for units in PER_SI_UNIT.values():

@@ -1,4 +1,4 @@
-"""Read files that a user names: regular files only, up to a size limit."""
+"""Reading of files named by a user: regular files only, up to a size limit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
         The file cannot be read, is not a regular file, or holds more than `limit` bytes; `strerror` gives the
         reason.
     ValueError
-        The name is not valid for a file.
+        The name is not a valid file name.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     with os.fdopen(descriptor, "rb") as stream:
@@ -43,6 +43,6 @@ def read_user_file(path: Path, limit: int = MAX_BYTES) -> bytes:
 def read_user_text(path: Path, limit: int = MAX_BYTES) -> str:
     """Return the text of a regular UTF-8 file, without a byte order mark.
 
-    Raises UnicodeDecodeError as well.
+    Raises as `read_user_file`, and UnicodeDecodeError.
     """
     return read_user_file(path, limit).decode("utf-8-sig")

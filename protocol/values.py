@@ -14,8 +14,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 
 Value = bool | int | float | str | bytes
-"""A physical value: a flag, a number in its unit, the name of an enumeration's member, or raw
-bytes."""
+"""A physical value: a flag, a number in its unit, the name of a member of an enumeration, or raw bytes."""
 
 INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {
@@ -50,11 +49,11 @@ class MessageError(ProtocolError):
     def __init__(self, text: str, *, index: int = 0) -> None:
         super().__init__(text)
         self.index = index
-        """Position of the rejected field in its row, for the acknowledge telemetry."""
+        """Index of the rejected field in its row, reported in the telemetry row `acknowledge`."""
 
 
 class LengthError(MessageError):
-    """Data whose length differs from the row's size."""
+    """Data whose length differs from the size of the row."""
 
     code = ErrorCode.INVALID_LENGTH
 
@@ -65,7 +64,7 @@ class FieldError(MessageError):
 
 @dataclass(frozen=True)
 class EnumDefinition:
-    """Names for numbers."""
+    """Named numbers."""
 
     name: str
     doc: str
@@ -124,10 +123,10 @@ class Section:
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the device, as the bus, the device and the object dictionary share it."""
+    """A parameter of the device, shared by bus, device and object dictionary."""
 
     id: int
-    """Id in set_parameter and select_parameter, 1 to 254."""
+    """ID in set_parameter and select_parameter, 1 to 254."""
     name: str
     type: str
     """Wire type: u8 … i32, f32, f64, bool or enum8."""
@@ -139,9 +138,9 @@ class Parameter:
     enum: EnumDefinition | None = field(default=None)
 
     def check(self, value: Value) -> bool | int | float | str:
-        """Return the value in the parameter's type, or raise FieldError that names the limits.
+        """Return the value in the type of the parameter, or raise FieldError, whose text gives the limits.
 
-        Numbers are accepted for booleans (0, 1) and members of enumerations, since set_parameter sends
+        Numbers are accepted for Booleans (0, 1) and members of enumerations, because set_parameter sends
         numbers.
         """
         if self.enum is not None:
@@ -167,7 +166,7 @@ class Parameter:
         return number
 
     def to_number(self, value: Value) -> float:
-        """Return the checked value as set_parameter and the telemetry `parameter` carry it."""
+        """Return the checked value as the number used in set_parameter and the telemetry row `parameter`."""
         checked = self.check(value)
         if isinstance(checked, str):
             return float(self.enum.values[checked]) if self.enum is not None else math.nan

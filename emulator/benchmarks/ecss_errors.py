@@ -1,16 +1,16 @@
-"""Attitude errors split into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
+"""Separation of attitude errors into the kinds of ECSS-E-ST-60-20C, from series that vary one influence at a time.
 
-An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y lie across the
-boresight, z about it. In the main series each field (direction of the sky) is seen at several sub-pixel
-positions, and each position in several frames, so that the error is
+An error is a rotation vector in the sensor frame (``starid.attitude.AttitudeError``): x and y are across the
+boresight, z is about it. The main series has several sub-pixel positions for each field (direction in the sky),
+and several frames for each position, so that the error is
 
     e = bias + field + position + noise
 
-with a random term for each level. A nested analysis of variance gives unbiased estimates of their variances
-(Henderson's method 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests their
-significance: a term that is not significant is reported as zero, with the smallest value that would have been
-significant. Thermo-elastic error and aberration residual come from separate series, in which fields are
-repeated at other temperatures and dates.
+with a random term for each level. A nested analysis of variance gives unbiased estimates of the variances
+(Henderson's method 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests show whether
+they are significant: a term that is not is reported as zero, with the smallest value that would have been
+significant. Thermo-elastic error and aberration residual come from separate series, in which fields are repeated
+at other temperatures and dates.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from starhil.emulator.errors import EmulatorError
 
 SIGNIFICANCE: Final = 1e-3
-"""Probability of reporting an influence that does not exist."""
+"""Probability of reporting an influence that is not present."""
 
 BIAS: Final = "bias"
 THERMO_ELASTIC: Final = "thermo-elastic error"
@@ -61,7 +61,7 @@ class ErrorLine:
     Attributes
     ----------
     name : str
-        As the standard calls it.
+        Name in the standard.
     arcsec : ndarray (3,) or None
         Size about x, y and z at the confidence level, arcseconds; 0 if not significant. None: not evaluated.
     resolution_arcsec : ndarray (3,)
@@ -84,7 +84,7 @@ class ErrorLine:
 
 
 def coverage_factor(confidence: float) -> float:
-    """Number of standard deviations that a normal error stays within at a confidence level: 2.97 for 0.997."""
+    """Return the number of standard deviations for a confidence level, for a normal error: 2.97 for 0.997."""
     from scipy.stats import norm
 
     if not 0.5 <= confidence < 1.0:
@@ -94,9 +94,9 @@ def coverage_factor(confidence: float) -> float:
 
 @dataclass(frozen=True)
 class _Nested:
-    """Mean squares (3,) of a series: of fields, of conditions in fields, and of frames; and their expectations.
+    """Mean squares (3,) of a series: of fields, of conditions in fields, and of frames.
 
-    The mean squares have the expectations noise + k2·condition + k3·field, noise + k1·condition, and noise.
+    Their expectations are noise + k2·condition + k3·field, noise + k1·condition, and noise.
     """
 
     mean: Vectors
@@ -112,12 +112,12 @@ class _Nested:
 
     @classmethod
     def of(cls, series: ErrorSeries) -> _Nested:
-        """Analyse a series, in which the number of frames may differ.
+        """Analyse a series, in which the numbers of frames may differ.
 
         Raises
         ------
         EmulatorError
-            There are not two fields, two conditions in a field, and two frames under a condition.
+            There are fewer than two fields, two conditions in a field, or two frames under a condition.
         """
         error = series.error_arcsec
         total = len(error)
@@ -129,7 +129,7 @@ class _Nested:
         fields, cells = int(field.max(initial=-1)) + 1, len(in_cell)
         if not 1 < fields < cells < total:
             raise EmulatorError(
-                f"errors of {fields} fields, {cells} positions and {total} frames cannot be split: "
+                f"errors of {fields} fields, {cells} positions and {total} frames cannot be separated: "
                 "more of each are needed"
             )
         in_field = np.bincount(field)
@@ -160,18 +160,18 @@ class _Nested:
     def condition_variance(
         self, known: Vectors | float = 0.0, known_dof: float = math.inf
     ) -> tuple[Vectors, Vectors]:
-        """Return the variance of the conditions beyond one known elsewhere, and the smallest that is significant."""
+        """Return the variance of the conditions above a known one, and the smallest significant value."""
         dof = (self.cells - self.fields, min(self.total - self.cells, known_dof))
         return _level(self.condition_ms, self.noise_ms + self.k1 * known, self.k1, dof)
 
     def field_variance(self, condition: Vectors) -> tuple[Vectors, Vectors]:
-        """Return the variance of the fields for that of the conditions, and the smallest that is significant."""
+        """Return the variance of the fields for that of the conditions, and the smallest significant value."""
         dof = (self.fields - 1, self.cells - self.fields)
         return _level(self.field_ms, self.noise_ms + self.k2 * condition, self.k3, dof)
 
 
 def _level(above: Vectors, below: Vectors, k: float, dof: tuple[float, float]) -> tuple[Vectors, Vectors]:
-    """Return the variance that mean squares have above those below, 0 if not significant, and the least that is."""
+    """Return the variance of a level above the next, 0 if not significant, and the smallest significant value."""
     from scipy.stats import f as f_distribution
 
     threshold = below * float(f_distribution.isf(SIGNIFICANCE, *dof))
@@ -182,7 +182,7 @@ def _level(above: Vectors, below: Vectors, k: float, dof: tuple[float, float]) -
 def static_errors(
     series: ErrorSeries, confidence: float
 ) -> tuple[ErrorLine, ErrorLine, ErrorLine, ErrorLine]:
-    """Split a series into bias, field-of-view spatial error, pixel spatial error and temporal noise.
+    """Separate a series into bias, field-of-view spatial error, pixel spatial error and temporal noise.
 
     Raises
     ------
@@ -207,11 +207,11 @@ def static_errors(
 
 
 def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confidence: float) -> ErrorLine:
-    """Return the error that differs between dates: aberration as far as the device does not correct it.
+    """Return the error that differs between dates: the aberration that the device does not correct.
 
-    The conditions of the first series are dates. As aberration moves the stars over the pixels too, the pixel
-    spatial error of the second one, that of `static_errors`, is taken from their variance. None as a series
-    gives a line that is not evaluated.
+    The conditions of the first series are dates. Aberration also moves the stars across pixels, so the pixel
+    spatial error in the second series (that of `static_errors`) is subtracted from the variance. If a series
+    is None, the line is not evaluated.
     """
     if dated is None:
         return ErrorLine(ABERRATION, None, np.zeros(3))
@@ -223,15 +223,15 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
 
 
 def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:
-    """Return the error that follows the temperature, the same in all fields.
+    """Return the error that follows the temperature and is the same in all fields.
 
-    The conditions of the series are points of the orbit. The size is the quantile of the deviation from the
-    mean over them. What temperature does differently from field to field is not in it.
+    The conditions of the series are points of the orbit. The size is the quantile of the deviation from their
+    mean. Effects of temperature that differ between fields are not included.
 
     Raises
     ------
     EmulatorError
-        There are not two fields that are valid under every condition, and two conditions.
+        There are fewer than two conditions, or fewer than two fields that are valid under all of them.
     """
     from scipy.stats import f as f_distribution
 
@@ -253,13 +253,13 @@ def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:
 
 
 def _means(values: Vectors, group: Labels, sizes: Labels) -> Vectors:
-    """Means (g, 3) of values (n, 3) by group."""
+    """Return the means (g, 3) of values (n, 3) by group."""
     sums = np.column_stack([np.bincount(group, values[:, axis], len(sizes)) for axis in range(3)])
     return np.asarray(sums / sizes[:, None])
 
 
 def _by_field_and_condition(series: ErrorSeries) -> Vectors:
-    """Return errors (fields, conditions, 3) of the fields that have one under every condition."""
+    """Return errors (fields, conditions, 3) of the fields that are valid under every condition."""
     conditions, column = np.unique(series.condition, return_inverse=True)
     fields, row = np.unique(series.field, return_inverse=True)
     table: Vectors = np.full((len(fields), len(conditions), 3), np.nan)

@@ -27,7 +27,7 @@ from starid.files import write_atomically
 from starid.result_store import Results
 
 INTERVAL: Final = 0.95
-"""Confidence of the intervals of probabilities."""
+"""Confidence level of the intervals for probabilities."""
 
 PLOTS: Final = {
     "ecss-errors.png": "Attitude errors by kind, across and about the boresight",
@@ -38,14 +38,14 @@ PLOTS: Final = {
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Numbers of frames of a condition with a correct, a wrong and no attitude.
+    """Numbers of frames under a condition with a correct, a wrong and no attitude.
 
     Attributes
     ----------
     influence, value
-        What was varied, and its value.
+        The varied influence, and its value.
     frames, correct, wrong
-        Number of frames, and of those with an attitude that is correct or wrong.
+        Number of frames, of correct attitudes, and of wrong ones.
     reasons
         Reason of an invalid attitude → number of frames.
     """
@@ -59,7 +59,7 @@ class Outcomes:
 
     @property
     def availability(self) -> float:
-        """Share of frames with a valid attitude."""
+        """Fraction of frames with a valid attitude."""
         return (self.correct + self.wrong) / self.frames
 
 
@@ -78,7 +78,7 @@ class EcssReport:
     measured_arcsec
         Quantile of the errors at rest about x, y and z at the confidence level, over sky and orbit.
     outcomes
-        Correct, wrong and invalid attitudes by condition, at rest first.
+        Correct, wrong and invalid attitudes by condition; the first is at rest.
     stars
         Median number of stars detected at rest.
     """
@@ -92,7 +92,7 @@ class EcssReport:
 
     @property
     def total(self) -> ErrorLine:
-        """Bias plus thermo-elastic error plus the root sum of squares of the others, without aberration."""
+        """Sum of bias, thermo-elastic error and the root sum of squares of the others, without aberration."""
         arcsec = {line.name: line.arcsec for line in self.lines if line.arcsec is not None}
         steady = [arcsec.pop(name) for name in (BIAS, THERMO_ELASTIC)]
         random = [size for name, size in arcsec.items() if name != ABERRATION]
@@ -128,7 +128,7 @@ class EcssReport:
 
 
 def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confidence: float) -> EcssReport:
-    """Make the report of a finished campaign from its parts, in any order."""
+    """Make the report of a finished campaign from its parts, which may be in any order."""
     by_name: dict[str, list[tuple[int, Results]]] = {}
     for name, chunk, results in parts:
         by_name.setdefault(name, []).append((chunk, results))
@@ -176,7 +176,7 @@ def _outcomes(influence: str, value: float, results: Results) -> Outcomes:
 
 
 def interval(count: int, frames: int) -> tuple[float, float]:
-    """Return the Clopper–Pearson interval of a probability, at `INTERVAL`."""
+    """Return the Clopper–Pearson interval of a probability at the level `INTERVAL`."""
     from scipy.stats import beta
 
     tail = 0.5 * (1.0 - INTERVAL)
@@ -186,7 +186,7 @@ def interval(count: int, frames: int) -> tuple[float, float]:
 
 
 def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
-    """Return the report as Markdown; `plots` are names of image files beside it."""
+    """Return the report as Markdown; `plots` are names of image files in its folder."""
     plan, percent = report.plan, 100.0 * report.confidence
     text = [
         f"# Performance of `{plan.profile}`",

@@ -63,7 +63,7 @@ def measure_frames(
 ) -> list[StageRow]:
     """Measure the processor time of each stage over frames of random attitude, after a warm-up.
 
-    Thread time is used because other programs on the machine affect it little.
+    The thread's processor time is used because other programs on the machine have little effect on it.
 
     Parameters
     ----------
@@ -110,20 +110,20 @@ def measure_frames(
 
 @dataclass(frozen=True)
 class BodiesRow:
-    """Time of frames with Sun, Moon, Earth, planets and aberration, and of the same frames with the stars alone.
+    """Time of frames with Sun, Moon, Earth, planets and aberration, and of the same frames with stars only.
 
     Attributes
     ----------
     in_field : str
-        Which of the bodies are in the field of view: "none", "earth" or "moon".
+        Bodies in the field of view: "none", "earth" or "moon".
     stage : str
         "render" or, with detection and identification, "all".
     frames : int
-        Number of measured frames of each sort.
+        Number of measured frames of each kind.
     without_ms, with_ms : float
         Medians, milliseconds.
     ratio : float
-        The second over the first.
+        `with_ms` divided by `without_ms`.
     """
 
     in_field: str
@@ -137,10 +137,10 @@ class BodiesRow:
 def measure_bodies(
     frames: int = 200, seed: int = 1, progress: Callable[[str], None] | None = None
 ) -> list[BodiesRow]:
-    """Measure what bodies and aberration by date and orbit add to a frame, both sorts of frames in turns.
+    """Measure the time that bodies and aberration add to a frame, alternately with and without them.
 
-    Attitudes are random, those of "moon" around the Moon; where light passes the baffle no frame is measured.
-    The processor time of one thread is taken, with the computation of the sky.
+    Attitudes are random, for "moon" around the Moon; attitudes at which light passes the baffle are skipped.
+    The times are processor time of one thread, including the computation of the sky.
     """
     camera, catalog = Camera.from_fov(), load_catalog()
     renderer = Renderer(camera, catalog, seed=seed)

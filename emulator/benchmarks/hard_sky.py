@@ -35,7 +35,7 @@ def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
     attitude : Attitude
         Attitude of the sensor.
     rng : Generator
-        Source of everything that differs between frames.
+        Random generator for everything that differs between frames.
     """
     planets = tuple(
         PointSource(

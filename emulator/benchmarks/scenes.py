@@ -1,9 +1,9 @@
 """Benchmark scenes: simulated detections, without rendering images.
 
-A scene is a random attitude, the catalogue stars in the field with noisy positions and magnitudes, false
-stars and missing ones. As in the published comparison of solvers, magnitude noise is 0.1, false stars have
-uniform positions and magnitudes drawn from the 20 brightest stars in the field, missing stars are drawn from
-the same, and doubles within 2 px are merged.
+A scene is a random attitude with the catalogue stars in the field, whose positions and magnitudes are noisy,
+false stars and missing stars. As in the published comparison of solvers, magnitude noise is 0.1, false stars
+have uniform positions and magnitudes drawn from the 20 brightest stars in the field, missing stars are drawn from
+these 20, and double stars within 2 px are merged.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog
 
 MAX_DRAWS: Final = 1000
-"""Attitudes drawn at most for one scene."""
+"""Maximum number of attitudes drawn for one scene."""
 
 
 @dataclass(frozen=True)
@@ -44,18 +44,18 @@ class SceneSettings:
     covered : float
         Fraction of the field without stars, behind a straight edge of random direction.
     cluttered : float
-        Share of the field behind such an edge to which the false stars keep.
+        Fraction of the field, behind such an edge, that contains all false stars.
     kept : int or None
-        Only so many of the brightest stars are seen.
+        Number of brightest stars that are visible; None: all.
     least_stars : int
-        Stars that the field has at least; another one is drawn until it has (at most `MAX_DRAWS`).
+        Minimum number of stars in the field; attitudes are drawn until it is reached (at most `MAX_DRAWS`).
     mirrored : bool
-        The image is mirrored: as dense and clustered as the sky, and nowhere like it.
+        Whether the image is mirrored: as dense and clustered as the sky, but nowhere the same.
     field_deg, side_px
-        Width of the field, and side of the image where that differs too, where they are not those of the camera given.
+        Width of the field and side of the image, if they differ from those of the given camera.
     predicted_px : float
-        Error of the predicted attitude that a solver that tracks is given, one sigma about each axis, in pixels at the
-        centre of the field; 0: none is given.
+        Error of the predicted attitude passed to a tracking solver, one sigma about each axis, in pixels at
+        the centre of the field; 0: no prediction.
     """
 
     limiting_magnitude: float = 5.5
@@ -76,7 +76,7 @@ class SceneSettings:
 
     @property
     def sky(self) -> bool:
-        """Whether there is an attitude to find: two true stars at least, and not mirrored."""
+        """Whether there is an attitude to find: at least two true stars, and not mirrored."""
         few = self.kept is not None and self.kept < 2
         return self.random_points is None and not self.mirrored and not few
 
@@ -107,14 +107,14 @@ class Scene:
 
 
 class SceneMaker:
-    """Makes scenes of one camera under one sky.
+    """Makes scenes for a camera and a catalogue.
 
     Parameters
     ----------
     camera : Camera
         The camera.
     stars : StarCatalog
-        Stars as seen, doubles merged, brightest first.
+        Visible stars with doubles merged, brightest first.
     """
 
     def __init__(self, camera: Camera, stars: StarCatalog) -> None:
@@ -155,7 +155,7 @@ class SceneMaker:
     def _field(
         self, visible: NDArray[np.int64], attitude: Attitude
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Those rows of the catalogue that are in the field, and their positions."""
+        """Return the rows of the catalogue in the field, and their positions."""
         boresight, radius = attitude.boresight, self.camera.field_radius_rad
         near = visible[self.stars.vectors[visible] @ boresight > math.cos(radius)]
         xy, inside = self.camera.project(attitude.to_sensor(self.stars.vectors[near]))
@@ -165,7 +165,7 @@ class SceneMaker:
         return rng.random((count, 2)) * [self.camera.width, self.camera.height] - 0.5
 
     def _clutter(self, count: int, share: float, rng: np.random.Generator) -> NDArray[np.float64]:
-        """Uniform positions in a share of the field behind a straight edge of random direction."""
+        """Return uniform positions in a fraction of the field behind a straight edge of random direction."""
         if share >= 1.0:
             return self._uniform(count, rng)
         xy = self._uniform(int(2.0 * count / share) + 64, rng)

@@ -11,7 +11,7 @@ def main() -> None:
         if sys.argv[1:2] == ["run"] and "--help" not in sys.argv:
             from starhil.emulator.pipeline.worker_process import start_ahead
 
-            start_ahead()  # the worker starts slowest, so it starts before this process's own imports
+            start_ahead()  # the worker takes longest to start, so it is started before the imports of this process
         from starhil.emulator.cli.app import main as run
     except KeyboardInterrupt:
         raise SystemExit(130) from None

@@ -1,4 +1,4 @@
-"""Images for people: stretched, in colour, with stars circled and named."""
+"""Annotated images: stretched, in colour, with circles and names of stars."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def stretch(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]) -> npt.NDArra
 
 
 def star_label(hip: int, magnitude: float, numbers_to: float) -> str:
-    """Return a star's name, else its Hipparcos number if bright enough, else an empty text."""
+    """Return the name of a star, or its Hipparcos number if it is bright enough, or an empty text."""
     if hip in STAR_NAMES:
         return STAR_NAMES[hip]
     return f"HIP {hip}" if magnitude <= numbers_to else ""

@@ -20,7 +20,7 @@ from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 
 EXIT_BAD_INPUT: Final = 2
-"""Exit status for invalid input; 1 means that the command worked but its result is negative."""
+"""Exit status for invalid input; 1 means that the command was carried out with a negative result."""
 
 EXIT_INTERRUPTED: Final = 130
 """Exit status after Ctrl-C, as in shells."""
@@ -63,7 +63,7 @@ _PYTHON_NUMBERS: Final = "starhil.python_numbers"
 
 
 def _only_python_reads(word: str) -> bool:
-    """Whether an argument is a number with underscores or non-ASCII digits."""
+    """Return whether an argument is a number with underscores or non-ASCII digits."""
     try:
         float(word)
     except ValueError:
@@ -72,14 +72,14 @@ def _only_python_reads(word: str) -> bool:
 
 
 OPTIONAL_VALUES: Final = {"--view": "auto"}
-"""Options whose value may be omitted → the value they then have. typer has no such options."""
+"""Options whose value may be omitted → their value in this case; typer does not support this."""
 
 
 class _PlainHelp:
-    """Shows flags without a type, and positional arguments in capitals."""
+    """Help that shows flags without a type, and positional arguments in capitals."""
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters, each with the metavar that the help shows."""
+        """Return the parameters, each with its metavar for the help."""
         params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
         for param in params:
             if getattr(param, "is_flag", False):
@@ -94,7 +94,7 @@ class Group(_PlainHelp, TyperGroup):
 
 
 class FiniteCommand(_PlainHelp, TyperCommand):
-    """A command that rejects numbers that typer accepts: infinite, NaN, and in Python's own notation (`1_0`)."""
+    """A command that rejects infinite numbers, NaN and numbers in Python notation (`1_0`)."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments, with omitted values of `OPTIONAL_VALUES` added."""
@@ -113,7 +113,7 @@ class FiniteCommand(_PlainHelp, TyperCommand):
         Raises
         ------
         typer.BadParameter
-            A number is not finite, or in Python's own notation.
+            A number is not finite, or in Python notation.
         """
         python_numbers = ctx.meta[_PYTHON_NUMBERS]
         params: list[Any] = list(self.params)
@@ -133,7 +133,7 @@ def build_app() -> typer.Typer:
     app = typer.Typer(
         name="starhil",
         cls=Group,
-        help="Star tracker emulator for hardware-in-the-loop tests: renders the sky, solves the attitude and answers on the bus.",
+        help="Star tracker emulator for hardware-in-the-loop tests: renders the sky, determines the attitude and answers on the bus.",
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,
@@ -159,7 +159,7 @@ def _options(
 
 
 def describe_os_error(error: OSError) -> str:
-    """Return one line, `path: reason`, for an error that no command has handled."""
+    """Return one line, `path: reason`, for an error that was not handled by a command."""
     reason = error.strerror or str(error) or type(error).__name__
     paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
     return " ".join(": ".join([" -> ".join(paths), reason] if paths else [reason]).split())

@@ -15,12 +15,12 @@ from starhil.emulator.cli.output import output_help, prepare_output
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 Column: TypeAlias = tuple[str, Callable[[Any], str]]
-"""Heading of a table's column, and how a row is shown in it."""
+"""Heading of a column, and the function that formats a row for it."""
 
 Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 
 group = typer.Typer(
-    help="Measure speed, latency, bus load and single algorithms (for attitudes of a whole device: campaign).",
+    help="Measure speed, latency, bus load and single algorithms (for the attitude accuracy of a device, see campaign).",
     no_args_is_help=True,
 )
 
@@ -51,12 +51,12 @@ def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
 
 
 def _figure(name: str, digits: int) -> Callable[[Any], str]:
-    """Show an attribute with a number of decimals."""
+    """Return a function that formats an attribute with a number of decimals."""
     return lambda row: f"{getattr(row, name):.{digits}f}"
 
 
 def _entry(name: str, digits: int) -> Callable[[Any], str]:
-    """Show an entry of a dictionary with a number of decimals, or a dash if there is none."""
+    """Return a function that formats an entry of a dictionary with a number of decimals, or a dash."""
     return lambda row: "–" if row[name] is None else f"{row[name]:.{digits}f}"
 
 
@@ -85,7 +85,7 @@ def latency(
     ] = None,
     viewers: Annotated[
         int,
-        typer.Option(min=0, help="Number of console pages; each rate is measured without and with them."),
+        typer.Option(min=0, help="Number of console pages; each rate is measured with and without them."),
     ] = 0,
     unit: Unit = DEFAULT_UNIT,
     as_json: AsJson = False,
@@ -176,7 +176,8 @@ def frame(
     bodies: Annotated[
         bool,
         typer.Option(
-            "--bodies", help="Compare images with bodies and aberration to the same images without, at rest."
+            "--bodies",
+            help="Compare images with bodies and aberration with the same images without them, at rest.",
         ),
     ] = False,
     as_json: AsJson = False,
@@ -199,7 +200,7 @@ def frame(
 def bus(
     seconds: Annotated[float, typer.Option(min=1.0, help="Time per link.")] = 60.0,
     rate: Annotated[float, typer.Option(min=0.0, help="CAN frames per second from other nodes.")] = 7000.0,
-    baud: Annotated[int, typer.Option(min=1200, help="Serial bit rate.")] = 921_600,
+    baud: Annotated[int, typer.Option(min=1200, help="Bit rate of the serial line.")] = 921_600,
     p99_limit_ms: Annotated[
         float, typer.Option(help="Limit for the 99th percentile of CAN reply latency, milliseconds.")
     ] = 5.0,
@@ -214,16 +215,17 @@ def bus(
     realtime: Annotated[
         bool,
         typer.Option(
-            "--realtime", help="Run with real-time priority, unaffected by other processes (needs root)."
+            "--realtime",
+            help="Run with real-time priority, so that other processes have no effect (needs root).",
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Load the links of a CubeStar to capacity and measure losses, errors, latency and jitter.
+    """Load the links of CubeStar to capacity and measure losses, errors, latency and jitter.
 
-    Without --can and --serial, starts a CAN hub and an emulator that solves images at 10 Hz. Exit
-    status 0 only if nothing was lost or wrong and the 99th percentile of the CAN reply latency is
-    within the limit.
+    Without --can and --serial, this starts a CAN hub and an emulator that solves images at 10 Hz. The exit
+    status is 0 only if nothing was lost or wrong and the 99th percentile of the CAN reply latency is within
+    the limit.
     """
     from contextlib import nullcontext
 
@@ -279,7 +281,7 @@ def identify(
         str,
         typer.Option(
             help="Solvers: geometric,lsi,rsi, lsi-matlab,lsi-sklearn, published ones such as pyramid,grid "
-            "(pyramid-even: with evenly spread guide stars), or MODULE:FUNCTION; 'all' stands for geometric, lsi, rsi, the published and the third-party ones."
+            "(pyramid-even: with evenly spread guide stars), or MODULE:FUNCTION; 'all': geometric, lsi, rsi, the published and the third-party ones."
         ),
     ] = "geometric",
     frames: Annotated[int, typer.Option(min=1, help="Scenes per row.")] = 300,
@@ -287,15 +289,15 @@ def identify(
     row: Annotated[
         list[str] | None,
         typer.Option(
-            help="Row of the table. Repeatable. 'all': every row; 'papers': the scenes of the published algorithms' papers. "
-            "Default: the standard rows, with --solvers all also other fields of view."
+            help="Row of the table. Repeatable. 'all': every row; 'papers': the scenes in the papers of the published algorithms. "
+            "Default: the standard rows; with --solvers all, also other fields of view."
         ),
     ] = None,
     budget: Annotated[
-        float, typer.Option(help="Time limit of a solver per row, seconds; it skips the rest of the row.")
+        float, typer.Option(help="Time limit of a solver per row, seconds; the rest of the row is skipped.")
     ] = 120.0,
     raw: Annotated[
-        bool, typer.Option("--raw", help="Show the answers of published algorithms without verification.")
+        bool, typer.Option("--raw", help="Use the answers of published algorithms without verification.")
     ] = False,
     output: Annotated[
         Path | None,
@@ -303,7 +305,7 @@ def identify(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare star identification solvers on the same scenes, and with the least-squares attitude of the true matches."""
+    """Compare star identification solvers on the same scenes and with the least-squares bound."""
     from starhil.emulator.benchmarks.identify import LEADERBOARD, PAPERS, ROWS, STANDARD, run
     from starhil.emulator.benchmarks.leaderboard import write_leaderboard
     from starhil.emulator.benchmarks.peers import ALL

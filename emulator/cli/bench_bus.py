@@ -38,28 +38,28 @@ NEEDED = (
     "set_update_rate",
     "set_mode",
 )
-"""Rows that the load asks for."""
+"""Rows that the load requests."""
 
 
 def check_rows(icd: InterfaceDefinition) -> None:
-    """Check that a unit has the rows that the load asks for.
+    """Check that a unit has the rows that the load requests.
 
     Raises
     ------
     BenchError
-        It lacks some.
+        The unit lacks some of them.
     """
     missing = [name for name in NEEDED if name not in icd.telemetry and name not in icd.telecommands]
     if missing:
         raise BenchError(
-            f"bench bus: unit {icd.name} lacks the rows of a CubeStar that load its links ({', '.join(missing)}); "
+            f"bench bus: unit {icd.name} lacks the CubeStar rows that are used to load the links ({', '.join(missing)}); "
             "measure another unit with bench latency"
         )
 
 
 @dataclass(frozen=True)
 class Target:
-    """The links of the device under test; None for a link that it lacks."""
+    """The links of the device under test; None for a missing link."""
 
     can: str | None
     serial: str | None
@@ -77,10 +77,10 @@ class BusFigures:
     serial: SerialLoad | None = None
     jitter: list[Jitter] = field(default_factory=list)
     frames_per_s: dict[str, float] = field(default_factory=dict)
-    """Frames per second that the device solved while each link was loaded."""
+    """Frames per second solved by the device while each link was loaded."""
 
     def good(self, p99_limit_ms: float) -> bool:
-        """Whether nothing was lost or wrong and 99 % of the CAN replies arrived within the limit."""
+        """Return whether nothing was lost or wrong and 99 % of the CAN replies arrived within the limit."""
         can_good = self.can is None or (self.can.good and self.can.latency.p99_ms <= p99_limit_ms)
         return can_good and (self.serial is None or self.serial.good)
 
@@ -89,7 +89,7 @@ class BusFigures:
 def started_device(unit: str, baud: int, realtime: bool, report: Callable[[str], None]) -> Iterator[Target]:
     """Start a hub and an emulator that solves frames at 10 Hz, each in its own process.
 
-    With `realtime`, both and this process get real-time priority; the pipeline worker does not.
+    With `realtime`, both and this process get real-time priority, but not the pipeline worker.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory()))
@@ -163,7 +163,7 @@ def measure_jitter(
 def count_solved_frames(
     icd: InterfaceDefinition, target: Target, link: str, figures: BusFigures
 ) -> Iterator[None]:
-    """Record the frames per second that the device reports as solved during the block, read over CAN."""
+    """Record the frames per second that the device solves during the block, read over CAN."""
     if target.can is None:
         yield
         return

@@ -25,8 +25,8 @@ def command(context: typer.Context) -> None:
 def info(as_json: AsJson = False) -> None:
     """Show the folder, size, limit and files of the cache.
 
-    Above the limit the least recently used files are removed. The environment variables
-    STARHIL_CACHE_DIR and STARHIL_CACHE_LIMIT_MB set another folder and limit.
+    Above the limit, the least recently used files are removed. The environment variables STARHIL_CACHE_DIR
+    and STARHIL_CACHE_LIMIT_MB set the folder and the limit.
     """
     from starid.cache import BYTES_PER_MB, cache_dir, cached_files, size_limit
 

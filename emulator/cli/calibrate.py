@@ -1,4 +1,4 @@
-"""`starhil calibrate`: estimate a camera's parameters from images of the sky."""
+"""`starhil calibrate`: estimate the parameters of a camera from images of the sky."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def command(
         list[str] | None,
         typer.Option(
             help="Parameter to estimate: focal, aspect, centre, k1, k2, p1, p2, k3. Repeatable. "
-            "Default: those that the images constrain."
+            "Default: those that can be determined from the images."
         ),
     ] = None,
     epoch: Annotated[float | None, typer.Option(help="Julian year of the images; default 2026.")] = None,
@@ -44,9 +44,9 @@ def command(
     ] = True,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate focal length, centre and distortion from the stars in several images, and write a camera profile.
+    """Estimate focal length, centre and distortion from stars in several images and write a camera profile.
 
-    Exit status 1 if an image could not be identified; the profile is then based on the others.
+    The exit status is 1 if an image could not be identified; the profile is then based on the others.
     """
     from starid.camera import Camera
     from starid.camera_file import save_camera

@@ -13,7 +13,7 @@ import typer
 from starhil.emulator.cli.options import AsJson
 
 group = typer.Typer(
-    help="Measure how accurate and reliable attitudes are, over many rendered images (for speed and solvers: bench).",
+    help="Measure the accuracy and reliability of attitudes over many rendered images (for speed and solvers, see bench).",
     invoke_without_command=True,
 )
 
@@ -24,7 +24,8 @@ def campaigns(
     ecss: Annotated[
         bool,
         typer.Option(
-            "--ecss", help="Measure a device's performance per ECSS-E-ST-60-20C; write the report to -o."
+            "--ecss",
+            help="Measure the performance of a device per ECSS-E-ST-60-20C and write a report to -o.",
         ),
     ] = False,
     profile: Annotated[str, typer.Option(help="Device profile: a name or a TOML file.")] = "cubestar",
@@ -40,7 +41,7 @@ def campaigns(
         int, typer.Option(min=5, help="Images at each value of an influence (rate, Sun …).")
     ] = 100,
     fields: Annotated[
-        int, typer.Option(min=3, help="Directions of the sky, to separate the kinds of error.")
+        int, typer.Option(min=3, help="Number of directions in the sky, to separate the kinds of error.")
     ] = 80,
     seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
@@ -54,11 +55,11 @@ def campaigns(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Measure how accurate and reliable attitudes are, over many rendered images.
+    """Measure the accuracy and reliability of attitudes over many rendered images.
 
-    With --ecss: attitude errors by kind, and rates of correct, wrong and invalid attitudes against
-    body rate, Sun, Moon, Earth, false stars and particles. Exit status 1 if any attitude at rest is
-    wrong. Speed, latency and other solvers: see `starhil bench`.
+    With --ecss: attitude errors by kind, and rates of correct, wrong and invalid attitudes against body rate,
+    Sun, Moon, Earth, false stars and particles. The exit status is 1 if any attitude at rest is wrong. For
+    speed, latency and other solvers, see `starhil bench`.
     """
     if context.invoked_subcommand is not None:
         if ecss:
@@ -96,9 +97,7 @@ def lost_in_space(
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0,
     unknown_field: Annotated[
         bool,
-        typer.Option(
-            "--unknown-field", help="Identify without knowing --fov, as `identify --fov auto` does."
-        ),
+        typer.Option("--unknown-field", help="Identify without knowing --fov, like `identify --fov auto`."),
     ] = False,
     rate: Annotated[
         float, typer.Option(min=0, help="Body rate during the exposure, deg/s, about a random axis.")
@@ -135,8 +134,8 @@ def lost_in_space(
 ) -> None:
     """Render, detect and identify images at uniformly random attitudes.
 
-    An image is wrong if its attitude is flagged valid but off by more than 0.1°. Exit status 1
-    if any image is wrong or too few are valid.
+    An image is wrong if its attitude is flagged valid but off by more than 0.1°. The exit status is 1 if any
+    image is wrong or too few are valid.
     """
     import numpy as np
 

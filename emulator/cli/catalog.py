@@ -77,7 +77,7 @@ def _radius(degrees: float) -> float:
 
 
 def _records(catalog: StarCatalog) -> list[dict[str, Any]]:
-    """Return each star's values as a dictionary; unknown ones are None."""
+    """Return the values of each star as a dictionary; unknown values are None."""
     columns = {
         "hip": catalog.hip,
         "ra_deg": catalog.ra_rad * (180.0 / math.pi),

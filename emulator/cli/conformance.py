@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, str | None, int | None]:
-    """Return serial port, CAN channel and CANopen node of a unit; a node if it is given, or is the only link."""
+    """Return serial port, CAN channel and CANopen node of a unit; the node if given or the only link."""
     serial = None if icd.link.serial is None else "auto"
     if icd.canopen_only and node is None:
         node = int(icd.parameters["canopen_node"].default)
@@ -57,19 +57,19 @@ def command(
         typer.Option(
             min=0.01,
             max=1.0,
-            help="Simulation seconds per second; below 1 for a slow or busy machine. An emulator that is already "
+            help="Simulation seconds per second, below 1 for a slow or busy machine. An emulator that is already "
             "running must use the same speed (run --clock scaled:…).",
         ),
     ] = 1.0,
     safe_only: Annotated[
-        bool, typer.Option("--safe-only", help="Run only cases that change nothing, for a unit in use.")
+        bool, typer.Option("--safe-only", help="Run only cases that change nothing; for a unit in use.")
     ] = False,
     list_only: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
     junit: JunitFile = None,
     view: ConsoleAddress = None,
     html: Annotated[
         Path | None,
-        typer.Option(help=output_help("Write an HTML report of what was sent, expected and received.")),
+        typer.Option(help=output_help("Write an HTML report with the sent, expected and received data.")),
     ] = None,
     dialect: SerialDialect = None,
     baud: Annotated[
@@ -86,12 +86,12 @@ def command(
 ) -> None:
     """Test a star sensor, emulated or real, over its bus.
 
-    Exit status 0: no case failed, 1: some failed, 2: invalid input. Settings changed by cases
-    are restored at the end, also after SIGINT, SIGTERM or SIGHUP; then the remaining cases are
-    reported as not run, and the exit status is 128 plus the signal's number.
+    The exit status is 0 if no case failed, 1 if some failed, and 2 for invalid input. Settings changed by
+    cases are restored at the end. After SIGINT, SIGTERM or SIGHUP they are restored too, the remaining cases
+    are reported as not run, and the exit status is 128 plus the signal's number.
 
-    Reports give for each case its ID, the clause or source it checks, and what was sent,
-    expected and received.
+    For each case, reports give its ID, the clause or source that it checks, and the sent, expected and
+    received data.
     """
     from rich.console import Console
 

@@ -1,4 +1,4 @@
-"""The console's OBC: the client of the bench on a link of a run."""
+"""The OBC of the console: a client of the bench on a link of the run."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class ConsoleClient:
     Parameters
     ----------
     port
-        Where the device is found.
+        Bus and address of the device.
     """
 
     def __init__(self, port: ObcPort) -> None:
         self._port = port
         self._client: AsyncObcClient | None = None
         self._settings: tuple[object, ...] = ()
-        """Settings of the device for which the client was made."""
+        """Device settings with which the client was made."""
 
     async def start(self) -> None:
         """Open the link."""
@@ -58,7 +58,7 @@ class ConsoleClient:
             await self.close()
             await self.start()
         if self._client is None:
-            return Exchange("link_lost", f"{row.name}: the console's link is closed")
+            return Exchange("link_lost", f"{row.name}: the link of the console is closed")
         request = self._port.icd.request(row, data)
         begin = time.perf_counter()
         try:

@@ -1,4 +1,4 @@
-"""`starhil features`: the feature vector of a patch of the catalogue's sky."""
+"""`starhil features`: the feature vector of a patch of the sky."""
 
 from __future__ import annotations
 
@@ -17,13 +17,19 @@ _KEYS: Final = ("n", "A", "r", "sigma_A", "sigma_r", "theta")
 
 def command(
     ra_corner: Annotated[
-        float | None, typer.Option(help="Right ascension of the patch's lower-left corner, degrees (planar).")
+        float | None,
+        typer.Option(help="Right ascension of the lower-left corner of the patch, degrees (planar)."),
     ] = None,
     dec_corner: Annotated[
-        float | None, typer.Option(help="Declination of the patch's lower-left corner, degrees (planar).")
+        float | None,
+        typer.Option(help="Declination of the lower-left corner of the patch, degrees (planar)."),
     ] = None,
-    ra: Annotated[float | None, typer.Option(help="Right ascension of the patch's centre, degrees.")] = None,
-    dec: Annotated[float | None, typer.Option(help="Declination of the patch's centre, degrees.")] = None,
+    ra: Annotated[
+        float | None, typer.Option(help="Right ascension of the centre of the patch, degrees.")
+    ] = None,
+    dec: Annotated[
+        float | None, typer.Option(help="Declination of the centre of the patch, degrees.")
+    ] = None,
     kappa: Annotated[float, typer.Option(help="Magnitude limit κ.")] = 11.5,
     direction: Annotated[
         str,
@@ -51,7 +57,7 @@ def command(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (degrees) of a patch of the catalogue's sky."""
+    """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (°) of a patch of the sky."""
     from starid.thesis.database import sky_of
 
     parameters = frame_parameters(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from starid.thesis.frame_sky import Direction
 
 PLANAR_EPOCH: Final = 1991.25
-"""The catalogue's native epoch: the published results ignore proper motion."""
+"""Epoch of the catalogue; the published results ignore proper motion."""
 
 SPHERICAL_EPOCH: Final = 2026.0
 
@@ -57,7 +57,7 @@ def frame_parameters(
 
 
 def frame_catalog(geometry: str, epoch: float | None) -> StarCatalog:
-    """Load the catalogue at an epoch; default: the geometry's."""
+    """Load the catalogue at an epoch; the default depends on the geometry."""
     from starid.catalog import load_catalog
 
     default = PLANAR_EPOCH if geometry == "planar" else SPHERICAL_EPOCH

@@ -44,7 +44,7 @@ def export(
             "--output",
             "-o",
             help=output_help(
-                "File to write; default: stdout. For c and cosmos-plugin: the folder of their files."
+                "File to write; default: stdout. For c and cosmos-plugin: folder for the files."
             ),
         ),
     ] = None,
@@ -62,7 +62,7 @@ def export(
     definition, name = load_unit(unit), format_.value
     if name in formats.FOLDER_FORMATS:
         if output is None or output.is_file():
-            raise EmulatorError(f"icd export {name}: makes several files; name their folder with -o")
+            raise EmulatorError(f"icd export {name}: writes several files; name a folder with -o")
         for path, text in formats.export_folder(definition, name).items():
             _write(output / path, text)
         return

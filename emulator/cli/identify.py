@@ -51,15 +51,15 @@ def command(
         str | None,
         typer.Option(
             metavar="UTC",
-            help="Date of the image, e.g. 2026-03-20T21:30: correct the aberration from the Earth's orbit (20″), and "
-            "use the star positions of that year.",
+            help="Date of the image, e.g. 2026-03-20T21:30, to correct the aberration due to the Earth's orbit (20″) and "
+            "use the star positions of this year.",
         ),
     ] = None,
     observer_velocity: Annotated[
         str | None,
         typer.Option(
             metavar="X,Y,Z",
-            help="Velocity of the camera in m/s, ICRS: relative to the Earth's centre with --date, else to the "
+            help="Velocity of the camera in m/s, ICRS: relative to the Earth's centre with --date, otherwise to the "
             "barycentre of the solar system.",
         ),
     ] = None,
@@ -67,12 +67,12 @@ def command(
         bool | None,
         typer.Option(
             "--allow-colour/--refuse-colour",
-            help="Convert a colour image to grey, or reject it; default: reject, but convert with --fov.",
+            help="Convert a colour image to grey, or reject it; default: convert with --fov, otherwise reject.",
         ),
     ] = None,
     dark: Annotated[
         Path | None,
-        typer.Option(help="Image of the same camera, exposure and temperature without light, to subtract."),
+        typer.Option(help="Dark image of the same camera, exposure and temperature, to be subtracted."),
     ] = None,
     annotate: Annotated[
         Path | None,
@@ -84,9 +84,9 @@ def command(
 ) -> None:
     """Identify the stars in an image, lost in space.
 
-    Without --profile or --fov the image must be from the emulator's default camera, 937×937
-    pixels and 42° wide. With --fov it may be from any camera, mirrored or a negative; field of
-    view and distortion are estimated. Exit status 1 if the stars cannot be identified.
+    Without --profile or --fov, the image must be from the default camera of the emulator, 937×937 pixels and
+    42° wide. With --fov, it may be from any camera, mirrored or a negative; field of view and distortion are
+    estimated. The exit status is 1 if the stars cannot be identified.
     """
     from starid.catalog import DEFAULT_EPOCH, load_catalog
     from starid.earth import julian_year
@@ -143,7 +143,7 @@ def _solve(
     if fov == _ANY_FIELD:
         if fov_tolerance is not None:
             raise EmulatorError(
-                "identify: --fov-tolerance has no effect with --fov auto; leave it out, or give --fov in degrees"
+                "identify: --fov-tolerance has no effect with --fov auto; omit it, or give --fov in degrees"
             )
         return solve_any_field(pixels, catalog, model=_MODELS[model], observer_velocity=observer_velocity)
     try:
@@ -207,7 +207,7 @@ def _camera(profile: str | None) -> Camera:
 
 
 def _advice(result: ImageSolution, fov: str | None, model: str) -> str:
-    """Return what to try for an image that was not identified; empty if it was."""
+    """Return a suggestion for an image that was not identified; empty if it was identified."""
     solution, found = result.solution, result.detections
     if solution.valid:
         return ""

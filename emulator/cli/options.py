@@ -57,8 +57,8 @@ ConsoleAddress: TypeAlias = Annotated[
     typer.Option(
         "--view",
         metavar="[ADDRESS]",
-        help="Show the results on a console as they arrive. ADDRESS: from the ready line of `starhil run --view`; "
-        "default, with --start: the emulator started here.",
+        help="Show the results on a console as they arrive. ADDRESS is on the ready line of `starhil run --view`; "
+        "default with --start: that of the started emulator.",
     ),
 ]
 

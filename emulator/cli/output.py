@@ -1,4 +1,4 @@
-"""Output of commands: files, and text that any terminal can show."""
+"""Output of commands: files, and text for any terminal."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ _PLAIN: Final = {
     "µ": "u",
     "π": "parallax",
 }
-"""Replacement for characters that an output's encoding lacks."""
+"""Replacements for characters that the encoding of an output lacks."""
 
 _HANDLER: Final = "starhil-plain"
 
 
 def output_help(what: str) -> str:
-    """Help of an option that names a file to write."""
+    """Return the help of an option that names an output file."""
     return f"{what} Missing folders are created; /dev/stdout is standard output."
 
 
 def prepare_output(path: Path, option: str) -> Path:
-    """Create the folder of an output file, so that a bad path fails before the work starts.
+    """Create the folder of an output file, so that an invalid path fails before the work starts.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def prepare_output(path: Path, option: str) -> Path:
 
 
 def report_stream(output: Path | None) -> TextIO:
-    """Return the stream for a command's report: stderr if its output file is stdout, else stdout."""
+    """Return the stream for the report of a command: stderr if its output file is stdout, or else stdout."""
     from starid.files import is_stdout
 
     return sys.stderr if output is not None and is_stdout(output) else sys.stdout
@@ -78,7 +78,7 @@ def print_text(text: str) -> None:
 
 
 def show_every_character() -> None:
-    """Make stdout and stderr replace characters that their encoding lacks instead of failing."""
+    """Make stdout and stderr replace characters that their encoding lacks."""
     codecs.register_error(_HANDLER, _spell_out)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

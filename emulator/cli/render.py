@@ -1,4 +1,4 @@
-"""`starhil render`: an image of the sky, and the truth behind it."""
+"""`starhil render`: an image of the sky, and its truth."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def command(
         Path, typer.Option("--output", "-o", help=output_help("Image to write: .png or .tiff."))
     ],
     roll: Annotated[
-        float, typer.Option(help="Angle of celestial north, counter-clockwise from image up, degrees.")
+        float, typer.Option(help="Angle of celestial north in the image, counter-clockwise from up, degrees.")
     ] = 0.0,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     rate: Annotated[
@@ -47,7 +47,7 @@ def command(
         float | None, typer.Option(help="Horizontal field of view, edge to edge, degrees.")
     ] = None,
     size: Annotated[
-        str | None, typer.Option(metavar="WIDTH[xHEIGHT]", help="Pixels, such as 1024x768.")
+        str | None, typer.Option(metavar="WIDTH[xHEIGHT]", help="Size in pixels, such as 1024x768.")
     ] = None,
     model: Annotated[str | None, typer.Option(help="Projection: pinhole or equidistant.")] = None,
     profile: Annotated[
@@ -114,7 +114,7 @@ class _Scene:
 
 
 def _scene(profile: str | None, fov: float | None, size: str | None, model: str | None) -> _Scene:
-    """Return the scene of a profile's device, or the default, with the camera options applied."""
+    """Return the scene for the device of a profile, or the default, with the camera options applied."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sky.objects import SkyObjects
     from starhil.emulator.sky.view import Sky, SkyView

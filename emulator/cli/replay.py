@@ -15,9 +15,9 @@ def command(
     folder: Annotated[Path, typer.Argument(help="Folder written by `starhil run --record`.")],
     as_json: AsJson = False,
 ) -> int:
-    """Replay a recorded run on the stepped clock and compare what the device sends and measures, byte by byte.
+    """Replay a recorded run on the stepped clock and compare everything that the device sends and measures.
 
-    Exit status 0: identical, 1: something differs.
+    The exit status is 0 if all bytes are identical, otherwise 1.
     """
     import asyncio
     import json

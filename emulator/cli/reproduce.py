@@ -29,15 +29,15 @@ def command(
     list_only: Annotated[bool, typer.Option("--list", help="List the experiments and exit.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Repeat the experiments of the thesis that the LSI and RSI algorithms come from.
+    """Repeat the experiments of the thesis that introduced the LSI and RSI algorithms.
 
     E. O. Özyurt, A Feedback Star Identification Algorithm via Regularized Pattern Recognition Using
     a Unique Feature Extraction, Istanbul Technical University. Writes tables, figures, and report.md
     with published and measured values.
 
-    A second run in the same folder resumes the first and skips experiments finished with the
-    same parameters. The report covers all finished experiments in the folder. Exit status 1 if
-    a check is missed that is not a known miss; the report shows every miss.
+    A second run in the same folder resumes the first and skips experiments finished with the same parameters.
+    The report covers all finished experiments in the folder. The exit status is 1 if a check fails that is
+    not known to fail; the report shows every failure.
     """
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn

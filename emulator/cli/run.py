@@ -33,8 +33,8 @@ def command(
     dialect: Annotated[
         str | None,
         typer.Option(
-            help="Format of serial replies: a for OBC software written for the CubeComputer (replies start with the "
-            "message ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
+            help="Format of serial replies: a for OBC software written for the CubeComputer (replies begin with the "
+            "row ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
             "one byte. Default: the profile's (b)."
         ),
     ] = None,
@@ -61,7 +61,7 @@ def command(
     state_dir: Annotated[
         Path | None,
         typer.Option(
-            help="Folder for state that survives restarts, such as saved parameters. Default: nothing is kept."
+            help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept."
         ),
     ] = None,
     symlink: Annotated[
@@ -70,7 +70,7 @@ def command(
     control: Annotated[
         str,
         typer.Option(
-            help="Control channel: off, auto (a Unix socket for this user only), unix:/PATH, "
+            help="Control channel: off, auto (a Unix socket that only this user can open), unix:/PATH, "
             "or HOST:PORT (open to all local users)."
         ),
     ] = "off",
@@ -116,8 +116,8 @@ def command(
 ) -> None:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
-    A line on stdout, `ready serial=… dialect=… can=… seed=…`, reports that the emulator accepts commands, and
-    where.
+    When the emulator accepts commands, it prints a line on stdout that gives the links:
+    `ready serial=… dialect=… can=… seed=…`.
     """
     from starhil.emulator.pipeline.worker_process import take_worker
 
@@ -169,12 +169,12 @@ def command(
     reachable = any((on.serial.port, on.can.channel, on.canopen.node) != ("off", "off", 0) for on in links)
     if (control, view) == ("off", "off") and not (truth_log or record or reachable):
         raise EmulatorError(
-            "no link: the device cannot be reached and nothing is recorded; "
+            "no link: the device could not be reached, and nothing would be recorded; "
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
 
     if control_token is not None and not control_token:
-        raise EmulatorError("--control-token: empty; give a text, or leave the option out")
+        raise EmulatorError("--control-token: empty; give a text, or omit the option")
     options = RunOptions(
         truth_log,
         overwrite,
@@ -207,7 +207,7 @@ def command(
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
             if line.done():
                 gc.collect()
-                gc.freeze()  # long-lived objects: scanning them would pause the links
+                gc.freeze()  # long-lived objects: garbage collection would pause the links
                 print(line.result(), flush=True)
                 await stop
             else:
@@ -219,7 +219,7 @@ def command(
 
 
 def _absolute_folder(unit: str) -> str:
-    """Return a folder given on the command line as an absolute path: in a profile it is relative to the profile."""
+    """Return a folder from the command line as an absolute path, as a profile would resolve it differently."""
     from starhil.protocol.unit_folders import bundled_units, find_unit
 
     return unit if unit in bundled_units() else str(find_unit(unit).absolute())
@@ -237,7 +237,7 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
 
 
 def _folder_of_head(folder: Path, number: int) -> Path:
-    """Return the state folder of a head; the second head's is `head-2` in the first head's."""
+    """Return the state folder of a head; that of the second head is `head-2` in that of the first."""
     return folder if number == 1 else folder / f"head-{number}"
 
 

@@ -29,7 +29,7 @@ def command(
     can: CanChannel = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,
     profile: Annotated[
-        str | None, typer.Option(help="With --start: device profile instead of the script's.")
+        str | None, typer.Option(help="With --start: device profile, instead of that in the script.")
     ] = None,
     log: Annotated[
         Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
@@ -46,8 +46,8 @@ def command(
 ) -> None:
     """Run a session (a TOML script of telecommands, reads and expectations).
 
-    Exit status 0: passed, 1: a step failed, 2: invalid input. SIGINT, SIGTERM and SIGHUP end
-    the session and the emulator it started; the remaining steps are reported as not run, and
+    The exit status is 0 if all steps passed, 1 if a step failed, and 2 for invalid input. SIGINT, SIGTERM and
+    SIGHUP end the session and the emulator that it started; the remaining steps are reported as not run, and
     the exit status is 128 plus the signal's number.
     """
     from starhil.hil_tests.bench import LinkOptions

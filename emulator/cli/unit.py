@@ -13,7 +13,7 @@ from starhil.emulator.cli.output import print_text
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 group = typer.Typer(
-    help="List, create, check and describe units. A unit is a star sensor's interface: a folder of TOML files that define "
+    help="List, create, check and describe units. A unit is the interface of a star sensor: a folder of TOML files that define "
     "its telecommands, telemetry and links.",
     no_args_is_help=True,
 )
@@ -80,7 +80,7 @@ def new(
 def check(unit: UnitArgument, as_json: AsJson = False) -> None:
     """Check a unit: list all errors, or show an example exchange of each row in hexadecimal.
 
-    Exit status 0: no errors, 1: errors.
+    The exit status is 0 if there are no errors, otherwise 1.
     """
     from starhil.protocol.errors import ProtocolError
     from starhil.protocol.icd import check_unit, load_unit
@@ -116,7 +116,7 @@ def check(unit: UnitArgument, as_json: AsJson = False) -> None:
 
 @group.command("describe")
 def describe(unit: UnitArgument = DEFAULT_UNIT, as_json: AsJson = False) -> None:
-    """Describe a unit: links, conventions, and what each field is bound to."""
+    """Describe a unit: links, conventions, and the binding of each field."""
     from starhil.protocol.icd import load_unit
 
     icd = load_unit(unit)

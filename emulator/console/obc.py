@@ -78,7 +78,7 @@ class ObcPort:
     icd
         Interface definition of the device.
     device_address
-        Returns the device's present address on that bus, or node-ID, which a telecommand may change.
+        Returns the device's present address on that bus, or node ID, which a telecommand may change.
     dialect
         Returns the present dialect of serial replies; None for a unit that has no dialects.
     """

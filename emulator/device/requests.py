@@ -137,7 +137,7 @@ class Requests:
         return [replace(item, final=item is replies[-1]) for item in replies]
 
     def _answers_with_data(self, request: Request, replies: Sequence[Reply]) -> list[Reply]:
-        """Return the answers whose data an action of a plugin has made; no id says that they are answers."""
+        """Return the answers whose data an action of a plugin has made; no ID says that they are answers."""
         data = [reply.data for reply in replies if reply.id is None]
         return [
             replace(self._reply(request, ReplyKind.ACK, item), final=number == len(data))
@@ -177,7 +177,7 @@ class Requests:
         )
 
     def _times(self) -> tuple[int, int]:
-        """Return the time since start-up and the device's clock since the unit's epoch, ns; 0 if no reply carries it."""
+        """Return uptime and device time since the unit's epoch, ns; 0 if replies do not carry it."""
         if not self._stamped:
             return 0, 0
         device = self.device

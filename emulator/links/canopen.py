@@ -191,7 +191,7 @@ class CanopenLink:
     seed
         Seed of the wire faults.
 
-    The node-ID is the device's parameter `canopen_node`, unless LSS has stored another one.
+    The node ID is the device's parameter `canopen_node`, unless LSS has stored another one.
     """
 
     bus: ClassVar[str] = "can"
@@ -317,7 +317,7 @@ class CanopenLink:
                 log.debug("%s %g %s", event.kind, event.value, event.detail)
 
     def _reset_device(self) -> int:
-        """Reset the device because NMT reset the node; return the node-ID to start with."""
+        """Reset the device because NMT reset the node; return the node ID to start with."""
         self._resetting = True
         try:
             self._device.reset("command")

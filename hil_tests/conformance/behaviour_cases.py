@@ -39,7 +39,7 @@ STORE: Final = CaseArea[LinkProbe]("store", rule(16), intrusive=True)
 # --- acknowledge ---
 
 
-@ACKNOWLEDGE.case("accepted", "after an accepted telecommand: its identifier, processed, no error")
+@ACKNOWLEDGE.case("accepted", "after an accepted telecommand: its ID, processed, no error")
 def acknowledge_accepted(probe: LinkProbe) -> None:
     for name, values in (("select_parameter", {"parameter": 1}), ("clear_counters", {})):
         probe.command(name, **values)
@@ -53,7 +53,7 @@ def acknowledge_accepted(probe: LinkProbe) -> None:
         check_equal(seen, wanted, "acknowledge")
 
 
-@ACKNOWLEDGE.case("unknown", "after an unknown telecommand: its identifier and invalid_id")
+@ACKNOWLEDGE.case("unknown", "after an unknown telecommand: its ID and invalid_id")
 def acknowledge_unknown(probe: LinkProbe) -> None:
     probe.expect_refusal(60, b"", INVALID_ID)
     seen = probe.telemetry("acknowledge")
@@ -86,7 +86,7 @@ def _counts(probe: LinkProbe) -> tuple[int, int]:
     return int(seen["telecommand_count"]), int(seen["telemetry_count"])
 
 
-@COUNTERS.case("telemetry", "each request of telemetry counts once, the reading of the counters too")
+@COUNTERS.case("telemetry", "each telemetry request counts once, including the one that reads the counters")
 def counters_telemetry(probe: LinkProbe) -> None:
     commands, before = _counts(probe)
     for _ in range(COUNTED):
@@ -96,7 +96,7 @@ def counters_telemetry(probe: LinkProbe) -> None:
     check_equal(after_commands, commands, "count of telecommands")
 
 
-@COUNTERS.case("refused-telemetry", "a refused request of telemetry counts as well")
+@COUNTERS.case("refused-telemetry", "a refused telemetry request is counted too")
 def counters_refused_telemetry(probe: LinkProbe) -> None:
     _, before = _counts(probe)
     probe.expect_refusal(200, b"", INVALID_ID)
@@ -115,12 +115,12 @@ def counters_telecommands(probe: LinkProbe) -> None:
 
 @COUNTERS.case("clear", "clear_counters sets both counts to zero", intrusive=True)
 def counters_clear(probe: LinkProbe) -> None:
-    """clear_counters itself is not counted, the reading afterwards is."""
+    """clear_counters itself is not counted, but the reading afterwards is."""
     probe.command("clear_counters")
     check_equal(_counts(probe), (0, 1), "counts")
 
 
-# --- data goes through unchanged: the hole map as an echo ---
+# --- data are transferred unchanged: the hole map as an echo ---
 
 ECHOES: Final = (
     ("zeros", bytes(16)),
@@ -142,7 +142,7 @@ def _echo(data: bytes, probe: LinkProbe) -> None:
 
 
 for _name, _data in ECHOES:
-    DATA.case(_name, f"16 bytes ({_name}) go there and back unchanged")(partial(_echo, _data))
+    DATA.case(_name, f"16 bytes ({_name}) are read back unchanged")(partial(_echo, _data))
 
 
 @DATA.case("parts", "the eight parts of the hole map are independent")
@@ -170,9 +170,9 @@ def _frames(probe: LinkProbe) -> int:
     return int(probe.telemetry("device_status")["frames_captured"])
 
 
-@TIME.case("set", "the clock is what it was set to", intrusive=True)
+@TIME.case("set", "the clock has the time to which it was set", intrusive=True)
 def time_set(probe: LinkProbe) -> None:
-    """The values include bytes that must be stuffed; the clock is set back afterwards."""
+    """The values include bytes that must be stuffed; the clock is restored afterwards."""
     with _kept_clock(probe):
         for seconds, milliseconds in ((CLOCK_STEP_S, 250), (0x1F1F1F1F, 31), (0, 0), (0xFFFFFFF0, 999)):
             probe.command("set_unix_time", seconds=seconds, milliseconds=milliseconds)
@@ -192,7 +192,7 @@ def _kept_clock(probe: LinkProbe) -> Iterator[None]:
         probe.command("set_unix_time", seconds=int(whole), milliseconds=int(whole % 1.0 * 1000))
 
 
-@TIME.case("runs", "the clock runs as fast as the tester's")
+@TIME.case("runs", "the clock runs as fast as the tester's clock")
 def time_runs(probe: LinkProbe) -> None:
     begin, first = probe.now(), _clock(probe)
     middle = probe.now()
@@ -202,7 +202,7 @@ def time_runs(probe: LinkProbe) -> None:
     check(0.98 * (third - middle) <= last - first <= 1.02 * (end - begin) + 0.002, f"{third - middle:.3f} to {end - begin:.3f} s", f"{last - first:.3f} s")  # fmt: skip
 
 
-@TIME.case("flag", "device_status reports that the clock was set, and the same time", intrusive=True)
+@TIME.case("flag", "device_status reports the same time, and that the clock was set", intrusive=True)
 def time_flag(probe: LinkProbe) -> None:
     with _kept_clock(probe):
         probe.command("set_unix_time", seconds=CLOCK_STEP_S, milliseconds=0)
@@ -218,7 +218,7 @@ def time_flag(probe: LinkProbe) -> None:
     "CubeComputer TC 1, magic number 0x5A, and TLM 128, 129 (AlbertaSat, CTS)",
 )
 def uptime(probe: LinkProbe) -> None:
-    """The runtime in identification wraps at 65536 s."""
+    """The run time in identification wraps at 65536 s."""
     first = probe.telemetry("identification")
     status = probe.telemetry("device_status")
     check(int(first["runtime_ms"]) < 1000, "milliseconds below 1000", first["runtime_ms"])
@@ -233,7 +233,7 @@ def uptime(probe: LinkProbe) -> None:
 # --- modes ---
 
 
-@MODES.case("standby", "in standby no attitude is valid, and the rows agree on it")
+@MODES.case("standby", "in standby no attitude is valid, and the rows agree")
 def standby(probe: LinkProbe) -> None:
     probe.standby()
     probe.wait_for("device_status", {"attitude_valid": False}, 2.0)
@@ -243,7 +243,7 @@ def standby(probe: LinkProbe) -> None:
     check(not probe.telemetry("star_performance_2")["attitude_ok"], "attitude_ok not set", "set")
 
 
-@MODES.case("frames", "out of standby frames are made at the update rate, in standby none", rule(12))
+@MODES.case("frames", "frames are taken at the update rate outside standby, and none in standby", rule(12))
 def frames(probe: LinkProbe) -> None:
     probe.standby()
     with probe.parameters_kept("update_rate", "exposure"):
@@ -284,7 +284,9 @@ def no_tracking(probe: LinkProbe) -> None:
 
 
 @MODES.case(
-    "attitude", "with stars in view: valid, of unit length, its time just past, all rows agree", rule(15)
+    "attitude",
+    "with stars in view, the attitude is valid, of unit length and recent, and all rows agree",
+    rule(15),
 )
 def attitude(probe: LinkProbe) -> None:
     probe.standby()
@@ -309,9 +311,9 @@ def attitude(probe: LinkProbe) -> None:
 # --- reset ---
 
 
-@RESET.case("magic", "reset without its magic number is refused and does nothing")
+@RESET.case("magic", "reset without its magic number is refused and has no effect")
 def reset_magic(probe: LinkProbe) -> None:
-    """The magic number of CubeWheel, 0x55, is among those refused."""
+    """The refused numbers include CubeWheel's, 0x55."""
     before = probe.telemetry("boot_status")["boot_count"]
     row = probe.icd.telecommands["reset"]
     for magic in (0x00, 0x55, 0x59, 0x5B, 0xFF):
@@ -320,7 +322,7 @@ def reset_magic(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("boot_status")["boot_count"], before, "boot count")
 
 
-@RESET.case("acknowledged", "reset is acknowledged, then the device restarts by command")
+@RESET.case("acknowledged", "reset is acknowledged, then the device restarts with the cause command")
 def reset_acknowledged(probe: LinkProbe) -> None:
     before = probe.telemetry("boot_status")
     began = probe.now()
@@ -337,7 +339,7 @@ def reset_acknowledged(probe: LinkProbe) -> None:
 # --- store ---
 
 
-@STORE.case("reset", "a parameter that is not saved is lost at a reset, a saved one is kept")
+@STORE.case("reset", "at a reset, an unsaved parameter is lost and a saved one kept")
 def store_reset(probe: LinkProbe) -> None:
     before = probe.value_of("exposure")
     probe.set_parameter("exposure", TEST_VALUE)
@@ -352,7 +354,7 @@ def store_reset(probe: LinkProbe) -> None:
         save_parameters(probe)
 
 
-@STORE.case("restore", "restore_parameters brings back what is stored", rule(17))
+@STORE.case("restore", "restore_parameters applies the stored values", rule(17))
 def store_restore(probe: LinkProbe) -> None:
     before = probe.value_of("exposure")
     save_parameters(probe)
@@ -361,7 +363,7 @@ def store_restore(probe: LinkProbe) -> None:
     check_equal(probe.value_of("exposure"), before, "exposure")
 
 
-@STORE.case("defaults", "default_parameters sets the defaults and leaves the store unchanged", rule(18))
+@STORE.case("defaults", "default_parameters sets the defaults and keeps the stored values", rule(18))
 def store_defaults(probe: LinkProbe) -> None:
     save_parameters(probe)
     stored = probe.value_of("limiting_magnitude")
@@ -378,7 +380,7 @@ def store_defaults(probe: LinkProbe) -> None:
 
 @STORE.case(
     "config",
-    "set_star_config sets parameters, all or nothing, and star_config shows them",
+    "set_star_config sets all parameters or none, and star_config reports them",
     "CubeComputer TC 37, TLM 202 (AlbertaSat)",
 )
 def star_config(probe: LinkProbe) -> None:

@@ -1,4 +1,4 @@
-"""CAN conformance: identifiers, lengths, segments, and what is not for the device, with the rows of any unit."""
+"""CAN conformance: CAN IDs, lengths, segments, and frames not addressed to the device, with the rows of any unit."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from starhil.hil_tests.conformance.can_probe import (
     TELECOMMAND_SEGMENT,
     CanProbe,
     CanWire,
-    identifier_of,
+    can_id_of,
     segments,
 )
 from starhil.hil_tests.conformance.case import (
@@ -39,26 +39,26 @@ OTHER_HOST: Final = 0x4D
 COMBINED: Final = 211
 COMBINED_SIZE: Final = 54
 CUBESTAR: Final = frozenset({128, 230, 211, 200, 60, 103, 96, 2, 112, 37})
-"""Rows, and gaps between them, that are taken for a case where they fit."""
+"""Rows, and gaps between them, that a case uses if they are suitable."""
 LONGEST: Final = 56
-"""Most bytes of the telemetry whose segments are looked at: 8 segments."""
+"""Maximum size of telemetry whose segments are checked: 8 segments."""
 
 
 class CanRows:
-    """Rows of a unit that the cases ask for; None where it has no such row.
+    """Rows of a unit that the cases use; None if it has no such row.
 
     Attributes
     ----------
     single, small
-        Telemetry that fits a frame, and of fewer than 8 bytes.
+        Telemetry that fits into a frame; the second has fewer than 8 bytes.
     long
         Telemetry in segments.
     unknown_telemetry, unknown_telecommand
-        Identifiers that the unit does not have.
+        IDs that the unit does not have.
     empty
         Telecommand without data that may be sent at any time.
     refused
-        Telecommand that fits a frame, and data with a value that it must refuse.
+        Telecommand that fits into a frame, and data with a value that must be refused.
     eight
         Same, with 8 bytes.
     short
@@ -84,7 +84,7 @@ class CanRows:
         self.longest = _first(sorted((row for row in commands if row.size > 8), key=lambda row: -row.size))
 
     def texts(self, icd: InterfaceDefinition) -> dict[str, str]:
-        """Return the values of the names in braces in the table of frames, without missing rows."""
+        """Return the texts for the names in braces in the table of frames, without those of missing rows."""
         found = {name: f"{row.id:02X}" for name, row in vars(self).items() if isinstance(row, Row)}
         found |= {name: f"{number:02X}" for name, number in vars(self).items() if isinstance(number, int)}
         for name in ("single", "small"):
@@ -106,7 +106,7 @@ def _bad_data(row: Row) -> list[bytes]:
 
 
 def _first(rows: Iterable[Row]) -> Row | None:
-    """Return the row of a CubeStar if it is among these, else the first."""
+    """Return CubeStar's row if it is among these, otherwise the first."""
     found = list(rows)
     return next((row for row in found if row.id in CUBESTAR), found[0] if found else None)
 
@@ -116,7 +116,7 @@ def _gap(numbers: range, known: set[int]) -> int | None:
     return next((number for number in gaps if number in CUBESTAR), gaps[0] if gaps else None)
 
 
-FRAME_RULE: Final = "29-bit identifier: type[28:24] id[23:16] source[15:8] destination[7:0] (libCubeObc)"
+FRAME_RULE: Final = "29-bit CAN ID: type[28:24] row[23:16] source[15:8] destination[7:0] (libCubeObc)"
 REPLY_SEGMENTS: Final = CaseArea[CanWire]("segments", SEGMENT_RULE)
 SEGMENTS: Final = CaseArea[CanWire]("segments", SEGMENT_RULE, intrusive=True)
 UNSOLICITED: Final = CaseArea[CanProbe](
@@ -133,41 +133,41 @@ IGNORED: Final = ((2, "an acknowledge"), (3, "a telecommand refusal"), (5, "tele
                   (13, "type 13"), (31, "type 31"))  # fmt: skip
 
 EXCHANGES: Final = (
-    Exchange("telemetry", "a request of telemetry is answered with type 5, addresses exchanged", ("04{single}HHDD#",), ("05{single}DDHH#{single_data}",)),
+    Exchange("telemetry", "a telemetry request is answered with type 5 and exchanged addresses", ("04{single}HHDD#",), ("05{single}DDHH#{single_data}",)),
     Exchange("telemetry-{small_size}", "telemetry of {small_size} bytes has {small_size} bytes, no padding", ("04{small}HHDD#",), ("05{small}DDHH#{small_data}",)),
-    Exchange("unknown-telemetry", "an unknown telemetry identifier is refused with type 6 and the code", ("04{unknown_telemetry}HHDD#",), ("06{unknown_telemetry}DDHH#{invalid_id}",), clause=TYPES),
+    Exchange("unknown-telemetry", "an unknown telemetry ID is refused with type 6 and the code", ("04{unknown_telemetry}HHDD#",), ("06{unknown_telemetry}DDHH#{invalid_id}",), clause=TYPES),
     Exchange("other-device", "a frame for another address is not answered", ("04{single}HHFE#",)),
     Exchange("other-device-zero", "a frame for address 0 is not answered", ("04{single}HH00#",)),
-    Exchange("standard", "a frame with an 11-bit identifier is not answered", ("480#", "604#")),
+    Exchange("standard", "a frame with an 11-bit CAN ID is not answered", ("480#", "604#")),
     Exchange("remote", "a remote frame is not answered", ("04{single}HHDD#R",)),
     *(Exchange(f"type-{kind}", f"{words} is not answered", (f"{kind:02X}{{single}}HHDD#00",), clause=TYPES) for kind, words in IGNORED),
-    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry identifier is no request", ("01{single}HHDD#",), clause=rule(6)),
-    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand identifier is no request", ("04{short}HHDD#",), clause=rule(6)),
+    Exchange("telemetry-as-telecommand", "a telecommand frame with a telemetry ID is not answered", ("01{single}HHDD#",), clause=rule(6)),
+    Exchange("telecommand-as-telemetry", "a telemetry request with a telecommand ID is not answered", ("04{short}HHDD#",), clause=rule(6)),
     Exchange("two-at-once", "two requests back to back are answered in order", ("04{single}HHDD#", "04{small}HHDD#"), ("05{single}DDHH#{single_data}", "05{small}DDHH#{small_data}")),
 )  # fmt: skip
 
 INTRUSIVE_EXCHANGES: Final = (
     Exchange("ack", "an accepted telecommand is answered with type 2 and no data", ("01{empty}HHDD#",), ("02{empty}DDHH#",), clause=TYPES),
     Exchange("nack", "a refused telecommand is answered with type 3 and one byte", ("01{refused}HHDD#{refused_data}",), ("03{refused}DDHH#{invalid_parameter}",), clause=TYPES),
-    Exchange("eight", "a telecommand of 8 bytes goes in one frame", ("01{eight}HHDD#{eight_data}",), ("03{eight}DDHH#{invalid_parameter}",), clause=SEGMENT_RULE),
-    Exchange("eight-segmented", "a telecommand of 8 bytes may also come in segments", ("07{eight}HHDD#{eight_first}01", "07{eight}HHDD#{eight_rest}00"), ("03{eight}DDHH#{invalid_parameter}",), clause=rule(7)),
+    Exchange("eight", "a telecommand of 8 bytes fits into one frame", ("01{eight}HHDD#{eight_data}",), ("03{eight}DDHH#{invalid_parameter}",), clause=SEGMENT_RULE),
+    Exchange("eight-segmented", "a telecommand of 8 bytes may also be sent in segments", ("07{eight}HHDD#{eight_first}01", "07{eight}HHDD#{eight_rest}00"), ("03{eight}DDHH#{invalid_parameter}",), clause=rule(7)),
     Exchange("segmented-unknown", "an unknown telecommand in segments is refused once, after the last", ("07{unknown_telecommand}HHDD#0001020304050601", "07{unknown_telecommand}HHDD#0708090A0B00"), ("03{unknown_telecommand}DDHH#{invalid_id}",), clause=SEGMENT_RULE),
     Exchange("segmented-full-last", "the last segment may hold 7 bytes", ("07{unknown_telecommand}HHDD#0001020304050601", "07{unknown_telecommand}HHDD#0708090A0B0C0D00"), ("03{unknown_telecommand}DDHH#{invalid_id}",), clause=SEGMENT_RULE),
 )  # fmt: skip
 
 
 def _frame_cases(icd: InterfaceDefinition) -> list[Case[CanWire]]:
-    """Return the cases of the tables of frames for which the unit has the rows."""
+    """Return the cases from the tables of frames for whose rows the unit has."""
     texts = CanRows(icd).texts(icd)
     area = CaseArea[CanWire]("frames", FRAME_RULE)
     add_exchange_cases(area, _filled(EXCHANGES, texts))
     add_exchange_cases(area, _filled(INTRUSIVE_EXCHANGES, texts), intrusive=True)
-    area.case("askers", "each asker gets the answer at its own address")(askers)
+    area.case("askers", "each sender gets the answer at its own address")(askers)
     return area.cases
 
 
 def _filled(table: Iterable[Exchange], texts: dict[str, str]) -> Iterator[Exchange]:
-    """Yield the rows of a table of which each name in braces has a text, with these texts."""
+    """Yield the rows of a table with names in braces replaced by texts; skip rows with a missing text."""
     for row in table:
         with suppress(KeyError):
             sent, answers = (tuple(text.format(**texts) for text in part) for part in (row.sent, row.answers))
@@ -176,7 +176,7 @@ def _filled(table: Iterable[Exchange], texts: dict[str, str]) -> Iterator[Exchan
 
 
 def askers(probe: CanWire) -> None:
-    """Ask from three addresses."""
+    """Send requests from three addresses."""
     for source in (OTHER_HOST, probe.host, 0xFF):
         probe.post_as(source, needed(CanRows(probe.icd).single, "telemetry of up to 8 bytes").id)
     seen = [probe.next_answer() for _ in range(3)]
@@ -193,23 +193,23 @@ def _segmented_reply(row: Row) -> Case[CanWire]:
     def run(probe: CanWire) -> None:
         probe.post_as(probe.host, row.id)
         frames = [probe.next_frame() for _ in range(count)]
-        identifier = identifier_of(8, row.id, probe.device, probe.host)
+        can_id = can_id_of(8, row.id, probe.device, probe.host)
         seen = [
             (frame.id, len(frame.data), frame.data[-1] if frame.data else -1)
             for frame in frames
             if frame is not None
         ]
-        wanted = [(identifier, 8, left) for left in range(count - 1, 0, -1)] + [(identifier, rest + 1, 0)]
+        wanted = [(can_id, 8, left) for left in range(count - 1, 0, -1)] + [(can_id, rest + 1, 0)]
         check_equal(seen, wanted, "segments")
 
     title = (
-        f"{row.size} bytes come in {count} segments that count {count - 1} to 0, "
+        f"{row.size} bytes are sent in {count} segments that count from {count - 1} to 0, "
         f"the last with {rest} bytes and its counter"
     )
     return Case("segments.reply", "segments", title, SEGMENT_RULE, run)
 
 
-@REPLY_SEGMENTS.case("all-rows", "every row goes in one frame up to 8 bytes, in segments above")
+@REPLY_SEGMENTS.case("all-rows", "every row of up to 8 bytes is sent in one frame, longer rows in segments")
 def all_rows(probe: CanWire) -> None:
     for row in probe.icd.telemetry.values():
         probe.post_as(probe.host, row.id)
@@ -222,7 +222,9 @@ def all_rows(probe: CanWire) -> None:
             probe.next_frame()
 
 
-@UNSOLICITED.case("segments", "a long row comes unsolicited as first, body and last, counters down to 0")
+@UNSOLICITED.case(
+    "segments", "an unsolicited long row is sent as first, body and last, with counters down to 0"
+)
 def unsolicited_segments(probe: CanProbe) -> None:
     """star_tracker has 54 bytes, so 8 frames."""
     probe.command("set_unsolicited", telemetry=COMBINED, rate=5.0)
@@ -240,17 +242,17 @@ def unsolicited_segments(probe: CanProbe) -> None:
 
 
 def _unknown_frames(probe: CanWire, data: bytes, source: int | None = None) -> list[CanFrame]:
-    """Return the segments of a telecommand that does not exist: its refusal shows that a message was complete."""
+    """Return the segments of an unknown telecommand, whose refusal shows that the message was complete."""
     number = CanRows(probe.icd).unknown_telecommand
     if number is None:
-        raise CaseSkipped("the unit has a telecommand of each identifier")
+        raise CaseSkipped("the unit has a telecommand for every ID")
     source = probe.host if source is None else source
-    identifier = identifier_of(TELECOMMAND_SEGMENT, number, source, probe.device)
-    return [CanFrame(identifier, part) for part in segments(data)]
+    can_id = can_id_of(TELECOMMAND_SEGMENT, number, source, probe.device)
+    return [CanFrame(can_id, part) for part in segments(data)]
 
 
 def needed(row: Row | None, what: str) -> Row:
-    """Return a row; the case is skipped if the unit has none."""
+    """Return a row; skip the case if it is None."""
     if row is None:
         raise CaseSkipped(f"the unit has no {what}")
     return row
@@ -269,7 +271,7 @@ def _expect_one_refusal(probe: CanWire) -> None:
     probe.expect_silence("one message was sent")
 
 
-@SEGMENTS.case("lost", "a message with a lost segment has no effect, the next one has")
+@SEGMENTS.case("lost", "a message with a lost segment has no effect, the next one is answered")
 def lost_segment(probe: CanWire) -> None:
     frames = _unknown_frames(probe, LONG)
     for lost in range(len(frames)):
@@ -288,12 +290,12 @@ def lost_segment(probe: CanWire) -> None:
 
 
 FAULTY: Final = (
-    ("doubled", "a message with a doubled segment has no effect", (0, 1, 1, 2, 3, 4)),
+    ("doubled", "a message with a duplicate segment has no effect", (0, 1, 1, 2, 3, 4)),
     ("swapped", "a message with exchanged segments has no effect", (0, 2, 1, 3, 4)),
     ("empty", "a segment without a counter has no effect", ()),
 )
-"""Name, title, and the order in which the five segments of a message are sent; one without a counter if
-none."""
+"""Name, title, and the order in which the five segments of a message are sent; empty: one segment without a
+counter."""
 
 
 def _faulty_message(title: str, order: tuple[int, ...], probe: CanWire) -> None:
@@ -310,7 +312,7 @@ for _name, _title, _order in FAULTY:
 
 @SEGMENTS.case("half", "an incomplete message is dropped after a time-out", rule(2))
 def half_message(probe: CanWire) -> None:
-    """The last segment arrives too late (the last two would form a message)."""
+    """The last segment arrives too late; the last two would form a message."""
     frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:-1])
     probe.sleep(LONG_PAUSE_S)
@@ -320,7 +322,7 @@ def half_message(probe: CanWire) -> None:
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("pause", "a pause of 0.1 s between segments does no harm", rule(1))
+@SEGMENTS.case("pause", "a pause of 0.1 s between segments has no effect", rule(1))
 def pause_between(probe: CanWire) -> None:
     for frame in _unknown_frames(probe, LONG):
         probe.send(frame)
@@ -328,14 +330,14 @@ def pause_between(probe: CanWire) -> None:
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("restart", "a message may restart before its end", rule(8))
+@SEGMENTS.case("restart", "a message may be restarted before its end", rule(8))
 def restarted_message(probe: CanWire) -> None:
     frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:2] + frames)
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("two-hosts", "segments of two hosts do not mix", FRAME_RULE)
+@SEGMENTS.case("two-hosts", "segments of two hosts are not mixed", FRAME_RULE)
 def two_hosts(probe: CanWire) -> None:
     ours, theirs = _unknown_frames(probe, LONG), _unknown_frames(probe, LONG, OTHER_HOST)
     for one, other in zip(ours, theirs, strict=True):
@@ -346,7 +348,9 @@ def two_hosts(probe: CanWire) -> None:
 
 
 @SEGMENTS.case(
-    "request-between", "a request between segments is answered at once and does no harm", FRAME_RULE
+    "request-between",
+    "a request between segments is answered at once and does not disturb the message",
+    FRAME_RULE,
 )
 def request_between(probe: CanWire) -> None:
     frames = _unknown_frames(probe, LONG)
@@ -356,16 +360,16 @@ def request_between(probe: CanWire) -> None:
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("overlong", "a message that is too long has no effect, the next one has", rule(4))
+@SEGMENTS.case("overlong", "a message that is too long has no effect, the next one is answered", rule(4))
 def overlong(probe: CanWire) -> None:
-    """1750 bytes; the buffer of the published host software has 512."""
+    """The message has 1750 bytes; the buffer of the published host software has 512."""
     _send(probe, _unknown_frames(probe, bytes(250 * 7)))
     probe.expect_silence("the message was too long")
     _send(probe, _unknown_frames(probe, LONG))
     _expect_one_refusal(probe)
 
 
-@SEGMENTS.case("long", "a message of 500 bytes is taken and refused for its length", rule(4))
+@SEGMENTS.case("long", "a message of 500 bytes is received and refused for its length", rule(4))
 def long_message(probe: CanWire) -> None:
     row = needed(CanRows(probe.icd).longest, "telecommand of more than 8 bytes")
     probe.post_as(probe.host, row.id, bytes(500))
@@ -376,8 +380,8 @@ def long_message(probe: CanWire) -> None:
 
 CAN_ERROR: Final = frozenset({"can_telecommand_error"})
 FLAGS: Final = (
-    FlagRow("type", "a message type that is no request", ("0580HHDD#00",), CAN_ERROR),
-    FlagRow("swapped-kinds", "a telecommand frame with a telemetry identifier", ("0180HHDD#",), CAN_ERROR),
+    FlagRow("type", "a message type that is not a request", ("0580HHDD#00",), CAN_ERROR),
+    FlagRow("swapped-kinds", "a telecommand frame with a telemetry ID", ("0180HHDD#",), CAN_ERROR),
     FlagRow("sequence", "a segment out of order", ("073CHHDD#0001020304050602", "073CHHDD#0001020304050600"), CAN_ERROR),
     FlagRow("begins-nothing", "a last segment without others", ("073CHHDD#00010203040500",), CAN_ERROR),
     FlagRow("no-counter", "a segment without a counter", ("073CHHDD#",), CAN_ERROR),
@@ -399,7 +403,7 @@ def no_flag(probe: CanProbe) -> None:
 
 
 def can_cases(icd: InterfaceDefinition, *, cubestar: bool) -> list[Case[Any]]:
-    """Make the cases of a unit with a CAN link; those on its unsolicited telemetry and error flags are for a CubeStar."""
+    """Return the cases for a unit with a CAN link; some are for CubeStar only."""
     long = CanRows(icd).long
     return [
         *_frame_cases(icd),

@@ -30,19 +30,19 @@ UNSOLICITED_LAST: Final = 12
 UNSOLICITED: Final = (9, UNSOLICITED_FIRST, UNSOLICITED_BODY, UNSOLICITED_LAST)
 
 
-def identifier_of(kind: int, number: int, source: int, destination: int) -> int:
-    """Put a 29-bit identifier together: type[28:24], id[23:16], source[15:8], destination[7:0]."""
+def can_id_of(kind: int, number: int, source: int, destination: int) -> int:
+    """Return a 29-bit CAN ID: type[28:24], row ID[23:16], source[15:8], destination[7:0]."""
     return kind << 24 | number << 16 | source << 8 | destination
 
 
 def segments(data: bytes) -> list[bytes]:
-    """Cut data into segments of 7 bytes and a byte that counts those still to come."""
+    """Split data into segments of 7 bytes, each with a byte that counts the remaining ones."""
     parts = [data[start : start + 7] for start in range(0, len(data), 7)]
     return [part + bytes([len(parts) - 1 - number]) for number, part in enumerate(parts)]
 
 
 class CanWire(PortProbe):
-    """Sends requests and decodes answers on a CAN bus, with any unit's rows.
+    """Sends requests and decodes answers on a CAN bus, for the rows of any unit.
 
     Parameters
     ----------
@@ -71,14 +71,14 @@ class CanWire(PortProbe):
         self.unsolicited: list[CanFrame] = []
         self._frames: list[CanFrame] = []
 
-    def post_as(self, source: int, identifier: int, data: bytes = b"") -> None:
-        """Send a request from another address than the tester's own."""
-        kind = TELEMETRY_REQUEST if identifier >= FIRST_TELEMETRY else TELECOMMAND
+    def post_as(self, source: int, row_id: int, data: bytes = b"") -> None:
+        """Send a request from a given address."""
+        kind = TELEMETRY_REQUEST if row_id >= FIRST_TELEMETRY else TELECOMMAND
         payloads = [data]
         if len(data) > 8:
             kind, payloads = TELECOMMAND_SEGMENT, segments(data)
         for payload in payloads:
-            self.send(CanFrame(identifier_of(kind, identifier, source, self.device), payload))
+            self.send(CanFrame(can_id_of(kind, row_id, source, self.device), payload))
 
     def send(self, frame: CanFrame) -> None:
         """Send a raw frame."""
@@ -90,10 +90,10 @@ class CanWire(PortProbe):
         self.send(parse_frame(self.with_addresses(text)))
 
     def expecting(self, *answers: str) -> None:
-        """Do nothing: an answer carries its identifier."""
+        """Do nothing: an answer contains its row ID."""
 
     def expect_exactly(self, answer: str) -> None:
-        """Take the next frame, which must be one with HH, DD, and `..` for any byte."""
+        """Take the next frame, which must match a pattern with HH, DD, and `..` for any byte."""
         wanted = pattern(self.with_addresses(answer))
         frame = self.next_frame()
         seen = "nothing" if frame is None else format_frame(frame)
@@ -128,7 +128,7 @@ class CanWire(PortProbe):
         return self._read(0.0) if self._frames else Answer("none")
 
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that come within a time."""
+        """Return the messages of unsolicited telemetry that arrive within a time."""
         self.unsolicited.clear()
         self.sleep(seconds)
         found, data = [], b""
@@ -138,12 +138,12 @@ class CanWire(PortProbe):
                 data += frame.data[:-1]
             elif kind == UNSOLICITED_LAST:
                 whole = data + frame.data[:-1] if data else frame.data
-                found.append(Answer("unsolicited", data=whole, identifier=number, other=other))
+                found.append(Answer("unsolicited", data=whole, row_id=number, other=other))
                 data = b""
         return found
 
     def next_frame(self, timeout_s: float | None = None) -> CanFrame | None:
-        """Return the next frame of the device that is not unsolicited, None if none comes."""
+        """Return the next frame of the device that is not unsolicited, or None."""
         end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
         while not self._frames:
             left = end - self.now()
@@ -156,7 +156,7 @@ class CanWire(PortProbe):
         return self._read(self.times.answer_s if timeout_s is None else timeout_s)
 
     def expect_answer(self, kind: AnswerKind, what: str, code: ErrorCode | None = None) -> Answer:
-        """Take the next answer, which must be of a kind, and with a code if one is given."""
+        """Take the next answer, which must be of a given kind, with a code if one is given."""
         answer = self.next_answer()
         number = None if code is None else int(self.icd.error_number(code))
         if answer.kind != kind or number not in (None, answer.code):
@@ -172,21 +172,18 @@ class CanWire(PortProbe):
         telemetry = number >= FIRST_TELEMETRY
         match kind:
             case 2 if not frame.data and not telemetry:
-                return Answer("ack", identifier=number, other=other)
+                return Answer("ack", row_id=number, other=other)
             case 3 | 6 if len(frame.data) == 1 and frame.data[0] and (kind == TELEMETRY_NACK) == telemetry:
-                return Answer("nack", code=frame.data[0], identifier=number, other=other)
+                return Answer("nack", code=frame.data[0], row_id=number, other=other)
             case 5 if telemetry:
-                return Answer("telemetry", data=frame.data, identifier=number, other=other)
+                return Answer("telemetry", data=frame.data, row_id=number, other=other)
             case 8 if telemetry or number == BURST_ID:
                 return self._segmented(frame, number, other)
             case _:
                 return Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
 
     def _segmented(self, first: CanFrame, number: int, other: int) -> Answer:
-        """Join the segments of one message.
-
-        Another counter or a short one in between is malformed.
-        """
+        """Join the segments of one message; a wrong counter or a short segment makes it malformed."""
         data = b""
         frame: CanFrame | None = first
         left = first.data[-1] if first.data else 0
@@ -194,20 +191,18 @@ class CanWire(PortProbe):
             data += frame.data[:-1]
             if left == 0:
                 kind: AnswerKind = "burst" if number == BURST_ID else "telemetry"
-                return Answer(
-                    kind if len(data) > 8 else "malformed", data=data, identifier=number, other=other
-                )
+                return Answer(kind if len(data) > 8 else "malformed", data=data, row_id=number, other=other)
             if len(frame.data) != 8:
                 break
             left -= 1
             frame = self.next_frame()
         seen = b"" if frame is None else frame.data
-        return Answer("malformed", data=data + seen, identifier=number, other=other)
+        return Answer("malformed", data=data + seen, row_id=number, other=other)
 
 
 class CanProbe(CanWire, LinkProbe):
-    """Talks to a CubeStar over a CAN bus."""
+    """Talks to CubeStar over a CAN bus."""
 
-    def post(self, identifier: int, data: bytes = b"") -> None:
+    def post(self, row_id: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
-        self.post_as(self.host, identifier, data)
+        self.post_as(self.host, row_id, data)

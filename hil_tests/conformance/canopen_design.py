@@ -1,4 +1,4 @@
-"""CANopen conformance: what this family of devices promises beyond CiA 301."""
+"""CANopen conformance: behaviour of this product beyond CiA 301."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ DESIGN: Final = CaseArea[CanopenProbe]("canopen.design", "interface definition: 
 @DESIGN.case("write-event", "a write to a mapped object is an event")
 def write_event(probe: CanopenProbe) -> None:
     item = writable(probe)
-    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
     before = probe.read(item.index, item.subindex)
     probe.command(START)
-    probe.wait_for(identifier, 0.1)
+    probe.wait_for(can_id, 0.1)
     _, changed = limits(item, before)
     probe.set(item.index, item.subindex, changed)
-    check_equal(probe.expect(identifier, "TPDO after the write"), changed, "data")
+    check_equal(probe.expect(can_id, "TPDO after the write"), changed, "data")
     probe.set(item.index, item.subindex, before)
 
 
-@DESIGN.case("attitude", "TPDOs with a sequence number are of one sample")
+@DESIGN.case("attitude", "TPDOs with the same sequence number are of one sample")
 def attitude(probe: CanopenProbe) -> None:
     marker = probe.find("object named sequence", lambda item: item.name == "sequence" and item.pdo_mappable)
     chosen: list[int] = []
@@ -41,14 +41,14 @@ def attitude(probe: CanopenProbe) -> None:
     for index in probe.pdo_indices(0x1800):
         if probe.number(index + 0x200, 0) and probe.number(index + 0x200, 1) == entry(marker):
             probe.set(index, 2, SYNCHRONOUS, 1)
-            identifier = 0x3E0 + len(chosen)
-            probe.set(index, 1, PDO_OFF | NO_RTR | identifier)
-            probe.set(index, 1, NO_RTR | identifier)
-            chosen.append(identifier)
+            can_id = 0x3E0 + len(chosen)
+            probe.set(index, 1, PDO_OFF | NO_RTR | can_id)
+            probe.set(index, 1, NO_RTR | can_id)
+            chosen.append(can_id)
     check(len(chosen) >= 2, "two TPDOs that begin with the sequence number", len(chosen))
     probe.command(START)
     for _ in range(5):
         probe.drain()
         send_sync(probe)
-        heads = {probe.expect(identifier, "TPDO")[:2] for identifier in chosen}
+        heads = {probe.expect(can_id, "TPDO")[:2] for can_id in chosen}
         check_equal(len(heads), 1, "sequence numbers and flags after one SYNC:")

@@ -33,7 +33,7 @@ def _file(probe: CanopenProbe) -> configparser.RawConfigParser:
     try:
         parser.read_string(probe.eds)
     except configparser.Error as error:
-        check(condition=False, expected="a file of sections with keys, each once", seen=error)
+        check(condition=False, expected="a file of sections with unique keys", seen=error)
     return parser
 
 
@@ -73,7 +73,7 @@ def types(probe: CanopenProbe) -> None:
         check(item.name, f"name of {item.index:04X}h:{item.subindex:02X}h", "none")
 
 
-@EDS.case("limits", "limits and defaults fit each other and their type", "CiA 306 4.6.3")
+@EDS.case("limits", "limits and defaults are consistent and fit the type", "CiA 306 4.6.3")
 def limits(probe: CanopenProbe) -> None:
     for item in probe.variables():
         if not is_integer(item):
@@ -90,10 +90,7 @@ def limits(probe: CanopenProbe) -> None:
 
 @EDS.case("sub-index-0", "sub-index 0 holds the highest sub-index", "CiA 301 7.4.3")
 def sub_index_0(probe: CanopenProbe) -> None:
-    """Sub-index 0 of records and arrays is an UNSIGNED8.
-
-    A constant one equals the highest sub-index.
-    """
+    """Sub-index 0 of records and arrays is an UNSIGNED8; if constant, it is the highest sub-index."""
     for index in sorted(probe.od.indices):
         item = probe.od.indices[index]
         if not isinstance(item, ODRecord | ODArray):
@@ -105,7 +102,7 @@ def sub_index_0(probe: CanopenProbe) -> None:
             check_equal(first.default, max(item.subindices), f"highest sub-index of {index:04X}h")
 
 
-@EDS.case("pdo-count", "number of PDOs agrees with the records")
+@EDS.case("pdo-count", "the numbers of PDOs agree with the records")
 def pdo_count(probe: CanopenProbe) -> None:
     information = probe.od.device_information
     for first, stated in ((0x1400, information.nr_of_RXPDO), (0x1800, information.nr_of_TXPDO)):
@@ -140,18 +137,18 @@ def mapping(probe: CanopenProbe) -> None:
             check(total <= 64, f"{index:04X}h maps at most 64 bits", total)
 
 
-@EDS.case("cob-ids", "default identifiers are free, allowed and distinct", "CiA 301 7.3.5")
+@EDS.case("cob-ids", "default CAN IDs are unused, allowed and distinct", "CiA 301 7.3.5")
 def cob_ids(probe: CanopenProbe) -> None:
     used: dict[int, str] = {}
     for index in (0x1005, 0x1012, 0x1014, *probe.pdo_indices(0x1400), *probe.pdo_indices(0x1800)):
         item = probe.od.get_variable(index, 0 if index < 0x1400 else 1)
         if item is None or item.default is None or (index >= 0x1014 and item.default >> 31):
             continue
-        identifier = item.default & 0x1FFFFFFF
-        restricted = any(low <= identifier <= high for low, high in RESTRICTED)
-        check(not restricted, f"identifier of {index:04X}h allowed", f"0x{identifier:03X}")
-        check(identifier not in used, f"identifier of {index:04X}h is unique", used.get(identifier))
-        used[identifier] = f"0x{identifier:03X} is that of {index:04X}h"
+        can_id = item.default & 0x1FFFFFFF
+        restricted = any(low <= can_id <= high for low, high in RESTRICTED)
+        check(not restricted, f"CAN ID of {index:04X}h allowed", f"0x{can_id:03X}")
+        check(can_id not in used, f"CAN ID of {index:04X}h is unique", used.get(can_id))
+        used[can_id] = f"0x{can_id:03X} is that of {index:04X}h"
 
 
 @EDS.case("identity", "device information agrees with the identity object")
@@ -172,7 +169,7 @@ def bit_rates(probe: CanopenProbe) -> None:
 
 @EDS.case("stored", "the EDS that the node serves is the one under test", "CiA 301 7.5.2.21")
 def stored(probe: CanopenProbe) -> None:
-    """1021h, if present, serves the text of the file."""
+    """1021h, if present, returns the text of the file."""
     item = probe.od.get_variable(0x1021)
     if item is None:
         raise CaseSkipped("the EDS has no object 1021h")

@@ -20,7 +20,7 @@ EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusiv
 
 
 class ProvokedError:
-    """An error caused by the tester: a SYNC of wrong length, else a missing heartbeat."""
+    """An error caused by the tester: a SYNC of wrong length or a missing heartbeat."""
 
     def __init__(self, probe: CanopenProbe) -> None:
         probe.require(0x1014)
@@ -32,7 +32,7 @@ class ProvokedError:
         self.cause()
         if probe.wait_for(self.emergency, 0.2) is None:
             if 0x1016 not in probe.od:
-                raise CaseSkipped("no error of this device can be caused over the bus")
+                raise CaseSkipped("no error of this device can be provoked over the bus")
             self._by_sync = False
             probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
             self.cause()
@@ -76,7 +76,7 @@ def emcy_once(probe: CanopenProbe) -> None:
     probe.expect_silence(error.emergency, "second EMCY")
 
 
-@EMCY.case("gone", "EMCY 0000h when the error is gone", "CiA 301 7.2.7.1")
+@EMCY.case("gone", "EMCY 0000h when the error is cleared", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
     error = ProvokedError(probe)
     error.cause()
@@ -90,7 +90,7 @@ def emcy_gone(probe: CanopenProbe) -> None:
         check_equal(probe.number(0x1003, 0), count, "errors in the history")
 
 
-@EMCY.case("history", "the error history has the newest first")
+@EMCY.case("history", "the error history begins with the newest error")
 def emcy_history(probe: CanopenProbe) -> None:
     probe.require(0x1003)
     error = ProvokedError(probe)
@@ -109,7 +109,7 @@ def emcy_history(probe: CanopenProbe) -> None:
 
 @EMCY.case("history-order", "older errors move up")
 def emcy_history_order(probe: CanopenProbe) -> None:
-    """The second error is another one: the heartbeat of a watched node stops."""
+    """The second error is a different one: the heartbeat of a watched node stops."""
     probe.require(0x1003)
     probe.require(0x1016)
     error = ProvokedError(probe)
@@ -126,26 +126,26 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     check_equal(data[2], register, "error register with the error that remains")
 
 
-@EMCY.case("history-write", "the error history takes 0 only")
+@EMCY.case("history-write", "the error history accepts only 0")
 def emcy_history_write(probe: CanopenProbe) -> None:
     probe.require(0x1003)
     probe.expect_refusal(0x1003, 0, 1, 1, *VALUE_ABORTS)
 
 
-@EMCY.case("switch", "EMCY is switched off by bit 31 and moved only then", "CiA 301 7.5.2.15")
+@EMCY.case("switch", "bit 31 switches EMCY off, and its CAN ID changes only then", "CiA 301 7.5.2.15")
 def emcy_switch(probe: CanopenProbe) -> None:
     error = ProvokedError(probe)
     probe.expect_refusal(0x1014, 0, 0x91, 4, *VALUE_ABORTS)
     probe.set(0x1014, 0, PDO_OFF | error.emergency)
-    for identifier in (0x2000_0091, 0x701, 0x000):
-        probe.expect_refusal(0x1014, 0, identifier, 4, *VALUE_ABORTS)
+    for can_id in (0x2000_0091, 0x701, 0x000):
+        probe.expect_refusal(0x1014, 0, can_id, 4, *VALUE_ABORTS)
     error.cause()
     probe.expect_silence(error.emergency, "EMCY while it is off")
     error.clear()
     probe.set(0x1014, 0, 0x91)
     probe.drain()
     error.cause()
-    probe.expect(0x91, "EMCY under its new identifier")
+    probe.expect(0x91, "EMCY with its new CAN ID")
 
 
 @EMCY.case("inhibit", "inhibit time between two EMCY", "CiA 301 7.5.2.16")

@@ -28,7 +28,7 @@ def _prepare(probe: CanopenProbe, heartbeat_ms: int = 20) -> None:
 
 
 def _state(probe: CanopenProbe) -> int:
-    """Return the state in the next heartbeat, after the frames in transit have arrived."""
+    """Return the state in the next heartbeat, after frames in transit have arrived."""
     probe.wait_for(NOBODY, SETTLING_S)
     probe.drain()
     return probe.expect(0x700 + probe.node, "heartbeat", 1.0)[0]
@@ -63,7 +63,7 @@ def commands(probe: CanopenProbe) -> None:
 
 @NMT.case("broadcast", "commands to all nodes", "CiA 301 7.2.8.3")
 def broadcast(probe: CanopenProbe) -> None:
-    """Node-ID 0 addresses every node; only for a bus on which nothing else is in operation."""
+    """Node ID 0 addresses every node, so this is only for a bus without other nodes in operation."""
     _prepare(probe)
     for command, state in STATE_OF.items():
         probe.command(command, 0)
@@ -77,7 +77,7 @@ def other_node(probe: CanopenProbe) -> None:
     check_equal(_state(probe), 0x7F, "state")
 
 
-@NMT.case("malformed", "frames that are no NMT command are ignored")
+@NMT.case("malformed", "frames that are not NMT commands are ignored")
 def malformed(probe: CanopenProbe) -> None:
     _prepare(probe)
     node = bytes([probe.node])
@@ -117,7 +117,7 @@ def sdo_states(probe: CanopenProbe) -> None:
 # Heartbeat
 
 
-@ERROR_CONTROL.case("heartbeat", "heartbeat at its period with the state")
+@ERROR_CONTROL.case("heartbeat", "heartbeat with the state at its period")
 def heartbeat(probe: CanopenProbe) -> None:
     _prepare(probe, 100)
     probe.drain()
@@ -128,7 +128,7 @@ def heartbeat(probe: CanopenProbe) -> None:
     check(0.08 <= mean <= 0.12, "period 0.1 s", f"{mean:.4f} s")
 
 
-@ERROR_CONTROL.case("heartbeat-off", "no heartbeat with time 0")
+@ERROR_CONTROL.case("heartbeat-off", "no heartbeat if the time is 0")
 def heartbeat_off(probe: CanopenProbe) -> None:
     _prepare(probe, 50)
     _prepare(probe, 0)
@@ -174,7 +174,7 @@ def guarding(probe: CanopenProbe) -> None:
 
 
 @ERROR_CONTROL.case(
-    "guarding-or-heartbeat", "no node guarding while the heartbeat is on", "CiA 301 7.2.8.3.1"
+    "guarding-or-heartbeat", "no node guarding while the heartbeat is enabled", "CiA 301 7.2.8.3.1"
 )
 def guarding_or_heartbeat(probe: CanopenProbe) -> None:
     probe.require(0x100C)
@@ -216,7 +216,7 @@ def _watch(probe: CanopenProbe) -> int:
     return _emergency(probe)
 
 
-@ERROR_CONTROL.case("consumer-start", "a watch begins with the first heartbeat")
+@ERROR_CONTROL.case("consumer-start", "supervision begins with the first heartbeat")
 def consumer_start(probe: CanopenProbe) -> None:
     """No EMCY before the watched node has sent its first heartbeat."""
     emergency = _watch(probe)
@@ -228,7 +228,7 @@ def consumer(probe: CanopenProbe) -> None:
     emergency = _watch(probe)
     for _ in range(3):
         probe.send_watched_heartbeat()
-        probe.expect_silence(emergency, "EMCY while it is heard", 0.07)
+        probe.expect_silence(emergency, "EMCY while its heartbeat is received", 0.07)
     data = probe.expect(emergency, "EMCY 8130h", 0.3)
     check_equal(data[:2], b"\x30\x81", "error code")
     check(data[2] & 0x11 == 0x11, "error register with generic and communication", data[2])
@@ -239,7 +239,7 @@ def consumer(probe: CanopenProbe) -> None:
 
 
 @ERROR_CONTROL.case(
-    "behaviour", "error behaviour when the heartbeat of a watched node stops", "CiA 301 7.5.2.32"
+    "behaviour", "error behaviour if the heartbeat of a watched node stops", "CiA 301 7.5.2.32"
 )
 def behaviour(probe: CanopenProbe) -> None:
     probe.require(0x1029)
@@ -254,7 +254,7 @@ def behaviour(probe: CanopenProbe) -> None:
         check_equal(_state(probe), state, f"state with 1029h:01h at {value}:")
 
 
-@ERROR_CONTROL.case("consumer-twice", "one node is watched by one entry", "CiA 301 7.5.2.18")
+@ERROR_CONTROL.case("consumer-twice", "a node can be watched by only one entry", "CiA 301 7.5.2.18")
 def consumer_twice(probe: CanopenProbe) -> None:
     _watch(probe)
     item = probe.od.get_variable(0x1016, 2)
@@ -264,7 +264,7 @@ def consumer_twice(probe: CanopenProbe) -> None:
     probe.set(0x1016, 2, (WATCHED_NODE + 1) << 16 | 200)
 
 
-@ERROR_CONTROL.case("consumer-off", "a watch with time 0 is off", "CiA 301 7.5.2.18")
+@ERROR_CONTROL.case("consumer-off", "supervision with time 0 is off", "CiA 301 7.5.2.18")
 def consumer_off(probe: CanopenProbe) -> None:
     emergency = _watch(probe)
     probe.send_watched_heartbeat()

@@ -12,11 +12,11 @@ from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, che
 
 OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
 NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}
-"""Aborts by which a node says that an object exists and has no value now."""
+"""Aborts which show that an object exists but has no value at present."""
 
 
 def _readable(indices: range, probe: CanopenProbe) -> None:
-    """Read every object in a range, each with the length of its type."""
+    """Read every object in a range and check the length for its type."""
     for item in probe.variables():
         if item.index not in indices or not item.readable or item.data_type == datatypes.DOMAIN:
             continue
@@ -38,9 +38,9 @@ for _name, _what, _clause, _indices in (
     )
 
 
-@OD.case("defaults", "after a reset the defaults are those of the EDS", "CiA 301 7.5.2")
+@OD.case("defaults", "after a reset the values are the defaults in the EDS", "CiA 301 7.5.2")
 def defaults(probe: CanopenProbe) -> None:
-    """Integers of the communication profile, after `load` has cleared stored parameters."""
+    """Checks integers of the communication profile, after `load` has cleared stored parameters."""
     if 0x1011 in probe.od:
         probe.set(0x1011, 1, b"load")
     probe.reset_communication()
@@ -57,7 +57,7 @@ def defaults(probe: CanopenProbe) -> None:
             )
 
 
-@OD.case("texts", "names and versions are those of the EDS", "CiA 301 7.5.2.7", intrusive=False)
+@OD.case("texts", "names and versions agree with the EDS", "CiA 301 7.5.2.7", intrusive=False)
 def texts(probe: CanopenProbe) -> None:
     """1008h to 100Ah, if the EDS has them."""
     for index in (0x1008, 0x1009, 0x100A):
@@ -68,7 +68,7 @@ def texts(probe: CanopenProbe) -> None:
             )
 
 
-@OD.case("identity", "identity is that of the EDS", "CiA 301 7.5.2.19", intrusive=False)
+@OD.case("identity", "the identity agrees with the EDS", "CiA 301 7.5.2.19", intrusive=False)
 def identity(probe: CanopenProbe) -> None:
     """1000h and 1018h."""
     for index, subindex in ((0x1000, 0), (0x1018, 1), (0x1018, 2), (0x1018, 3)):
@@ -77,7 +77,7 @@ def identity(probe: CanopenProbe) -> None:
             check_equal(probe.number(index, subindex), item.default, f"{index:04X}h:{subindex:02X}h")
 
 
-@OD.case("sub-index-0", "sub-index 0 of a record is its highest sub-index", "CiA 301 7.4.3", intrusive=False)
+@OD.case("sub-index-0", "sub-index 0 of a record is the highest sub-index", "CiA 301 7.4.3", intrusive=False)
 def sub_index_0(probe: CanopenProbe) -> None:
     """Every record and array whose sub-index 0 is constant."""
     for item in probe.variables():
@@ -86,7 +86,7 @@ def sub_index_0(probe: CanopenProbe) -> None:
             check_equal(probe.number(item.index, 0), max(group.subindices), f"{item.index:04X}h:00h")
 
 
-@OD.case("write-only", "write-only objects are not read", intrusive=False)
+@OD.case("write-only", "write-only objects cannot be read", intrusive=False)
 def write_only(probe: CanopenProbe) -> None:
     probe.find("write-only object", lambda item: item.access_type == "wo")
     for item in probe.variables():
@@ -94,7 +94,7 @@ def write_only(probe: CanopenProbe) -> None:
             probe.expect_abort(b"\x40" + multiplexer(item.index, item.subindex), Abort.WRITE_ONLY)
 
 
-@OD.case("read-only", "read-only and constant objects are not written")
+@OD.case("read-only", "read-only and constant objects cannot be written")
 def read_only(probe: CanopenProbe) -> None:
     for item in probe.variables():
         if item.access_type in {"ro", "const"}:
@@ -126,7 +126,7 @@ def no_sub_index(probe: CanopenProbe) -> None:
             probe.expect_abort(b"\x2f" + multiplexer(index, beyond), Abort.NO_SUBINDEX)
 
 
-@OD.case("length-high", "too long a value is refused")
+@OD.case("length-high", "a value that is too long is refused")
 def length_high(probe: CanopenProbe) -> None:
     for item in probe.variables():
         size = size_of(item)
@@ -137,7 +137,7 @@ def length_high(probe: CanopenProbe) -> None:
             )
 
 
-@OD.case("length-low", "too short a value is refused")
+@OD.case("length-low", "a value that is too short is refused")
 def length_low(probe: CanopenProbe) -> None:
     for item in probe.variables():
         size = size_of(item)
@@ -158,7 +158,7 @@ def _bounded(probe: CanopenProbe) -> list[ODVariable]:
 
 
 def _expect_refusal_beyond(probe: CanopenProbe, step: int, code: Abort) -> None:
-    """Write the value above (1) or below (-1) the limit of each object, if its type holds it."""
+    """Write the value above (1) or below (-1) the limit of each object, if its type can hold it."""
     for item in _bounded(probe):
         size = size_of(item) or 4
         signed = item.data_type in datatypes.SIGNED_TYPES
@@ -179,7 +179,7 @@ def value_low(probe: CanopenProbe) -> None:
     _expect_refusal_beyond(probe, -1, Abort.VALUE_LOW)
 
 
-@OD.case("write-back", "what is written is read back", "CiA 301 7.2.4.3")
+@OD.case("write-back", "a written value is read back", "CiA 301 7.2.4.3")
 def write_back(probe: CanopenProbe) -> None:
     found = 0
     for item in probe.variables():
@@ -203,4 +203,4 @@ def write_back(probe: CanopenProbe) -> None:
                 check_equal(probe.read(item.index, item.subindex), data, f"{item.qualname}")
         probe.set(item.index, item.subindex, before)
     if not found:
-        raise CaseSkipped("the EDS has no object that takes its limits")
+        raise CaseSkipped("the EDS has no object that accepts its limits")

@@ -1,4 +1,4 @@
-"""CANopen conformance: how the cases about PDOs configure them (CiA 301 7.5.2.34 to 7.5.2.38)."""
+"""CANopen conformance: configuration of PDOs, shared by their cases (CiA 301 7.5.2.34 to 7.5.2.38)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
 from starhil.hil_tests.conformance.case import CaseSkipped
 
 FIXED: Final = (Abort.ACCESS, Abort.DEVICE_STATE, Abort.VALUE)
-"""Aborts by which stacks refuse a change of the mapping of a PDO in use; CiA 301 names none."""
+"""Aborts with which stacks refuse to change the mapping of an enabled PDO; CiA 301 specifies none."""
 SYNCHRONOUS: Final = 1
 EVENT: Final = 255
 
@@ -30,7 +30,7 @@ def entry(item: ODVariable) -> int:
 
 
 def constant(probe: CanopenProbe) -> ODVariable:
-    """Return an object to transmit whose value holds still: mapped by default if it can be."""
+    """Return an object to transmit whose value is constant, if possible one that is mapped by default."""
     for item in probe.variables():
         if (
             item.pdo_mappable
@@ -45,9 +45,9 @@ def constant(probe: CanopenProbe) -> ODVariable:
 
 
 def writable(probe: CanopenProbe) -> ODVariable:
-    """Return an object for an RPDO that accepts both its limits now; skip the case if there is none.
+    """Return an object for an RPDO that accepts both its limits; skip the case if there is none.
 
-    Another object may bound it more tightly than the EDS: an exposure time by the update rate.
+    Another object may limit it further than the EDS does, as the update rate limits the exposure time.
     """
     for item in probe.variables():
         size = size_of(item)
@@ -69,7 +69,7 @@ def writable(probe: CanopenProbe) -> ODVariable:
 
 
 def limits(item: ODVariable, before: bytes) -> tuple[bytes, bytes]:
-    """Return both limits of an object as it carries them, last the one that is not its present value."""
+    """Return both limits of an object, encoded, with the one that is not its current value last."""
     size = size_of(item) or 1
     low, high = (int(limit or 0).to_bytes(size, "little") for limit in (item.min, item.max))
     return (high, low) if high == before else (low, high)
@@ -81,23 +81,21 @@ def set_up(
     objects: Sequence[int],
     kind: int,
     *,
-    identifier: int | None = None,
+    can_id: int | None = None,
     inhibit: int = 0,
     event_ms: int = 0,
     start: int | None = None,
 ) -> int:
-    """Configure a PDO by the procedure of CiA 301 and return its identifier.
+    """Configure a PDO by the procedure of CiA 301 and return its CAN ID.
 
     Other PDOs and the heartbeat are off.
     """
     probe.quiet()
     transmit = index >= 0x1800
     number = index & 0x1FF
-    identifier = (
-        (0x180 if transmit else 0x200) + 0x100 * number + probe.node if identifier is None else identifier
-    )
+    can_id = (0x180 if transmit else 0x200) + 0x100 * number + probe.node if can_id is None else can_id
     flags = NO_RTR if transmit else 0
-    probe.set(index, 1, PDO_OFF | flags | identifier)
+    probe.set(index, 1, PDO_OFF | flags | can_id)
     probe.set(index + 0x200, 0, 0, 1)
     for position, value in enumerate(objects, 1):
         probe.set(index + 0x200, position, value)
@@ -111,16 +109,13 @@ def set_up(
             raise CaseSkipped(f"{index:04X}h has no sub-index {subindex}")
         if setting is not None and served:
             probe.set(index, subindex, setting, size)
-    probe.set(index, 1, flags | identifier)
+    probe.set(index, 1, flags | can_id)
     probe.drain()
-    return identifier
+    return can_id
 
 
 def first(probe: CanopenProbe, kind: int) -> int:
-    """Return the index of the first RPDO (1400h) or TPDO (1800h).
-
-    Skip the case if there is none.
-    """
+    """Return the index of the first RPDO (1400h) or TPDO (1800h); skip the case if there is none."""
     indices = probe.pdo_indices(kind)
     if not indices:
         raise CaseSkipped(f"no PDO from {kind:04X}h on")
@@ -132,12 +127,9 @@ def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
     probe.send(0x080, b"" if counter is None else bytes([counter]))
 
 
-def after_event(probe: CanopenProbe, identifier: int, timeout_s: float | None = None) -> bytes:
-    """Return the TPDO that a write to a mapped object has caused.
-
-    Skip the case if such a write is no event here.
-    """
-    data = probe.wait_for(identifier, timeout_s)
+def after_event(probe: CanopenProbe, can_id: int, timeout_s: float | None = None) -> bytes:
+    """Return the TPDO caused by a write to a mapped object; skip the case if the write is not an event."""
+    data = probe.wait_for(can_id, timeout_s)
     if data is None:
-        raise CaseSkipped("a write to a mapped object is no event of this device")
+        raise CaseSkipped("a write to a mapped object is not an event on this device")
     return data

@@ -25,18 +25,18 @@ RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
 ANSWER_S: Final = 0.5
-"""Longest time for an answer."""
+"""Maximum time for an answer."""
 BOOT_S: Final = 3.0
-"""Longest time from a reset of the communication to the boot-up message."""
+"""Maximum time from a communication reset to the boot-up message."""
 FIRST_OWN_OBJECT: Final = 0x2000
 
 NOBODY: Final = -1
-"""No identifier: waiting for it lets time pass."""
+"""No CAN ID; waiting for it lets time pass."""
 SETTLING_S: Final = 0.05
-"""Time in which a node obeys an NMT command, and what was under way has come."""
+"""Time in which a node obeys an NMT command and frames in transit arrive."""
 
 MAX_WAITING: Final = 20_000
-"""Frames that may wait to be read before a node counts as one that floods the bus."""
+"""Number of unread frames above which a node is considered to flood the bus."""
 
 PDO_OFF: Final = 1 << 31
 NO_RTR: Final = 1 << 30
@@ -74,9 +74,9 @@ class Abort(IntEnum):
 VALUE_ABORTS: Final = (Abort.VALUE, Abort.VALUE_HIGH, Abort.VALUE_LOW)
 """Abort codes with which a node may refuse a value."""
 RESTRICTED_IDS: Final = (0x000, 0x07F, 0x101, 0x180, 0x581, 0x5FF, 0x601, 0x67F, 0x6E0, 0x6FF, 0x701, 0x7FF)
-"""CAN-IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
+"""CAN IDs at both ends of the restricted ranges (CiA 301 7.3.5)."""
 WATCHED_NODE: Final = 0x05
-"""Node-ID of a simulated watched node; no other node on the bus may have it."""
+"""Node ID of a simulated watched node; no other node on the bus may have it."""
 
 
 class CanopenProbe:
@@ -85,11 +85,11 @@ class CanopenProbe:
     Parameters
     ----------
     port
-        The bus that the node is on.
+        The bus of the node.
     node
-        Its node-ID.
+        Node ID.
     od
-        Its object dictionary, from its EDS.
+        Object dictionary, from the EDS.
     eds
         Text of the EDS; empty if there is none.
     """
@@ -107,10 +107,10 @@ class CanopenProbe:
     # Around a run
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return `nothing` if the node answers no reading of its device type, None if it does.
+        """Return `nothing` if the node does not answer a read of its device type, None if it does.
 
-        A node that may be booting or stopped is asked again, with its boot-up message as an answer
-        too.
+        The request is repeated for a node that may be booting or stopped; its boot-up message counts as an
+        answer too.
         """
         if booting:
             self.drain()
@@ -123,7 +123,7 @@ class CanopenProbe:
         return "nothing"
 
     def prepare(self) -> None:
-        """Note the values that the node's own objects have."""
+        """Record the values of the application objects."""
         self.abandon_transfer()
         self._found = {
             (item.index, item.subindex): self.read(item.index, item.subindex)
@@ -132,19 +132,19 @@ class CanopenProbe:
         }
 
     def restore(self) -> None:
-        """Put the values back that `prepare` found, and have them stored.
+        """Restore the values that `prepare` recorded, and store them.
 
         Raises
         ------
         CaseFailed
-            The node does not take them.
+            The node does not accept them.
         """
         if not self._found:
             return
         self.reset_to_stored_values()
         changed = {item: value for item, value in self._found.items() if self.read(*item) != value}
         refused = {item: value for item, value in changed.items() if self.write(*item, value)}
-        for item, value in refused.items():  # one that another one bounds
+        for item, value in refused.items():  # one that is limited by another
             self.set(*item, value)
         if 0x1010 in self.od:
             self.set(0x1010, 1, b"save")
@@ -152,33 +152,33 @@ class CanopenProbe:
     # Around a case
 
     def begin(self, *, intrusive: bool) -> None:
-        """Start a case: an intrusive one begins with the communication reset."""
+        """Begin a case; an intrusive one begins with a communication reset."""
         if intrusive:
             self.reset_to_stored_values()
         else:
             self.abandon_transfer()
 
     def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same after any case)
-        """End a case: an intrusive one ends with the communication reset."""
+        """End a case; an intrusive one ends with a communication reset."""
         if intrusive:
             self.reset_to_stored_values()
 
     def recover(self) -> None:
-        """Nothing is left to pass: the next case begins by abandoning what was under way."""
+        """Do nothing: the next case begins by aborting any transfer."""
 
     # Frames
 
     def send(
-        self, identifier: int, data: bytes | str = b"", *, remote: bool = False, extended: bool = False
+        self, can_id: int, data: bytes | str = b"", *, remote: bool = False, extended: bool = False
     ) -> None:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
-        frame = CanFrame(identifier, payload, extended=extended, remote=remote)
+        frame = CanFrame(can_id, payload, extended=extended, remote=remote)
         self.log.append(f"{self.port.now():.4f} -> {_frame_text(frame)}")
         self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
-        """Return the next frame, None if none comes in time."""
+        """Return the next frame, or None if none arrives in time."""
         frame = self.port.receive(timeout_s)
         if frame is not None:
             self.log.append(f"{self.port.now():.4f} <- {_frame_text(frame)}")
@@ -193,12 +193,12 @@ class CanopenProbe:
 
     def wait_for(
         self,
-        identifiers: int | Collection[int],
+        can_ids: int | Collection[int],
         timeout_s: float | None = None,
         accept: Callable[[bytes], bool] = lambda _data: True,
     ) -> bytes | None:
-        """Return the data of the next accepted frame with one of the CAN IDs, else None."""
-        wanted = {identifiers} if isinstance(identifiers, int) else identifiers
+        """Return the data of the next accepted frame with one of the CAN IDs, or None."""
+        wanted = {can_ids} if isinstance(can_ids, int) else can_ids
         end = self.port.now() + (ANSWER_S if timeout_s is None else timeout_s)
         while (left := end - self.port.now()) >= 0:
             frame = self.receive(left)
@@ -210,28 +210,28 @@ class CanopenProbe:
 
     def expect(
         self,
-        identifier: int,
+        can_id: int,
         what: str,
         timeout_s: float | None = None,
         accept: Callable[[bytes], bool] = lambda _data: True,
     ) -> bytes:
-        """Return the data of the next such frame; fail if none comes."""
-        data = self.wait_for(identifier, timeout_s, accept)
+        """Return the data of the next such frame; fail if none arrives."""
+        data = self.wait_for(can_id, timeout_s, accept)
         if data is None:
-            raise CaseFailed(f"{what} with identifier 0x{identifier:03X}", "nothing")
+            raise CaseFailed(f"{what} with CAN ID 0x{can_id:03X}", "nothing")
         return data
 
-    def expect_silence(self, identifiers: int | Collection[int], what: str, for_s: float = 0.1) -> None:
-        """Fail if a frame with one of the identifiers comes within a time."""
-        data = self.wait_for(identifiers, for_s)
+    def expect_silence(self, can_ids: int | Collection[int], what: str, for_s: float = 0.1) -> None:
+        """Fail if a frame with one of the CAN IDs arrives within a time."""
+        data = self.wait_for(can_ids, for_s)
         if data is not None:
             raise CaseFailed(f"no {what}", data.hex(" ") or "an empty frame")
 
-    def count(self, identifier: int, for_s: float) -> list[tuple[float, bytes]]:
-        """Return time and data of the frames with an identifier within a time."""
+    def count(self, can_id: int, for_s: float) -> list[tuple[float, bytes]]:
+        """Return time and data of the frames with a CAN ID within a time."""
         end, found = self.port.now() + for_s, []
         while (left := end - self.port.now()) > 0:
-            data = self.wait_for(identifier, left)
+            data = self.wait_for(can_id, left)
             if data is None:
                 break
             found.append((self.port.now(), data))
@@ -240,7 +240,7 @@ class CanopenProbe:
     # SDO
 
     def ask(self, request: str | bytes, timeout_s: float | None = None) -> bytes | None:
-        """Send an SDO request, padded to 8 bytes; return the answer, None if none comes."""
+        """Send an SDO request, padded to 8 bytes; return the answer, or None."""
         data = bytes.fromhex(request) if isinstance(request, str) else request
         self.send_request(data)
         return self.wait_for(0x580 + self.node, timeout_s)
@@ -252,12 +252,12 @@ class CanopenProbe:
         self.send(0x600 + self.node, data.ljust(8, b"\0"))
 
     def abandon_transfer(self) -> None:
-        """Send an abort for the last transfer, so that no transfer continues into the next case."""
+        """Abort the last transfer, so that it does not continue into the next case."""
         self.send_request(b"\x80" + self._multiplexer + bytes.fromhex("00000008"))
         self.drain()
 
     def expect_answer(self, request: str | bytes, answer: str) -> bytes:
-        """Fail unless an SDO request gets this answer; `..` in it stands for any byte."""
+        """Fail unless an SDO request gets this answer, in which `..` matches any byte."""
         seen = self.ask(request)
         wanted = answer.replace(" ", "")
         if seen is None:
@@ -268,15 +268,12 @@ class CanopenProbe:
         return seen
 
     def expect_abort(self, request: str | bytes, *codes: int) -> None:
-        """Fail unless an SDO request is aborted with one of the codes, and for its own object."""
+        """Fail unless an SDO request is aborted with one of the codes and its own multiplexer."""
         data = bytes.fromhex(request) if isinstance(request, str) else request
         self.check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
 
     def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
-        """Fail unless an SDO answer is an abort with one of the codes.
-
-        An empty multiplexer matches any.
-        """
+        """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer matches any."""
         expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
         if seen is None:
             raise CaseFailed(expected, "nothing")
@@ -337,7 +334,7 @@ class CanopenProbe:
         code = self.write(index, subindex, value, size)
         if code not in codes:
             names = " or ".join(f"0x{wanted:08X}" for wanted in codes)
-            raise CaseFailed(f"abort {names}", f"abort 0x{code:08X}" if code else "the value taken")
+            raise CaseFailed(f"abort {names}", f"abort 0x{code:08X}" if code else "the value accepted")
 
     # States
 
@@ -346,7 +343,7 @@ class CanopenProbe:
         self.send(NMT, bytes([specifier, self.node if node is None else node]))
 
     def command_and_settle(self, specifier: int) -> None:
-        """Send an NMT command, and discard what the node sent before it obeyed."""
+        """Send an NMT command, and discard the frames that the node sent before it obeyed."""
         self.command(specifier)
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
@@ -362,9 +359,9 @@ class CanopenProbe:
         self.expect_boot_up()
 
     def reset_to_stored_values(self) -> None:
-        """Bring the node to PRE-OPERATIONAL with its stored values, if it boots.
+        """Bring the node to PRE-OPERATIONAL with its stored values.
 
-        Cases that do not test the boot-up continue without a boot-up message.
+        A missing boot-up message is ignored, because most cases do not test it.
         """
         self.abandon_transfer()
         self.command(RESET_COMMUNICATION)
@@ -374,17 +371,17 @@ class CanopenProbe:
         self.drain()
 
     def expect_boot_up(self) -> None:
-        """Fail unless the boot-up message comes, after heartbeats that were under way."""
+        """Fail unless the boot-up message arrives; heartbeats in transit are ignored."""
         self.expect(0x700 + self.node, "boot-up message 00", 5.0, _is_boot_up)
 
     def quiet(self) -> None:
-        """Switch off the heartbeat and all PDOs, so that the case alone causes traffic."""
+        """Switch off the heartbeat and all PDOs, so that only the case causes traffic."""
         if 0x1017 in self.od:
             self.set(0x1017, 0, 0, 2)
         for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):
             self.set(index, 1, self.number(index, 1) | PDO_OFF)
 
-    # What the dictionary has
+    # Content of the dictionary
 
     def variables(self) -> list[ODVariable]:
         """Return all variables of the EDS, without those that only describe data types."""
@@ -407,7 +404,7 @@ class CanopenProbe:
         raise CaseSkipped(f"the EDS has no {what}")
 
     def require(self, index: int) -> None:
-        """Skip the case if an object is not there."""
+        """Skip the case if an object is missing."""
         if index not in self.od:
             raise CaseSkipped(f"the EDS has no object {index:04X}h")
 
@@ -417,12 +414,12 @@ class CanopenProbe:
 
 
 def multiplexer(index: int, subindex: int) -> bytes:
-    """Return index and sub-index as an SDO carries them."""
+    """Return index and sub-index as encoded in an SDO."""
     return index.to_bytes(2, "little") + bytes([subindex])
 
 
 def size_of(item: ODVariable) -> int | None:
-    """Bytes of a variable, None if its length is free."""
+    """Return the size of a variable in bytes, or None if it varies."""
     packer = ODVariable.STRUCT_TYPES.get(item.data_type if item.data_type is not None else -1)
     return None if packer is None else packer.size
 
@@ -437,8 +434,8 @@ def _is_boot_up(data: bytes) -> bool:
 
 
 def _frame_text(frame: CanFrame) -> str:
-    identifier = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    return f"{identifier}#{'R' if frame.remote else frame.data.hex().upper()}"
+    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    return f"{can_id}#{'R' if frame.remote else frame.data.hex().upper()}"
 
 
 def _seen(data: bytes | None) -> str:

@@ -21,7 +21,7 @@ LONGEST_TIMEOUT_S: Final = 12.0
 
 
 def long_text(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
-    """Return a readable text for transfers of three segments, or of two full ones if there is no longer text."""
+    """Return a readable text that takes three segments, or two full ones if there is no longer text."""
     two_segments: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         if item.data_type in {datatypes.VISIBLE_STRING, datatypes.OCTET_STRING} and item.readable:
@@ -36,7 +36,7 @@ def long_text(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
 
 
 def writable_number(probe: CanopenProbe) -> ODVariable:
-    """Return a writable 16-bit number without side effects: the heartbeat time, else another."""
+    """Return a writable 16-bit number without side effects, preferably the heartbeat time."""
     if 0x1017 in probe.od:
         item = probe.od.get_variable(0x1017)
         if item is not None:
@@ -48,22 +48,22 @@ def writable_number(probe: CanopenProbe) -> ODVariable:
 
 
 def transfer(command: int, item: ODVariable, data: bytes = b"") -> bytes:
-    """Return the request that begins a transfer of an object."""
+    """Return the request that initiates a transfer of an object."""
     return bytes([command]) + multiplexer(item.index, item.subindex) + data
 
 
 def upload(item: ODVariable) -> bytes:
-    """Return the request that begins to read an object."""
+    """Return the request that initiates an upload of an object."""
     return transfer(0x40, item)
 
 
 def mux(item: ODVariable) -> str:
-    """Return an object's multiplexer as hexadecimal text."""
+    """Return the multiplexer of an object as hexadecimal text."""
     return multiplexer(item.index, item.subindex).hex()
 
 
 def expect_no_transfer(probe: CanopenProbe) -> None:
-    """Fail unless a segment request finds no transfer under way."""
+    """Fail if a segment request shows that a transfer is active."""
     probe.check_abort(probe.ask("60"), Abort.COMMAND)
 
 
@@ -155,7 +155,7 @@ def download_toggle(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@SDO.case("announced-high", "announced size above the object's", intrusive=True)
+@SDO.case("announced-high", "announced size larger than the object", intrusive=True)
 def announced_high(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     answer = probe.ask(transfer(0x21, item, b"\x03\0\0\0"))
@@ -164,7 +164,7 @@ def announced_high(probe: CanopenProbe) -> None:
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 
-@SDO.case("sent-high", "more bytes sent than the object takes", intrusive=True)
+@SDO.case("sent-high", "more bytes sent than the object has", intrusive=True)
 def sent_high(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     probe.ask(transfer(0x20, item))
@@ -172,7 +172,7 @@ def sent_high(probe: CanopenProbe) -> None:
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 
-@SDO.case("sent-low", "fewer bytes sent than the object takes", intrusive=True)
+@SDO.case("sent-low", "fewer bytes sent than the object has", intrusive=True)
 def sent_low(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
@@ -209,7 +209,7 @@ def wrong_segment(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@SDO.case("client-abort", "an abort of the client ends the transfer, unanswered")
+@SDO.case("client-abort", "an abort by the client ends the transfer and is not answered")
 def client_abort(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     probe.ask(upload(item))
@@ -218,7 +218,7 @@ def client_abort(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@SDO.case("new-request", "a new request replaces the transfer under way", "CiA 301 7.2.4.3.6")
+@SDO.case("new-request", "a new request replaces the active transfer", "CiA 301 7.2.4.3.6")
 def new_request(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     probe.ask(upload(item))
@@ -237,20 +237,20 @@ def time_out(probe: CanopenProbe) -> None:
     expect_no_transfer(probe)
 
 
-@SDO.case("wrong-length", "frames of other than 8 bytes are no SDO", "CiA 301 7.2.4.3.2")
+@SDO.case("wrong-length", "frames with a length other than 8 bytes are ignored", "CiA 301 7.2.4.3.2")
 def wrong_length(probe: CanopenProbe) -> None:
     for length in (0, 4, 7):
         probe.send(0x600 + probe.node, bytes.fromhex("40001000000000")[:length])
         probe.expect_silence(0x580 + probe.node, f"answer to {length} bytes")
 
 
-@SDO.case("extended", "frames with a 29-bit identifier are no SDO", "CiA 301 7.3.5")
+@SDO.case("extended", "frames with a 29-bit CAN ID are ignored", "CiA 301 7.3.5")
 def extended(probe: CanopenProbe) -> None:
     probe.send(0x600 + probe.node, "40 00 10 00 00 00 00 00", extended=True)
     probe.expect_silence(0x580 + probe.node, "answer to an extended frame")
 
 
-@SDO.case("remote", "remote frames are no SDO", "CiA 301 7.2.4")
+@SDO.case("remote", "remote frames are ignored", "CiA 301 7.2.4")
 def remote(probe: CanopenProbe) -> None:
     probe.send(0x600 + probe.node, remote=True)
     probe.expect_silence(0x580 + probe.node, "answer to a remote frame")
@@ -271,7 +271,7 @@ def stopped(probe: CanopenProbe) -> None:
         raise CaseFailed("no SDO answer in STOPPED", "an answer")
 
 
-@SDO.case("server-parameter", "1200h holds the identifiers in use", "CiA 301 7.5.2.33")
+@SDO.case("server-parameter", "1200h holds the CAN IDs in use", "CiA 301 7.5.2.33")
 def server_parameter(probe: CanopenProbe) -> None:
     probe.require(0x1200)
     check_equal(probe.number(0x1200, 1), 0x600 + probe.node, "1200h:01h")

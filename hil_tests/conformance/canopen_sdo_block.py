@@ -23,7 +23,7 @@ SEGMENT: Final = 7
 
 
 def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
-    """Return the longest readable text or domain of at most 200 kB, ideally many blocks."""
+    """Return the longest readable text or domain of at most 200 kB, preferably of many blocks."""
     best: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
         if item.readable and item.data_type in {
@@ -55,7 +55,7 @@ def _begin(
 
 
 def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
-    """Send a request and return the segments of the next block, after a check of their numbers."""
+    """Send a request, check the sequence numbers of the next block, and return its segments."""
     probe.send_request(request)
     found: list[bytes] = []
     while len(found) < block:
@@ -122,7 +122,7 @@ def upload_big(probe: CanopenProbe) -> None:
         raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
 
 
-@SDO_BLOCK.case("upload-repeat", "segments that were not confirmed are sent again", "CiA 301 7.2.4.3.14")
+@SDO_BLOCK.case("upload-repeat", "unconfirmed segments are sent again", "CiA 301 7.2.4.3.14")
 def upload_repeat(probe: CanopenProbe) -> None:
     item, value = long_text(probe)
     _begin(probe, item, 3)
@@ -194,7 +194,7 @@ def upload_time_out(probe: CanopenProbe) -> None:
 
 
 def _begin_download(probe: CanopenProbe, item: ODVariable, size: int | None, *, crc: bool = True) -> int:
-    """Begin a block download; return the block size that the node wants."""
+    """Initiate a block download; return the block size requested by the node."""
     command = 0xC0 | (0x04 if crc else 0) | (0 if size is None else 0x02)
     answer = probe.ask(transfer(command, item, (size or 0).to_bytes(4, "little")))
     if answer is None or answer[0] & 0xFB != 0xA0:
@@ -256,7 +256,7 @@ def download_zero(probe: CanopenProbe) -> None:
     probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")
 
 
-@SDO_BLOCK.case("download-length", "lengths of block downloads", intrusive=True)
+@SDO_BLOCK.case("download-length", "block downloads of wrong length", intrusive=True)
 def download_length(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     before = probe.read(item.index, item.subindex)
@@ -269,7 +269,9 @@ def download_length(probe: CanopenProbe) -> None:
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
-@SDO_BLOCK.case("download-announced", "announced size that differs from the object's", intrusive=True)
+@SDO_BLOCK.case(
+    "download-announced", "announced size that differs from the size of the object", intrusive=True
+)
 def download_announced(probe: CanopenProbe) -> None:
     item = writable_number(probe)
     answer = probe.ask(transfer(0xC2, item, b"\x03\0\0\0"))
@@ -279,7 +281,7 @@ def download_announced(probe: CanopenProbe) -> None:
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 
-@SDO_BLOCK.case("download-abort", "an abort of the client ends a block download", intrusive=True)
+@SDO_BLOCK.case("download-abort", "an abort by the client ends a block download", intrusive=True)
 def download_abort(probe: CanopenProbe) -> None:
     """80h is not a segment."""
     item = writable_number(probe)

@@ -27,7 +27,7 @@ def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
     probe.expect_boot_up()
 
 
-@STORE.case("ability", "1010h and 1011h describe their abilities", intrusive=False)
+@STORE.case("ability", "1010h and 1011h report their capabilities", intrusive=False)
 def ability(probe: CanopenProbe) -> None:
     for index in (0x1010, 0x1011):
         if index in probe.od:
@@ -36,7 +36,7 @@ def ability(probe: CanopenProbe) -> None:
 
 @STORE.case("signature", "wrong signatures are refused")
 def signature(probe: CanopenProbe) -> None:
-    """Abort 0800 002xh for anything but `save` and `load`, and for the two exchanged."""
+    """Abort 0800 002xh for anything but `save` and `load`, and if the two are exchanged."""
     probe.require(0x1010)
     for index, other in ((0x1010, b"load"), (0x1011, b"save")):
         if index in probe.od:
@@ -44,7 +44,7 @@ def signature(probe: CanopenProbe) -> None:
                 probe.expect_refusal(index, 1, value, 4, *SIGNATURE_REFUSED)
 
 
-@STORE.case("save", "stored parameters are back after a reset")
+@STORE.case("save", "stored parameters are restored by a reset")
 def save(probe: CanopenProbe) -> None:
     probe.require(0x1010)
     probe.set(0x1017, 0, 777, 2)
@@ -87,7 +87,7 @@ def groups(probe: CanopenProbe) -> None:
     _restore(probe)
 
 
-@STORE.case("pdo", "a stored PDO configuration is back after a reset")
+@STORE.case("pdo", "a stored PDO configuration is restored by a reset")
 def pdo(probe: CanopenProbe) -> None:
     probe.require(0x1010)
     probe.require(0x1800)
@@ -150,7 +150,7 @@ def global_(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@LSS.case("inquire", "inquire identity and node-ID", "CiA 305 inquire")
+@LSS.case("inquire", "inquire identity and node ID", "CiA 305 inquire")
 def inquire(probe: CanopenProbe) -> None:
     identity = _select(probe)
     for command, number in enumerate(identity, 0x5A):
@@ -160,7 +160,7 @@ def inquire(probe: CanopenProbe) -> None:
     _wait(probe)
 
 
-@LSS.case("waiting", "a waiting node obeys no configuration command")
+@LSS.case("waiting", "a waiting node ignores configuration commands")
 def waiting(probe: CanopenProbe) -> None:
     _select(probe)
     _wait(probe)
@@ -169,20 +169,17 @@ def waiting(probe: CanopenProbe) -> None:
         check(answer is None, f"no answer to {data}", answer)
 
 
-@LSS.case("node-id", "configure node-ID", "CiA 305 configure node-ID")
+@LSS.case("node-id", "configure node ID", "CiA 305 configure node-ID")
 def node_id(probe: CanopenProbe) -> None:
-    """Invalid node-IDs are refused.
-
-    A new one takes effect with the communication reset, and is then set back.
-    """
+    """Invalid node IDs are refused; a new one takes effect with a communication reset; restored afterwards."""
     _select(probe)
     for value in (0, 128, 254):
-        check_equal(_lss(probe, bytes([0x11, value])), b"\x11\x01" + bytes(6), f"answer to node-ID {value}")
+        check_equal(_lss(probe, bytes([0x11, value])), b"\x11\x01" + bytes(6), f"answer to node ID {value}")
     old = probe.node
     new = old % 127 + 1
-    check_equal(_lss(probe, bytes([0x11, new])), b"\x11\0" + bytes(6), f"answer to node-ID {new}")
+    check_equal(_lss(probe, bytes([0x11, new])), b"\x11\0" + bytes(6), f"answer to node ID {new}")
     _wait(probe)
-    check_equal(probe.number(0x1000) >= 0, 1, "SDO under the old node-ID before the reset")
+    check_equal(probe.number(0x1000) >= 0, 1, "SDO under the old node ID before the reset")
     probe.command(RESET_COMMUNICATION)
     try:
         probe.node = new
@@ -238,7 +235,7 @@ def identify(probe: CanopenProbe) -> None:
             check(answer is None, "no answer", answer)
 
 
-@LSS.case("configured", "a configured node takes no part in fastscan", "CiA 305 fastscan")
+@LSS.case("configured", "a configured node does not take part in Fastscan", "CiA 305 fastscan")
 def configured(probe: CanopenProbe) -> None:
     _select(probe)
     _wait(probe)
@@ -247,24 +244,24 @@ def configured(probe: CanopenProbe) -> None:
         check(answer is None, f"no answer to {data}", answer)
 
 
-@LSS.case("fastscan", "fastscan finds a node without a node-ID", "CiA 305 fastscan")
+@LSS.case("fastscan", "Fastscan finds a node without a node ID", "CiA 305 fastscan")
 def fastscan(probe: CanopenProbe) -> None:
-    """The node-ID is removed, the identity found bit by bit, the node-ID set back.
+    """The node ID is removed, the identity found bit by bit, and the node ID restored.
 
-    Only without other such nodes.
+    This requires that no other node is unconfigured.
     """
     identity = _select(probe)
     old = probe.node
-    check_equal(_lss(probe, "11 ff"), b"\x11\0" + bytes(6), "answer to node-ID 255")
+    check_equal(_lss(probe, "11 ff"), b"\x11\0" + bytes(6), "answer to node ID 255")
     _wait(probe)
     probe.command(RESET_COMMUNICATION)
     try:
         probe.drain()
-        check(probe.wait_for(0x700 + old, 0.2) is None, "no boot-up message without a node-ID", "one")
+        check(probe.wait_for(0x700 + old, 0.2) is None, "no boot-up message without a node ID", "one")
         check_equal(_lss(probe, "4c"), b"\x50" + bytes(7), "answer to identify non-configured")
         found = _scan(probe)
         check_equal(found, identity, "identity")
-        check_equal(_lss(probe, "5e"), b"\x5e\xff" + bytes(6), "answer to inquire node-ID")
+        check_equal(_lss(probe, "5e"), b"\x5e\xff" + bytes(6), "answer to inquire node ID")
     finally:
         probe.send(LSS_TO_SLAVE, b"\x04\x01" + bytes(6))
         _lss(probe, bytes([0x11, old]))
@@ -278,7 +275,7 @@ def _scan(probe: CanopenProbe) -> list[int]:
         return _lss(probe, data, 0.03) is not None
 
     if not ask(0, 0x80, 0, 0):
-        raise CaseFailed("an answer to the begin of fastscan", "nothing")
+        raise CaseFailed("an answer to the start of Fastscan", "nothing")
     identity = []
     for part in range(4):
         number = 0

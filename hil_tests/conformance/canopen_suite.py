@@ -42,11 +42,11 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
 
 
 def canopen_suite(icd: InterfaceDefinition) -> tuple[Case[CanopenProbe], ...]:
-    """Return the cases for a unit on CANopen: a CubeStar's rows are tested over its other links.
+    """Return the cases for a unit on CANopen; the rows of CubeStar are tested over its other links.
 
     Raises
     ------
     IcdError
-        The unit has no CANopen.
+        The unit has no CANopen node.
     """
     return CANOPEN_CASES if is_cubestar(icd) else (*CANOPEN_CASES, *canopen_unit_cases(icd))

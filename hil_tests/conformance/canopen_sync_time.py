@@ -26,15 +26,15 @@ def _quiet(probe: CanopenProbe) -> None:
 # SYNC
 
 
-@SYNC.case("identifier", "identifiers that SYNC may not have")
+@SYNC.case("identifier", "CAN IDs that SYNC must not have")
 def sync_identifier(probe: CanopenProbe) -> None:
     probe.require(0x1005)
-    for identifier in (*RESTRICTED_IDS, 0x2000_0080):
-        probe.expect_refusal(0x1005, 0, identifier, 4, *VALUE_ABORTS)
+    for can_id in (*RESTRICTED_IDS, 0x2000_0080):
+        probe.expect_refusal(0x1005, 0, can_id, 4, *VALUE_ABORTS)
     check_equal(probe.number(0x1005) & 0x7FF, 0x80, "1005h as before")
 
 
-@SYNC.case("counter-range", "values of the counter overflow", "CiA 301 7.5.2.22")
+@SYNC.case("counter-range", "invalid values of the counter overflow", "CiA 301 7.5.2.22")
 def sync_counter_range(probe: CanopenProbe) -> None:
     probe.require(0x1019)
     for value in (1, 241, 255):
@@ -43,7 +43,9 @@ def sync_counter_range(probe: CanopenProbe) -> None:
         probe.set(0x1019, 0, value, 1)
 
 
-@SYNC.case("counter-fixed", "counter overflow is fixed while a period is set", "CiA 301 7.5.2.22")
+@SYNC.case(
+    "counter-fixed", "the counter overflow cannot be changed while a period is set", "CiA 301 7.5.2.22"
+)
 def sync_counter_fixed(probe: CanopenProbe) -> None:
     probe.require(0x1019)
     probe.require(0x1006)
@@ -91,17 +93,17 @@ def sync_producer(probe: CanopenProbe) -> None:
 # TIME
 
 
-@TIME.case("identifier", "identifiers that TIME may not have")
+@TIME.case("identifier", "CAN IDs that TIME must not have")
 def time_identifier(probe: CanopenProbe) -> None:
     probe.require(0x1012)
     probe.set(0x1012, 0, 0x100)
-    for identifier in (*RESTRICTED_IDS, 0x2000_0100):
-        probe.expect_refusal(0x1012, 0, identifier, 4, *VALUE_ABORTS)
+    for can_id in (*RESTRICTED_IDS, 0x2000_0100):
+        probe.expect_refusal(0x1012, 0, can_id, 4, *VALUE_ABORTS)
     probe.set(0x1012, 0, 0x8000_0100)
     probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *VALUE_ABORTS)
 
 
-@TIME.case("malformed", "TIME of another length does no harm", "CiA 301 7.2.6.3")
+@TIME.case("malformed", "TIME of wrong length has no effect", "CiA 301 7.2.6.3")
 def time_malformed(probe: CanopenProbe) -> None:
     for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
         probe.send(0x100, data)

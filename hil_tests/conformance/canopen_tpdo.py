@@ -38,48 +38,48 @@ from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, che
 TPDO: Final = CaseArea[CanopenProbe]("canopen.tpdo", "CiA 301 7.5.2.37", intrusive=True)
 
 
-@TPDO.case("cyclic", "synchronous TPDO at every nth SYNC", "CiA 301 7.2.2.2")
+@TPDO.case("cyclic", "a synchronous TPDO is sent at every nth SYNC", "CiA 301 7.2.2.2")
 def cyclic(probe: CanopenProbe) -> None:
     index, item = first(probe, 0x1800), constant(probe)
     value = probe.read(item.index, item.subindex)
     for kind in (1, 3):
-        identifier = set_up(probe, index, [entry(item)], kind)
+        can_id = set_up(probe, index, [entry(item)], kind)
         probe.command(START)
         probe.drain()
         for number in range(1, 2 * kind + 1):
             send_sync(probe)
             if number % kind == 0:
-                check_equal(probe.expect(identifier, f"TPDO of type {kind}"), value, "data")
+                check_equal(probe.expect(can_id, f"TPDO of type {kind}"), value, "data")
             else:
-                probe.expect_silence(identifier, f"TPDO of type {kind} at SYNC {number}", 0.05)
+                probe.expect_silence(can_id, f"TPDO of type {kind} at SYNC {number}", 0.05)
         probe.command(PRE_OPERATIONAL)
 
 
-@TPDO.case("not-without-sync", "synchronous TPDO waits for SYNC", "CiA 301 7.2.2.2")
+@TPDO.case("not-without-sync", "a synchronous TPDO waits for SYNC", "CiA 301 7.2.2.2")
 def not_without_sync(probe: CanopenProbe) -> None:
-    identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], SYNCHRONOUS)
     probe.command(START)
-    probe.expect_silence(identifier, "TPDO without SYNC", 0.5)
+    probe.expect_silence(can_id, "TPDO without SYNC", 0.5)
 
 
-@TPDO.case("acyclic", "acyclic TPDO at the SYNC after an event only")
+@TPDO.case("acyclic", "an acyclic TPDO is sent only at the SYNC after an event")
 def acyclic(probe: CanopenProbe) -> None:
     item = writable(probe)
-    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(item)], 0)
     probe.command(START)
     send_sync(probe)
-    probe.wait_for(identifier, 0.1)
+    probe.wait_for(can_id, 0.1)
     probe.drain()
     send_sync(probe)
-    probe.expect_silence(identifier, "TPDO without an event")
+    probe.expect_silence(can_id, "TPDO without an event")
     before = probe.read(item.index, item.subindex)
     _, changed = limits(item, before)
     probe.set(item.index, item.subindex, changed)
-    probe.expect_silence(identifier, "TPDO before the SYNC", 0.05)
+    probe.expect_silence(can_id, "TPDO before the SYNC", 0.05)
     send_sync(probe)
-    check_equal(after_event(probe, identifier), changed, "data")
+    check_equal(after_event(probe, can_id), changed, "data")
     send_sync(probe)
-    probe.expect_silence(identifier, "TPDO without a second event")
+    probe.expect_silence(can_id, "TPDO without a second event")
     probe.set(item.index, item.subindex, before)
 
 
@@ -87,38 +87,38 @@ def acyclic(probe: CanopenProbe) -> None:
 def sync_start(probe: CanopenProbe) -> None:
     probe.require(0x1019)
     probe.set(0x1019, 0, 8, 1)
-    identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], 2, start=3)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], 2, start=3)
     probe.command(START)
     probe.drain()
     sent = []
     for counter in range(1, 9):
         send_sync(probe, counter)
-        if probe.wait_for(identifier, 0.05) is not None:
+        if probe.wait_for(can_id, 0.05) is not None:
             sent.append(counter)
     check_equal(sent, [3, 5, 7], "counters")
 
 
-@TPDO.case("event", "event-driven TPDO after a change", "CiA 301 7.2.2.2")
+@TPDO.case("event", "an event-driven TPDO is sent after a change", "CiA 301 7.2.2.2")
 def event(probe: CanopenProbe) -> None:
     item = writable(probe)
-    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT)
     before = probe.read(item.index, item.subindex)
     probe.command(START)
-    probe.wait_for(identifier, 0.1)
+    probe.wait_for(can_id, 0.1)
     send_sync(probe)
-    probe.expect_silence(identifier, "event-driven TPDO at SYNC")
+    probe.expect_silence(can_id, "event-driven TPDO at SYNC")
     _, changed = limits(item, before)
     probe.set(item.index, item.subindex, changed)
-    check_equal(after_event(probe, identifier), changed, "data")
+    check_equal(after_event(probe, can_id), changed, "data")
     probe.set(item.index, item.subindex, before)
 
 
 @TPDO.case("event-timer", "event timer")
 def event_timer(probe: CanopenProbe) -> None:
-    identifier = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(constant(probe))], EVENT, event_ms=50)
     probe.command(START)
-    probe.wait_for(identifier, 0.1)
-    found = probe.count(identifier, 0.33)
+    probe.wait_for(can_id, 0.1)
+    found = probe.count(can_id, 0.33)
     check(5 <= len(found) <= 8, "a TPDO every 50 ms", f"{len(found)} in 0.33 s")
     mean = (found[-1][0] - found[0][0]) / (len(found) - 1)
     check(0.04 <= mean <= 0.06, "period 0.05 s", f"{mean:.4f} s")
@@ -127,38 +127,38 @@ def event_timer(probe: CanopenProbe) -> None:
 @TPDO.case("inhibit", "inhibit time")
 def inhibit(probe: CanopenProbe) -> None:
     item = writable(probe)
-    identifier = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
+    can_id = set_up(probe, first(probe, 0x1800), [entry(item)], EVENT, inhibit=1000)
     before = probe.read(item.index, item.subindex)
     last, changed = limits(item, before)
     probe.command(START)
-    probe.wait_for(identifier, 0.3)
+    probe.wait_for(can_id, 0.3)
     probe.wait_for(NOBODY, 0.15)
     probe.set(item.index, item.subindex, changed)
-    check_equal(after_event(probe, identifier, 3.0), changed, "data")
+    check_equal(after_event(probe, can_id, 3.0), changed, "data")
     start = probe.port.now()
     probe.set(item.index, item.subindex, changed)
     probe.set(item.index, item.subindex, last)
-    check_equal(probe.expect(identifier, "second TPDO"), last, "data")
+    check_equal(probe.expect(can_id, "second TPDO"), last, "data")
     check(0.08 <= probe.port.now() - start <= 0.16, "0.1 s between them", f"{probe.port.now() - start:.3f} s")
     probe.set(item.index, item.subindex, before)
 
 
-@TPDO.case("gate", "TPDOs in OPERATIONAL only", "CiA 301 7.3.2.2.5")
+@TPDO.case("gate", "TPDOs are sent only in OPERATIONAL", "CiA 301 7.3.2.2.5")
 def gate(probe: CanopenProbe) -> None:
     index, item = first(probe, 0x1800), constant(probe)
     for kind, event_ms in ((SYNCHRONOUS, 0), (EVENT, 20)):
-        identifier = set_up(probe, index, [entry(item)], kind, event_ms=event_ms)
+        can_id = set_up(probe, index, [entry(item)], kind, event_ms=event_ms)
         for command in (PRE_OPERATIONAL, STOP):
             probe.command(START)
             send_sync(probe)
-            probe.expect(identifier, "TPDO in OPERATIONAL")
+            probe.expect(can_id, "TPDO in OPERATIONAL")
             probe.command_and_settle(command)
             send_sync(probe)
-            probe.expect_silence(identifier, f"TPDO after command {command}")
+            probe.expect_silence(can_id, f"TPDO after command {command}")
         probe.command(PRE_OPERATIONAL)
 
 
-@TPDO.case("mapping", "remapping while the node runs", "CiA 301 7.5.2.38")
+@TPDO.case("mapping", "remapping at run time", "CiA 301 7.5.2.38")
 def mapping(probe: CanopenProbe) -> None:
     index = first(probe, 0x1800)
     fitting = [
@@ -171,36 +171,36 @@ def mapping(probe: CanopenProbe) -> None:
     one, two = fitting[:2]
     values = {item.qualname: probe.read(item.index, item.subindex) for item in (one, two)}
     for pair in ((one, two), (two, one)):
-        identifier = set_up(probe, index, [entry(item) for item in pair], SYNCHRONOUS)
+        can_id = set_up(probe, index, [entry(item) for item in pair], SYNCHRONOUS)
         probe.command(START)
         send_sync(probe)
         data = b"".join(values[item.qualname] for item in pair)
-        check_equal(probe.expect(identifier, "TPDO"), data, "data")
+        check_equal(probe.expect(can_id, "TPDO"), data, "data")
         probe.command(PRE_OPERATIONAL)
 
 
-@TPDO.case("identifier", "a TPDO under another identifier")
-def identifier_moves(probe: CanopenProbe) -> None:
+@TPDO.case("identifier", "a TPDO with another CAN ID")
+def can_id_changes(probe: CanopenProbe) -> None:
     index, item = first(probe, 0x1800), constant(probe)
     old = set_up(probe, index, [entry(item)], SYNCHRONOUS)
-    new = set_up(probe, index, [entry(item)], SYNCHRONOUS, identifier=0x3F1)
+    new = set_up(probe, index, [entry(item)], SYNCHRONOUS, can_id=0x3F1)
     probe.command(START)
     send_sync(probe)
     probe.expect(new, "TPDO")
     send_sync(probe)
-    probe.expect_silence(old, "TPDO under its old identifier")
+    probe.expect_silence(old, "TPDO with its old CAN ID")
 
 
-@TPDO.case("forbidden", "identifiers that a TPDO may not have", "CiA 301 7.3.5")
+@TPDO.case("forbidden", "CAN IDs that a TPDO must not have", "CiA 301 7.3.5")
 def forbidden(probe: CanopenProbe) -> None:
     index = first(probe, 0x1800)
     set_up(probe, index, [entry(constant(probe))], SYNCHRONOUS)
     probe.set(index, 1, probe.number(index, 1) | PDO_OFF)
-    for identifier in (*RESTRICTED_IDS, 0x2000_0181):
-        probe.expect_refusal(index, 1, NO_RTR | identifier, 4, *VALUE_ABORTS)
+    for can_id in (*RESTRICTED_IDS, 0x2000_0181):
+        probe.expect_refusal(index, 1, NO_RTR | can_id, 4, *VALUE_ABORTS)
 
 
-@TPDO.case("fixed", "settings of a TPDO in use that cannot be changed")
+@TPDO.case("fixed", "settings that cannot be changed while a TPDO is enabled")
 def fixed(probe: CanopenProbe) -> None:
     index, item = first(probe, 0x1800), constant(probe)
     set_up(probe, index, [entry(item)], SYNCHRONOUS)
@@ -227,7 +227,7 @@ def types(probe: CanopenProbe) -> None:
         probe.set(index, 2, value, 1)
 
 
-@TPDO.case("reserved", "sub-index 4 of a TPDO is not served", intrusive=False)
+@TPDO.case("reserved", "sub-index 4 of a TPDO does not exist", intrusive=False)
 def reserved(probe: CanopenProbe) -> None:
     index = first(probe, 0x1800)
     if probe.od.get_variable(index, 4) is not None:

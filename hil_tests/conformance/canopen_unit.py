@@ -27,13 +27,13 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import SCALAR_SIZES, Value
 
 PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
-"""CAN IDs of the first four RPDOs and TPDOs, to which the node-ID is added (CiA 301 7.3.5)."""
+"""CAN IDs of the first four RPDOs and TPDOs, to which the node ID is added (CiA 301 7.3.5)."""
 BOOT_S: Final = 15.0
-"""Longest time from a reset to the end of booting."""
+"""Maximum time from a reset to the end of booting."""
 EXPEDITED: Final = 4
-"""Most bytes that an expedited SDO carries."""
+"""Maximum number of bytes in an expedited SDO."""
 CHANGING: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
-"""How the names of quantities begin that change with each exposure."""
+"""Prefixes of the names of quantities that change with each exposure."""
 CLAUSE: Final = "[canopen]"
 
 Run = Callable[[CanopenProbe], None]
@@ -41,18 +41,18 @@ Run = Callable[[CanopenProbe], None]
 
 @dataclass(frozen=True)
 class Entry:
-    """An entry of the object dictionary, as `[canopen]` places it.
+    """An entry of the object dictionary, as defined in `[canopen]`.
 
     Attributes
     ----------
     name
-        As PDOs refer to it: `INDEX.NAME`, or `INDEX`.
+        Name used by PDOs: `INDEX.NAME`, or `INDEX`.
     size
-        Bytes; 0 where the definition fixes none, as of a text.
+        Size in bytes; 0 if it varies, as for a text.
     row, slot
-        Telemetry that it reads, and which part of it.
+        Telemetry row, and the slot that the entry reads.
     command, part
-        Telecommand that a write executes, and which part of its data is written; all of it if None.
+        Telecommand that a write executes, and the part of its data that is written; None: all of it.
     """
 
     index: int
@@ -115,7 +115,7 @@ def _entry(
 
 
 def _is_text(command: Row) -> bool:
-    """Return whether a telecommand has a text, which is written as long as it is."""
+    """Return whether a telecommand has a text, which is written without padding."""
     return [field.kind for field in command.fields] == ["text"]
 
 
@@ -124,7 +124,7 @@ def _bytes_of(type_: str) -> int:
 
 
 def canopen_unit_cases(icd: InterfaceDefinition) -> list[Case[CanopenProbe]]:
-    """Make the cases of a unit with CANopen."""
+    """Return the cases for a unit with CANopen."""
     layout = read_layout(icd)
     found = list(entries(icd, layout))
     return [*_rows(icd, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
@@ -146,7 +146,7 @@ def _turned(slot: Slot | None, data: bytes) -> bytes:
 
 
 def _read(probe: CanopenProbe, entry: Entry) -> bytes:
-    """Read an entry, which must have its size; return it in the order of its row."""
+    """Read an entry and check its size; return it in the byte order of its row."""
     data = probe.read(entry.index, entry.subindex)
     if entry.slot is not None and not entry.size:
         return data.ljust(entry.slot.size, b"\0")
@@ -155,7 +155,7 @@ def _read(probe: CanopenProbe, entry: Entry) -> bytes:
 
 
 def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
-    """Read the entries of a row twice or more, until no new sample has come in between."""
+    """Read the entries of a row repeatedly, until no new sample has come in between."""
     seen = [b"", row.encode()]
     for _ in range(10):
         data = bytearray(row.encode())
@@ -169,12 +169,12 @@ def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
 
 
 def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Value]) -> None:
-    """Write an entry that executes a telecommand, which must be taken."""
+    """Write an entry that executes a telecommand, which must be accepted."""
     probe.set(entry.index, entry.subindex, _written(entry, command, command.encode(values)))
 
 
 def _written(entry: Entry, command: Row, data: bytes) -> bytes:
-    """Return the bytes to write to an entry to execute a telecommand with this data."""
+    """Return the bytes to be written to an entry to execute a telecommand with this data."""
     part = command.slots[0] if entry.part is None and len(command.slots) == 1 else entry.part
     if not data:
         return b"\x01"
@@ -185,7 +185,7 @@ def _written(entry: Entry, command: Row, data: bytes) -> bytes:
 
 @contextmanager
 def _seeing(probe: CanopenProbe, found: list[Entry]) -> Iterator[None]:
-    """Have the unit look for stars, if an entry starts that; the mode is put back."""
+    """Have the unit identify stars, if an entry can start this; restore the mode afterwards."""
     for entry in found:
         command, field = entry.command, _argument(entry, "mode")
         if (
@@ -216,11 +216,11 @@ def _rows(icd: InterfaceDefinition, found: list[Entry]) -> Iterator[Case[Canopen
     for row in icd.telemetry.values():
         if not any(entry.row is row for entry in found):
             continue
-        title = f"the entries of {row.name} have its sizes and values within its limits"
+        title = f"the entries of {row.name} have the right sizes, and values within the limits"
         yield _case("rows", row.name, title, _values(row, found), clause_of_row(row), safe=True)
         bound = {field.value: name for name, field in row.named_fields.items() if field.value}
         if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
-            title = f"{row.name} has a quaternion of length 1 when it is valid"
+            title = f"{row.name} has a quaternion of length 1 if it is valid"
             yield _case("attitude", row.name, title, _unit_length(row, bound, found), clause_of_row(row))
 
 
@@ -261,7 +261,7 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             mode = next((item for item in found if item.row is not None and _reports(item, "mode")), None)
             run = _restarts(entry, command, mode)
         elif entry.row is not None and entry.slot is not None:
-            title = f"{entry.name}h reports each value of {command.name} that was written"
+            title = f"{entry.name}h reports each written value of {command.name}"
             run = _reported(entry, command)
         elif command.action in (None, "nothing"):
             title, run = f"{command.name} is accepted", _accepted(entry, command)
@@ -275,7 +275,7 @@ def _accepted(entry: Entry, command: Row) -> Run:
 
 
 def _restarts(entry: Entry, command: Row, mode: Entry | None) -> Run:
-    """Have the unit restart, and wait until the mode that an entry reports is no longer the boot mode."""
+    """Restart the unit, and wait until the mode reported by an entry is no longer the boot mode."""
 
     def run(probe: CanopenProbe) -> None:
         probe.drain()
@@ -290,25 +290,25 @@ def _restarts(entry: Entry, command: Row, mode: Entry | None) -> Run:
 
 
 def _value(probe: CanopenProbe, entry: Entry) -> Value | None:
-    """Return the value of the first field that an entry reads."""
+    """Return the value of the first telemetry field of an entry."""
     if entry.row is None:
         return None
     return entry.row.decode(_read_row(probe, entry.row, [entry]))[_fields(entry)[0].name]
 
 
 def _fields(entry: Entry) -> list[Field]:
-    """Return the fields of telemetry that an entry reads."""
+    """Return the telemetry fields of an entry."""
     fields = () if entry.row is None else entry.row.named_fields.values()
     return [field for field in fields if entry.slot is not None and field.slot.index == entry.slot.index]
 
 
 def _reports(entry: Entry, *quantities: str) -> bool:
-    """Return whether an entry reads a quantity whose name begins like this."""
+    """Return whether an entry reads a quantity whose name has one of these prefixes."""
     return any(field.value is not None and field.value.startswith(quantities) for field in _fields(entry))
 
 
 def _reported(entry: Entry, command: Row) -> Run:
-    """Write all values of an enumeration, else both limits; the previous value is put back."""
+    """Write all values of an enumeration, or else both limits; restore the previous value."""
     (name, field), *_ = command.named_fields.items()
     values: list[Value]
     if _is_text(command):
@@ -330,12 +330,12 @@ def _reported(entry: Entry, command: Row) -> Run:
 
 
 def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
-    """Make the cases of records whose entries set one telecommand together."""
+    """Yield the cases for records whose entries together set one telecommand."""
     for command in {
         entry.command.name: entry.command for entry in found if entry.command and entry.part
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
-        title = f"each entry of {command.name} keeps the value written to it when others are written"
+        title = f"each entry of {command.name} keeps its written value when other entries are written"
         yield _case("records", command.name, title, _kept(command, members), clause_of_row(command))
 
 
@@ -355,7 +355,7 @@ def _kept(command: Row, members: list[Entry]) -> Run:
 
 
 def _limit(command: Row, entry: Entry, end: int) -> bytes:
-    """Return the bytes of the lowest (0) or highest (1) values of the fields of an entry."""
+    """Encode the lowest (0) or highest (1) values of the fields of an entry."""
     values = dict(command.example())
     for name, field in command.named_fields.items():
         if field.kind in ("integer", "float", "bits") and entry.part is not None:
@@ -397,12 +397,12 @@ def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProb
         for number, model in enumerate(models):
             mapped = [by_name[name.lower()] for name in model.objects]
             index, label = first + number, f"{kind[:4].upper()} {number + 1} ({model.name})"
-            title = f"{label} has the CAN ID, transmission, timers and mapping of the definition"
+            title = f"{label} has the CAN ID, transmission type, timers and mapping of the definition"
             yield _case(kind, f"{number + 1}.default", title, _default(index, model, mapped), safe=True)
             if not mapped:
                 continue
             if first == 0x1800:
-                title = f"{label} carries what its objects read"
+                title = f"{label} carries the values of its objects"
                 yield _case(kind, f"{number + 1}.data", title, _carries(index, mapped))
             if (
                 first == 0x1800
@@ -410,7 +410,7 @@ def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProb
                 and not model.event_ms
                 and any(_reports(entry, *CHANGING) for entry in mapped)
             ):
-                title = f"{label} is sent as frames are taken"
+                title = f"{label} is sent when frames are taken"
                 yield _case(kind, f"{number + 1}.frames", title, _sent_with_frames(index, model, found))
             if first == 0x1400 and model.enabled:
                 yield from _clock(index, model, mapped, found)
@@ -444,9 +444,9 @@ def _default(index: int, model: PdoModel, mapped: list[Entry]) -> Run:
 def _carries(index: int, mapped: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         probe.quiet()
-        identifier = probe.number(index, 1) & 0x7FF
+        can_id = probe.number(index, 1) & 0x7FF
         probe.set(index, 2, SYNCHRONOUS, 1)
-        probe.set(index, 1, NO_RTR | identifier)
+        probe.set(index, 1, NO_RTR | can_id)
         probe.command(START)
 
         def read() -> bytes:
@@ -456,7 +456,7 @@ def _carries(index: int, mapped: list[Entry]) -> Run:
             before = read()
             probe.drain()
             send_sync(probe)
-            data, after = probe.expect(identifier, "TPDO after a SYNC"), read()
+            data, after = probe.expect(can_id, "TPDO after a SYNC"), read()
             if before == after:
                 break
         check_equal(data, after, "data")
@@ -468,8 +468,8 @@ def _sent_with_frames(index: int, model: PdoModel, found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         with _seeing(probe, found):
             probe.command(START)
-            identifier = _can_id(probe, index, model)
-            times = [probe.expect(identifier, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
+            can_id = _can_id(probe, index, model)
+            times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
         probe.command(PRE_OPERATIONAL)
         check_equal(len(times), 3, "TPDOs")
 
@@ -479,7 +479,7 @@ def _sent_with_frames(index: int, model: PdoModel, found: list[Entry]) -> Run:
 def _clock(
     index: int, model: PdoModel, mapped: list[Entry], found: list[Entry]
 ) -> Iterator[Case[CanopenProbe]]:
-    """Make the case of an RPDO that sets the clock, if an entry reads it."""
+    """Yield the case for an RPDO that sets the clock, if an entry reads it."""
     clock = next((item for item in found if _reports(item, "clock.seconds")), None)
     (entry, *others) = mapped
     seconds = _argument(entry, "seconds")

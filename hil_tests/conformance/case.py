@@ -11,7 +11,7 @@ ProbeType = TypeVar("ProbeType")
 
 
 class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
-    """The device behaved differently from the rule.
+    """The device violated the rule.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error 
 
 
 class CaseSkipped(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
-    """The device does not have what the case is about; the text says what."""
+    """The device lacks a feature that the case needs; the text names it."""
 
 
 @dataclass(frozen=True)
@@ -38,15 +38,15 @@ class Case(Generic[ProbeType]):
     id
         Dotted name, unique: link, area, check.
     area
-        Part of the protocol that it belongs to.
+        Area of the protocol.
     title
-        What is checked, one line.
+        The checked behaviour, one line.
     clause
-        Where that is written: clause of a standard, or the source that confirms it.
+        Clause of a standard, or the source that confirms the behaviour.
     run
-        Does it with a probe; raises `CaseFailed` or `CaseSkipped`.
+        Performs the check with a probe; raises `CaseFailed` or `CaseSkipped`.
     intrusive
-        Changes settings or state of the device, so that it is not for a unit in use.
+        Whether the case changes settings or state of the device, so that it is not for a unit in use.
     """
 
     id: str
@@ -64,9 +64,9 @@ class CaseArea(Generic[ProbeType]):
     Attributes
     ----------
     name
-        Dotted name, with which the IDs of the cases begin.
+        Dotted name, the prefix of the case IDs.
     clause, intrusive
-        Defaults of the cases.
+        Defaults for the cases.
     cases
         Cases in the order of their declaration.
     """
@@ -98,13 +98,13 @@ class CaseArea(Generic[ProbeType]):
 
 
 def cases_of(*modules: ModuleType) -> list[Case[Any]]:
-    """Return the cases of the areas that some modules define, in their order."""
+    """Return the cases of all areas defined in modules, in order."""
     areas = (item for module in modules for item in vars(module).values() if isinstance(item, CaseArea))
     return [case for area in areas for case in area.cases]
 
 
 def rule(number: int) -> str:
-    """Return the clause of a rule of this product, where no standard or public source applies."""
+    """Return the clause for a rule of this product (docs/rules.md)."""
     return f"R{number}, docs/rules.md"
 
 

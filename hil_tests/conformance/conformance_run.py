@@ -59,7 +59,7 @@ class ConformanceRequest:
     speed: float = 1.0
     times: ProbeTimes = field(default_factory=ProbeTimes)
     view: str | None = None
-    """Address of the console that shows the outcomes; `auto` with `start`: the started emulator's."""
+    """Address of a console that shows the outcomes; `auto` with `start`: that of the started emulator."""
 
 
 def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
@@ -91,7 +91,7 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
 
 @dataclass(frozen=True)
 class ConformanceResult:
-    """What a run found, and the signal that interrupted it if one did."""
+    """Outcomes of a run, and the signal that interrupted it, if any."""
 
     outcomes: list[Outcome]
     interruption: Interrupted | None = None
@@ -102,7 +102,7 @@ def run_conformance(
 ) -> ConformanceResult:
     """Run the cases on the requested links.
 
-    Those that an interruption leaves are marked as not run.
+    After an interruption, the remaining cases are marked as not run.
 
     Raises
     ------
@@ -146,7 +146,7 @@ def run_conformance(
 def _shown_on_console(
     address: str, unit: str, planned: int, stack: ExitStack, record: Callable[[Outcome], None]
 ) -> Callable[[Outcome], None]:
-    """Return what shows an outcome on the console too."""
+    """Return a function that shows an outcome on the console too."""
     feed = stack.enter_context(
         RunFeed(address, kind="conformance", title="Conformance", unit=unit.strip(), planned=planned)
     )
@@ -176,13 +176,13 @@ def _run_on_links(
     can: str | None,
     on_outcome: Callable[[Outcome], None],
 ) -> None:
-    """Run the cases of one link after the other's."""
+    """Run the cases of each link in turn."""
     with ExitStack() as stack:
         mine = [item for item in cases if item.id.startswith("serial.")]
         if mine and serial is not None:
             port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD, request.speed))
             baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
-            if baud is not None:  # the line itself keeps its pace
+            if baud is not None:  # the bit rate of the line does not change
                 baud = round(baud / request.speed)
             run_cases(_serial_probe(request, icd, port, baud), mine, on_outcome, port=serial)
         mine = [item for item in cases if item.id.startswith("can.")]
@@ -211,14 +211,9 @@ def _serial_probe(
 
 
 def _fallen(error: EmulatorProcessError) -> Outcome:
-    """Return the outcome that says that the emulator did not last.
-
-    What was found until then stays.
-    """
-    case = case_of_run(
-        "emulator.end", "the emulator lasts until it is ended, and ends in good order", "starhil run"
-    )
-    return Outcome.of(case, Verdict(FAILED, "an end with status 0, when it is asked for", str(error)))
+    """Return the outcome for an emulator that ended early; earlier outcomes are kept."""
+    case = case_of_run("emulator.end", "the emulator runs until it is ended, and ends cleanly", "starhil run")
+    return Outcome.of(case, Verdict(FAILED, "exit with status 0 on request", str(error)))
 
 
 def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
@@ -257,7 +252,7 @@ def _run_canopen(
     cases: Sequence[Case[Any]],
     on_outcome: Callable[[Outcome], None],
 ) -> None:
-    """Run the CANopen cases with the EDS of the request, else the product's."""
+    """Run the CANopen cases with the requested EDS, or else the product's."""
     import canopen
     from canopen.objectdictionary import import_od
 

@@ -25,7 +25,7 @@ BURSTS: Final = CaseArea[LinkProbe](
 
 
 def _save(probe: LinkProbe) -> None:
-    """Have an image of 64 x 64 pixels stored."""
+    """Store an image of 64 x 64 pixels."""
     probe.standby()
     probe.command("save_image", camera="star", image_size="size_64")
     probe.wait_for("image_status", {"percent": 100, "status": "ok"}, probe.times.image_s)
@@ -44,7 +44,7 @@ def other_camera(probe: LinkProbe) -> None:
         probe.expect_refused("save_image", INVALID_PARAMETER, camera=camera, image_size="size_64")
 
 
-@IMAGES.case("frames", "an image comes in frames of 128 bytes, each with its number and checksum")
+@IMAGES.case("frames", "an image is sent in frames of 128 bytes, each with number and checksum")
 def frames(probe: LinkProbe) -> None:
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
@@ -68,7 +68,7 @@ def beyond(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("image_frame_info")["frame"], 31, "loaded frame")
 
 
-@IMAGES.case("jump", "frames may be requested in any order, and again")
+@IMAGES.case("jump", "frames may be requested in any order and repeatedly")
 def jump(probe: LinkProbe) -> None:
     _save(probe)
     probe.command("init_image_download", image_size="size_64")
@@ -93,11 +93,11 @@ def _burst(probe: LinkProbe, count: int, *, everything: bool) -> list[tuple[int,
         if answer.kind != "burst" or len(answer.data) != PACKET + 2:
             raise CaseFailed(f"{count} packets of 22 bytes", f"{len(packets)} of them, then {answer}")
         packets.append((int.from_bytes(answer.data[:2], "little"), answer.data[2:]))
-    probe.expect_silence("all packets have come")
+    probe.expect_silence("all packets have arrived")
     return packets
 
 
-@BURSTS.case("block", "a block comes in numbered packets of 20 bytes with the right checksum")
+@BURSTS.case("block", "a block is sent in numbered packets of 20 bytes with the right checksum")
 def block(probe: LinkProbe) -> None:
     _save(probe)
     _load(probe, 0, 990)
@@ -109,7 +109,7 @@ def block(probe: LinkProbe) -> None:
     check(bmp_file_size(data) > EDGE * EDGE, "a file larger than its pixels", bmp_file_size(data))
 
 
-@BURSTS.case("holes", "with a hole map only missing packets are sent")
+@BURSTS.case("holes", "with a hole map, only missing packets are sent")
 def holes(probe: LinkProbe) -> None:
     _save(probe)
     _load(probe, 0, 1000)

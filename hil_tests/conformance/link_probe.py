@@ -1,7 +1,7 @@
 """The tester's side of a serial or CAN link: requests, strict decoding of answers, and a log.
 
-The framing is an independent implementation of the public description; it shares no code with the
-codecs of the product.
+The framing is implemented independently from the public description and shares no code with the codecs of the
+product.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ FIRST_TELEMETRY: Final = 128
 BURST_ID: Final = 119
 
 LONG_PAUSE_S: Final = 0.8
-"""Longer than the device waits for the rest of a message (0.5 s)."""
+"""Longer than the device waits for the end of a message (0.5 s)."""
 RECOVERY_S: Final = 1.0
-"""Pause after a failed case, for time-outs of the device to pass."""
+"""Pause after a failed case, in which time-outs of the device pass."""
 
 SHOWN_BYTES: Final = 48
-"""Bytes on a serial line that a line of the log shows."""
+"""Number of serial bytes shown in a line of the log."""
 
 LIVELY: Final = ("identification", "device_status", "acknowledge")
-"""Rows of which a unit answers one at least."""
+"""Rows at least one of which every unit answers."""
 
 AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malformed", "none"]
 
@@ -50,22 +50,21 @@ class Answer:
     Attributes
     ----------
     kind
-        Kind of answer: `none` for no answer within the time-out, `malformed` for an undecodable
-        one.
+        Kind of answer: `none` if there was no answer in time, `malformed` if it could not be decoded.
     code
         Error code of a refusal.
     data
-        Telemetry, or what was malformed.
-    identifier
-        Identifier in the answer; None where the dialect carries none.
+        Telemetry, or the malformed bytes.
+    row_id
+        Row ID in the answer; None if the dialect has none.
     other
-        CAN address that it was sent to; 0 on serial.
+        CAN address to which it was sent; 0 on serial.
     """
 
     kind: AnswerKind
     code: int = 0
     data: bytes = b""
-    identifier: int | None = None
+    row_id: int | None = None
     other: int = 0
 
     def __str__(self) -> str:
@@ -85,13 +84,13 @@ class ProbeTimes:
     Attributes
     ----------
     answer_s
-        Longest time for an answer.
+        Maximum time for an answer.
     quiet_s
         Silence that counts as no answer.
     boot_s
-        Longest time from a reset to the first answer in standby.
+        Maximum time from a reset to the first answer in standby.
     image_s
-        Longest time for an image to be taken.
+        Maximum time for taking an image.
     """
 
     answer_s: float = 1.0
@@ -101,7 +100,7 @@ class ProbeTimes:
 
 
 class PortProbe(ABC):
-    """A port, its clock, and waiting on it, for any kind of traffic."""
+    """A port with its clock, for any kind of traffic."""
 
     link: str
     """`serial` or `can`."""
@@ -119,34 +118,34 @@ class PortProbe(ABC):
 
     @abstractmethod
     def _receive(self, timeout_s: float) -> bool:
-        """Keep what arrives next; return whether anything came in time."""
+        """Store the next input; return whether anything arrived in time."""
 
     def now(self) -> float:
         """Time of the port, s."""
         return self.port.now()
 
     def sleep(self, seconds: float) -> None:
-        """Let time pass; received data are kept."""
+        """Wait; received data are kept."""
         end = self.now() + seconds
         while (left := end - self.now()) > 0:
             self._receive(left)
 
     @abstractmethod
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
-        """Fail the case if anything comes within a time."""
+        """Fail the case if anything arrives within a time."""
 
     @abstractmethod
     def expect_alive(self) -> None:
-        """Fail the case unless the next good request is answered."""
+        """Fail the case unless the next valid request is answered."""
 
     # --- around a case ---
 
     def begin(self, *, intrusive: bool) -> None:  # noqa: ARG002 (the same for all cases)
-        """Start a case with an empty line."""
+        """Begin a case without unread input."""
         self.drain()
 
     def end(self, *, intrusive: bool, passed: bool) -> None:  # noqa: ARG002 (the same for all cases)
-        """End a case: nothing more may come."""
+        """End a case; nothing more may arrive."""
         if passed:
             self.expect_silence("the case is over", self.times.quiet_s / 4)
 
@@ -156,7 +155,7 @@ class PortProbe(ABC):
 
 
 class SerialWire(PortProbe):
-    """Sends bytes on a serial line, and logs what passes both ways."""
+    """Sends bytes on a serial line, and logs both directions."""
 
     link = "serial"
 
@@ -171,27 +170,27 @@ class SerialWire(PortProbe):
 
 
 class LinkProbe(PortProbe):
-    """Talks to one CubeStar over one link."""
+    """Talks to CubeStar over a link."""
 
     _found: UnitSettings | None = None
 
     # --- the link ---
 
     @abstractmethod
-    def post(self, identifier: int, data: bytes = b"") -> None:
+    def post(self, row_id: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
 
     @abstractmethod
     def send_text(self, text: str) -> None:
-        """Send hexadecimal bytes, or a CAN frame in which HH and DD stand for host and device."""
+        """Send hexadecimal bytes, or a CAN frame in which HH and DD are the addresses of host and device."""
 
     @abstractmethod
     def expecting(self, *answers: str) -> None:
-        """Note the answers to raw traffic, in order, before it is sent."""
+        """Record the rows that raw traffic is going to request, in order."""
 
     @abstractmethod
     def expect_exactly(self, answer: str) -> None:
-        """Take the next answer to raw traffic: the number of a row on serial, the pattern of a frame on CAN."""
+        """Take the next answer to raw traffic, given by row ID on serial and as a frame pattern on CAN."""
 
     @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
@@ -203,77 +202,74 @@ class LinkProbe(PortProbe):
 
     @abstractmethod
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that come within a time."""
+        """Return the messages of unsolicited telemetry that arrive within a time."""
 
     # --- requests ---
 
-    def ask(self, identifier: int, data: bytes = b"") -> Answer:
+    def ask(self, row_id: int, data: bytes = b"") -> Answer:
         """Send a request and return the answer to it."""
-        self.post(identifier, data)
+        self.post(row_id, data)
         return self.next_answer()
 
     def telemetry(self, name: str) -> dict[str, Value]:
-        """Read a row by name; anything but its telemetry fails the case."""
+        """Read a row by name; any other answer fails the case."""
         row = self.icd.telemetry[name]
         return row.decode(self.data_of(row))
 
     def data_of(self, row: Row) -> bytes:
-        """Read the bytes of a row; anything but its telemetry fails the case."""
+        """Read the bytes of a row; any other answer fails the case."""
         self.post(row.id)
         return self.expect_telemetry(row.id)
 
     def command(self, name: str, **values: Value) -> None:
-        """Send a telecommand by name; anything but its acknowledge fails the case."""
+        """Send a telecommand by name; any answer but an acknowledge fails the case."""
         row = self.icd.telecommands[name]
         self.expect_ack(row.id, row.encode(values))
 
-    def expect_ack(self, identifier: int, data: bytes = b"") -> None:
+    def expect_ack(self, row_id: int, data: bytes = b"") -> None:
         """Send a telecommand that must be accepted."""
-        answer = self.ask(identifier, data)
+        answer = self.ask(row_id, data)
         if answer.kind != "ack":
-            raise CaseFailed(f"acknowledge of telecommand {self._name(identifier)}", str(answer))
+            raise CaseFailed(f"acknowledge of telecommand {self._name(row_id)}", str(answer))
 
-    def expect_refusal(self, identifier: int, data: bytes, code: int) -> None:
+    def expect_refusal(self, row_id: int, data: bytes, code: int) -> None:
         """Send a request that must be refused with a code."""
-        answer = self.ask(identifier, data)
+        answer = self.ask(row_id, data)
         if answer.kind != "nack" or answer.code != code:
-            raise CaseFailed(f"refusal of {self._name(identifier)} with code {code}", str(answer))
+            raise CaseFailed(f"refusal of {self._name(row_id)} with code {code}", str(answer))
 
     def expect_refused(self, name: str, code: int, **values: Value) -> None:
         """Send a telecommand by name, which must be refused with a code."""
         row = self.icd.telecommands[name]
         self.expect_refusal(row.id, row.encode(values), code)
 
-    def expect_telemetry(self, identifier: int, timeout_s: float | None = None) -> bytes:
+    def expect_telemetry(self, row_id: int, timeout_s: float | None = None) -> bytes:
         """Take the next answer, which must be the telemetry of a row, and return its data."""
-        row = self.icd.telemetry_by_id[identifier]
+        row = self.icd.telemetry_by_id[row_id]
         answer = self.next_answer(timeout_s)
-        right_id = answer.identifier in (None, identifier)
+        right_id = answer.row_id in (None, row_id)
         if answer.kind != "telemetry" or len(answer.data) != row.size or not right_id:
-            raise CaseFailed(f"telemetry {self._name(identifier)} of {row.size} bytes", str(answer))
+            raise CaseFailed(f"telemetry {self._name(row_id)} of {row.size} bytes", str(answer))
         return answer.data
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
-        """Fail the case if anything comes within a time."""
+        """Fail the case if anything arrives within a time."""
         answer = self.unexpected_answer(self.times.quiet_s if seconds is None else seconds)
         if answer.kind != "none":
             raise CaseFailed(f"nothing ({why})", str(answer))
 
     def expect_alive(self) -> None:
-        """Fail the case unless the next good request is answered."""
+        """Fail the case unless the next valid request is answered."""
         self.telemetry("identification")
 
-    def _name(self, identifier: int) -> str:
-        row = self.icd.row_by_id(identifier)
-        return f"{identifier} ({row.name})" if row is not None else str(identifier)
+    def _name(self, row_id: int) -> str:
+        row = self.icd.row_by_id(row_id)
+        return f"{row_id} ({row.name})" if row is not None else str(row_id)
 
     # --- state of the device ---
 
     def wait_for(self, name: str, wanted: Mapping[str, Value], within_s: float) -> dict[str, Value]:
-        """Read a row until its fields have the wanted values.
-
-        The case fails if they do not get them in time.
-        """
+        """Read a row until its fields have the wanted values; fail the case if this takes too long."""
         end = self.now() + within_s
         while True:
             row = self.icd.telemetry[name]
@@ -302,12 +298,12 @@ class LinkProbe(PortProbe):
         self.wait_for("device_status", {"mode": "standby"}, self.times.boot_s)
 
     def parameter(self, name: str) -> dict[str, Value]:
-        """Read a parameter's value and limits."""
+        """Read value and limits of a parameter."""
         self.command("select_parameter", parameter=self.icd.parameters[name].id)
         return self.telemetry("parameter")
 
     def value_of(self, name: str) -> float:
-        """Read a parameter's value."""
+        """Read the value of a parameter."""
         return float(self.parameter(name)["value"])
 
     def set_parameter(self, name: str, number: float) -> None:
@@ -327,11 +323,9 @@ class LinkProbe(PortProbe):
     # --- around a run ---
 
     def silence(self, *, booting: bool) -> str | None:
-        """Read three telemetry rows.
+        """Read three telemetry rows; return None if one is answered correctly, otherwise the invalid answer.
 
-        Return the invalid answer, None if one of them is answered correctly.
-
-        A unit that may be booting is asked again until it must have booted.
+        If the unit may be booting, the requests are repeated until it must have booted.
         """
         end = self.now() + (self.times.boot_s if booting else 0.0)
         while True:
@@ -342,10 +336,7 @@ class LinkProbe(PortProbe):
                 return next((text for text in seen if text != "nothing"), "nothing")
 
     def _bad_answer(self, name: str) -> Answer | None:
-        """Ask for a row.
-
-        Return the answer unless it is telemetry of the row's length or a published refusal.
-        """
+        """Request a row; return the answer if it is neither valid telemetry nor a published refusal."""
         self.drain()
         row = self.icd.telemetry[name]
         answer = self.ask(row.id)
@@ -356,17 +347,17 @@ class LinkProbe(PortProbe):
         return answer
 
     def prepare(self) -> None:
-        """Note the settings of the unit, and give the cases a unit at its defaults."""
+        """Record the settings of the unit, and set its defaults for the cases."""
         self._found = UnitSettings.read(self)
         self._found.prepare(self)
 
     def restore(self) -> None:
-        """Put the settings back that `prepare` found; those that cannot be are named.
+        """Restore the settings that `prepare` recorded.
 
         Raises
         ------
         CaseFailed
-            The unit does not take them.
+            The unit does not accept some of them; the text names them.
         """
         if self._found is None:
             return
@@ -375,11 +366,11 @@ class LinkProbe(PortProbe):
         try:
             self._found.restore(self)
         except CaseFailed as failure:
-            raise CaseFailed(f"the stored parameters back as found ({self._found})", failure.seen) from None
+            raise CaseFailed(f"the stored parameters restored ({self._found})", failure.seen) from None
 
 
 def checked_values(row: Row, data: bytes) -> dict[str, Value]:
-    """Decode telemetry with all limits checked; a value outside fails the case."""
+    """Decode telemetry; a value outside its limits fails the case."""
     try:
         return row.decode(data, check=True)
     except ProtocolError as error:

@@ -1,4 +1,4 @@
-"""Ports and buses for the cases, each with its own clock."""
+"""Ports and buses for the cases, each with a clock."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Item = TypeVar("Item")
 
 
 class Port(Protocol[Item]):
-    """A serial port (items are bytes) or a CAN bus (items are frames): plain calls, and a clock."""
+    """A serial port (items are bytes) or a CAN bus (items are frames) with synchronous calls and a clock."""
 
     def send(self, item: Item) -> None:
         """Send an item."""
 
     def receive(self, timeout_s: float) -> Item | None:
-        """Return the next item, None if none comes in time."""
+        """Return the next item, or None if none arrives in time."""
 
     def now(self) -> float:
         """Time, s, from any origin."""
@@ -37,7 +37,7 @@ class LivePort(Generic[Item]):
     transport
         What carries the items.
     speed
-        Seconds on this port's clock per second of the wall clock.
+        Seconds on the clock of this port per second of the wall clock.
     """
 
     def __init__(self, transport: Transport[Item], speed: float = 1.0) -> None:
@@ -53,16 +53,16 @@ class LivePort(Generic[Item]):
         Raises
         ------
         LinkLostError
-            The port or bus is gone.
+            The port or bus was lost.
         """
         if not self._loop.run(self._send(item)):
-            raise LinkLostError(f"{self._transport.description}: {self._lost or 'takes nothing more'}")
+            raise LinkLostError(f"{self._transport.description}: {self._lost or 'accepts no more data'}")
 
     async def _send(self, item: Item) -> bool:
         return self._transport.send(item)
 
     def receive(self, timeout_s: float) -> Item | None:
-        """Return the next item, None if none comes in time."""
+        """Return the next item, or None if none arrives in time."""
         try:
             if timeout_s > 0:
                 return self._arrived.get(timeout=timeout_s / self._speed)
@@ -95,10 +95,10 @@ class LivePort(Generic[Item]):
 
 
 def live_serial(spec: str, baud: int, speed: float = 1.0) -> LivePort[bytes]:
-    """Make the port of a serial specification; it is opened as a context manager."""
+    """Return the port for a serial specification, a context manager."""
     return LivePort(open_serial(spec, baud=baud, paced=False), speed)
 
 
 def live_can(spec: str, speed: float = 1.0) -> LivePort[CanFrame]:
-    """Make the bus of a CAN specification; it is opened as a context manager."""
+    """Return the bus for a CAN specification, a context manager."""
     return LivePort(open_can(spec), speed)

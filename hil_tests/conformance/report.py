@@ -43,7 +43,7 @@ details pre {{ background: #f6f8fa; padding: .5rem; overflow-x: auto; }}
 
 
 def count(outcomes: Sequence[Outcome], status: str) -> int:
-    """Return how many cases ended with a status."""
+    """Return the number of cases with a status."""
     return sum(outcome.status == status for outcome in outcomes)
 
 
@@ -61,7 +61,7 @@ def to_json(outcomes: Sequence[Outcome], unit: str) -> dict[str, Any]:
 
 
 def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
-    """Print a line for a case; passed cases and those not run only if `verbose`."""
+    """Print a line for a case; for passed cases and those not run only if `verbose`."""
     if outcome.status in SHOWN_IF_VERBOSE and not verbose:
         return
     mark, style = STYLES[outcome.status]
@@ -76,7 +76,7 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
 
 
 def areas_of(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the areas in the order in which they came."""
+    """Return the areas in the order of their first case."""
     return list(dict.fromkeys(outcome.area for outcome in outcomes))
 
 
@@ -136,7 +136,9 @@ def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> Non
 
 def _area_table(area: str, outcomes: Sequence[Outcome]) -> str:
     rows = "".join(_row(outcome) for outcome in outcomes if outcome.area == area)
-    heads = "".join(f"<th>{word}</th>" for word in ("case", "what is checked", "clause or source", "result"))
+    heads = "".join(
+        f"<th>{word}</th>" for word in ("case", "checked behaviour", "clause or source", "result")
+    )
     return f'<h2 id="{escape(area)}">{escape(area)}</h2><table><tr>{heads}</tr>{rows}</table>'
 
 
@@ -148,7 +150,7 @@ def _row(outcome: Outcome) -> str:
     elif outcome.status in (SKIPPED, NOT_RUN):
         result += f"<br>{escape(outcome.seen)}"
     if outcome.log:
-        result += f"<details><summary>sent and seen</summary><pre>{escape(chr(10).join(outcome.log))}</pre></details>"
+        result += f"<details><summary>sent and received</summary><pre>{escape(chr(10).join(outcome.log))}</pre></details>"
     kind = " <small>(intrusive)</small>" if outcome.intrusive else ""
     return (
         f"<tr><td><code>{escape(outcome.id)}</code>{kind}</td><td>{escape(outcome.title)}</td>"

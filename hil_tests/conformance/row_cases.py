@@ -28,10 +28,10 @@ PARTNERS: Final = {
     "exposure": ("update_rate", 0.01),
     "delay_time": ("update_rate", 0.01),
 }
-"""Parameters that bound each other → the other one, and the value at which it leaves all room."""
+"""Parameters that limit each other → the other parameter, and its value that allows the full range."""
 F32_ROUNDING: Final = 1e-6
 UNSET: Final = frozenset({"unsolicited_rate"})
-"""Parameters whose greatest value would flood the line."""
+"""Parameters whose largest value would flood the line."""
 
 
 IDENTIFIERS: Final = CaseArea[LinkProbe](
@@ -40,12 +40,12 @@ IDENTIFIERS: Final = CaseArea[LinkProbe](
 
 
 def clause_of(row: Row) -> str:
-    """Where a row is written."""
+    """Return the source of a row."""
     return f"configs/units/cubestar {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
 
 
 def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
-    """Make the cases of a definition."""
+    """Return the cases for a definition."""
     cases: list[Case[LinkProbe]] = list(IDENTIFIERS.cases)
     cases.extend(_telemetry_case(row) for row in icd.telemetry.values())
     for row in icd.telecommands.values():
@@ -56,27 +56,25 @@ def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
     return cases
 
 
-# --- identifiers ---
+# --- row IDs ---
 
 
-@IDENTIFIERS.case("telemetry", "each unknown telemetry identifier is refused with code 1")
+@IDENTIFIERS.case("telemetry", "each unknown telemetry ID is refused with code 1")
 def unknown_telemetry(probe: LinkProbe) -> None:
-    for identifier in range(128, 256):
-        if identifier not in probe.icd.telemetry_by_id:
-            probe.expect_refusal(identifier, b"", INVALID_ID)
+    for row_id in range(128, 256):
+        if row_id not in probe.icd.telemetry_by_id:
+            probe.expect_refusal(row_id, b"", INVALID_ID)
 
 
 @IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
 def unknown_telecommands(probe: LinkProbe) -> None:
-    for identifier in range(128):
-        if identifier not in probe.icd.telecommands_by_id:
-            probe.expect_refusal(identifier, b"", INVALID_ID)
-            probe.expect_refusal(identifier, b"\x01\x02", INVALID_ID)
+    for row_id in range(128):
+        if row_id not in probe.icd.telecommands_by_id:
+            probe.expect_refusal(row_id, b"", INVALID_ID)
+            probe.expect_refusal(row_id, b"\x01\x02", INVALID_ID)
 
 
-@IDENTIFIERS.case(
-    "telemetry-with-data", "a request of telemetry with data is refused for its length", rule(5)
-)
+@IDENTIFIERS.case("telemetry-with-data", "a telemetry request with data is refused for its length", rule(5))
 def telemetry_with_data(probe: LinkProbe) -> None:
     for row in probe.icd.telemetry.values():
         probe.expect_refusal(row.id, b"\x00", INVALID_LENGTH)
@@ -129,7 +127,7 @@ def _field_cases(row: Row) -> Iterator[Case[LinkProbe]]:
 
 
 def bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
-    """Yield parameters of a telecommand with one field outside its limits."""
+    """Yield data of a telecommand with one field outside its limits."""
     good = bytearray(row.encode(row.example()))
 
     def with_raw(raw: bytes) -> bytes:
@@ -213,9 +211,9 @@ def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
 
     name = parameter.name
     for check_name, title, run in (
-        ("limits", f"{name} reports its number and limits", limits),
-        ("refusals", f"{name} outside its limits is refused, and stays", refusals),
-        ("values", f"{name} takes its least and greatest value", values),
+        ("limits", f"{name} reports its ID and limits", limits),
+        ("refusals", f"{name} outside its limits is refused and unchanged", refusals),
+        ("values", f"{name} accepts its smallest and largest value", values),
     ):
         yield Case(f"parameters.{name}.{check_name}", "parameters", title, clause, run, intrusive=True)
 
@@ -230,7 +228,7 @@ def _whole(parameter: Parameter) -> bool:
 
 
 def _outside(parameter: Parameter) -> list[float]:
-    """Values that a parameter must refuse."""
+    """Yield values that a parameter must refuse."""
     step = 1.0 if _whole(parameter) else max(1.0, abs(parameter.maximum)) * 0.01
     bad = [parameter.minimum - step, parameter.maximum + step, math.nan, math.inf, -math.inf]
     if _whole(parameter):
@@ -242,7 +240,7 @@ def _outside(parameter: Parameter) -> list[float]:
 
 
 def _inside(parameter: Parameter, present: float) -> list[float]:
-    """Values that a parameter must take."""
+    """Yield values that a parameter must accept."""
     if parameter.name in LINK_PARAMETERS:
         return [present]
     if parameter.enum is not None:

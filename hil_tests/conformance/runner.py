@@ -16,7 +16,7 @@ from starhil.protocol.errors import ProtocolError
 
 @dataclass(frozen=True)
 class Verdict:
-    """Outcome of one part of a case."""
+    """Outcome of a part of a case."""
 
     status: str
     expected: str = ""
@@ -31,13 +31,13 @@ class Outcome:
     Attributes
     ----------
     id, area, title, clause, intrusive
-        Those of the case.
+        As in the case.
     status
         `passed`, `failed`, `skipped` or `not run`.
     expected, seen
-        Of a failed case; of one that was skipped or not run the reason is in `seen`.
+        Set for a failed case; for a skipped case or one not run, `seen` has the reason.
     log
-        What was sent and received, with times.
+        Sent and received traffic, with times.
     """
 
     id: str
@@ -58,7 +58,7 @@ class Outcome:
         return cls(*about, verdict.status, verdict.expected, verdict.seen, seconds, tuple(log))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the outcome as JSON data, with the log of a failed case only."""
+        """Return the outcome as JSON data, with the log only of a failed case."""
         value = dict(vars(self))
         value["seconds"] = round(self.seconds, 4)
         value["log"] = list(self.log) if self.status == FAILED else []
@@ -73,7 +73,7 @@ def select_cases(
     Raises
     ------
     BenchError
-        A pattern matches none.
+        A pattern matches no case.
     """
     chosen = list(cases)
     if patterns:
@@ -85,44 +85,40 @@ def select_cases(
     return [item for item in chosen if not (safe_only and item.intrusive)]
 
 
-def _matches(identifier: str, pattern: str) -> bool:
-    return (
-        identifier == pattern
-        or identifier.startswith(pattern + ".")
-        or fnmatch.fnmatchcase(identifier, pattern)
-    )
+def _matches(case_id: str, pattern: str) -> bool:
+    return case_id == pattern or case_id.startswith(pattern + ".") or fnmatch.fnmatchcase(case_id, pattern)
 
 
 class Probe(Protocol):
-    """What running a case needs of the tester's side of a link."""
+    """The functions of a link that are needed to run cases."""
 
     log: list[str]
-    """What was sent and received."""
+    """Sent and received traffic."""
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return the invalid answer, or `nothing`; None if the device answers."""
+        """Return None if the device answers, otherwise the invalid answer or `nothing`."""
 
     def prepare(self) -> None:
-        """Note the settings of the device before cases that change them."""
+        """Record the settings of the device before cases that change them."""
 
     def restore(self) -> None:
-        """Put the settings back after such cases."""
+        """Restore the settings after such cases."""
 
     def begin(self, *, intrusive: bool) -> None:
-        """Get ready for a case."""
+        """Prepare for a case."""
 
     def end(self, *, intrusive: bool, passed: bool) -> None:
-        """Check what must hold after a case, and leave the device to the next one.
+        """Check the conditions that must hold after a case, and prepare for the next one.
 
-        `CaseFailed` if it is not so.
+        Raises `CaseFailed` if they do not hold.
         """
 
     def recover(self) -> None:
-        """Let what a failed case has left pass."""
+        """Wait for the after-effects of a failed case."""
 
 
 def run_case(probe: Probe, case: Case[Any]) -> Outcome:
-    """Run one case on any link; any behaviour of device or link becomes an outcome."""
+    """Run a case on any link; any behaviour of device or link becomes an outcome."""
     probe.log.clear()
 
     def run() -> None:
@@ -143,10 +139,10 @@ def run_case(probe: Probe, case: Case[Any]) -> Outcome:
 
 
 def _attempt(probe: Probe, act: Callable[[], None]) -> Verdict:
-    """Do a part of a case.
+    """Run a part of a case.
 
-    Frames that no case has thought of, such as an empty heartbeat, show as errors of the code that
-    takes them apart.
+    Unexpected frames, such as an empty heartbeat, appear as exceptions in the code that decodes them; they
+    fail the case.
     """
     try:
         act()
@@ -173,10 +169,9 @@ def run_cases(
 ) -> list[Outcome]:
     """Run the cases of one link in order.
 
-    A device that answers nothing ends the run: a failed outcome names the port, and the cases that
-    are left are not run. Before the first case that changes settings these are noted; after the
-    last one they are put back, also when the run is interrupted. An outcome is added only if that
-    fails.
+    If the device does not answer, a failed outcome names the port, and the remaining cases are not run. The
+    settings are recorded before the first case that changes them, and restored after the last one, also when
+    the run is interrupted. Only a failure to do so adds an outcome.
     """
     waiting = list(cases)
     outcomes: list[Outcome] = []
@@ -207,7 +202,7 @@ def run_cases(
     finally:
         if intrusive:
             probe.log.clear()
-            report_trouble("settings.kept", "the settings are put back after the last case", probe.restore)
+            report_trouble("settings.kept", "the settings are restored after the last case", probe.restore)
     if mute is not None:
         record(Outcome.of(case_of_run(f"{link}.answers", "the device answers"), mute, log=probe.log))
         for item in waiting:
@@ -216,20 +211,17 @@ def run_cases(
 
 
 def not_run(item: Case[Any], reason: str) -> Outcome:
-    """Return the outcome of a case that the run did not come to."""
+    """Return the outcome of a case that was not reached."""
     return Outcome.of(item, Verdict(NOT_RUN, seen=f"not run: {reason}"))
 
 
-def case_of_run(identifier: str, title: str, clause: str = "starhil conformance") -> Case[Any]:
-    """Return a case that reports something about the run, and is never run itself."""
-    return Case(identifier, identifier.rpartition(".")[0], title, clause, lambda _probe: None)
+def case_of_run(case_id: str, title: str, clause: str = "starhil conformance") -> Case[Any]:
+    """Return a case for an outcome of the run itself; it has no check."""
+    return Case(case_id, case_id.rpartition(".")[0], title, clause, lambda _probe: None)
 
 
 def _mute(probe: Probe, port: str, *, booting: bool) -> Verdict | None:
-    """Return the verdict on a device that does not answer.
-
-    None if it answers, or if the link itself is gone.
-    """
+    """Return the verdict on a device that does not answer; None if it answers or the link was lost."""
     seen: str | None = None
 
     def listen() -> None:

@@ -1,4 +1,4 @@
-"""Serial conformance: framing, stuffing, forms of the replies, time-outs and pace."""
+"""Serial conformance: framing, stuffing, reply formats, time-outs and pace."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from starhil.hil_tests.conformance.wire_tables import (
     check_flags,
 )
 
-REPLIES: Final = "forms of the replies: a AlbertaSat, b RADSAT, c libCubeObc"
+REPLIES: Final = "reply formats: a AlbertaSat, b RADSAT, c libCubeObc"
 
 SHORT_PAUSE_S: Final = 0.1
 CLOCK_GRAIN_S: Final = 1e-4
@@ -34,44 +34,44 @@ STUFFING: Final = CaseArea[SerialProbe](
 )
 ERRORS: Final = CaseArea[SerialProbe](
     "errors",
-    "configs/units/cubestar: communication_status 144, errors of the link are flagged and passed over",
+    "configs/units/cubestar: communication_status 144, link errors are flagged and otherwise ignored",
     intrusive=True,
 )
 TIMING: Final = CaseArea[SerialProbe]("timing", "8N1: ten bits a byte")
 
 READ: Final = "1F 7F 80 1F FF"
-"""Request of identification."""
+"""Request for identification."""
 
 
 EXCHANGES: Final = (
     Exchange("one", "a request is answered once", (READ,), ("128",)),
-    Exchange("two-at-once", "two requests in one piece are both answered, in order", (READ + "1F 7F E6 1F FF",), ("128", "230")),
-    Exchange("twenty-at-once", "twenty requests in one piece are all answered", (READ * 20,), ("128",) * 20),
-    Exchange("byte-by-byte", "a request may come byte by byte", ("1F", "7F", "80", "1F", "FF"), ("128",), pause_s=0.005),
-    Exchange("cut-in-escape", "a request may be cut between 1F and what follows it", ("1F", "7F 80 1F", "FF"), ("128",), pause_s=0.02),
-    Exchange("pause", "a pause of 0.1 s within a request does no harm", ("1F 7F", "80 1F FF"), ("128",), pause_s=SHORT_PAUSE_S, clause=rule(1)),
-    Exchange("junk-before", "bytes before a request are passed over", ("00 55 AA FF" + READ,), ("128",)),
-    Exchange("junk-between", "bytes between requests are passed over", (READ + "00 FF 7F" + READ,), ("128", "128")),
-    Exchange("junk-after", "bytes after a request do not spoil the next", (READ + "42", READ), ("128", "128"), pause_s=0.02),
-    Exchange("escape-before", "a lone 1F before a request is passed over", ("1F" + READ,), ("128",)),
-    Exchange("escapes-before", "several 1F before a request are passed over", ("1F 1F 1F" + READ,), ("128",)),
-    Exchange("junk-escape", "1F and a byte that means nothing, then a request", ("1F 00" + READ,), ("128",)),
-    Exchange("end-alone", "an end mark without a start is no message", ("1F FF",)),
-    Exchange("end-before", "an end mark before a request is passed over", ("1F FF" + READ,), ("128",)),
-    Exchange("start-alone", "a start mark alone is no message", ("1F 7F",)),
+    Exchange("two-at-once", "two requests sent together are both answered, in order", (READ + "1F 7F E6 1F FF",), ("128", "230")),
+    Exchange("twenty-at-once", "twenty requests sent together are all answered", (READ * 20,), ("128",) * 20),
+    Exchange("byte-by-byte", "a request may be sent byte by byte", ("1F", "7F", "80", "1F", "FF"), ("128",), pause_s=0.005),
+    Exchange("cut-in-escape", "a request may be split after 1F", ("1F", "7F 80 1F", "FF"), ("128",), pause_s=0.02),
+    Exchange("pause", "a pause of 0.1 s within a request has no effect", ("1F 7F", "80 1F FF"), ("128",), pause_s=SHORT_PAUSE_S, clause=rule(1)),
+    Exchange("junk-before", "bytes before a request are ignored", ("00 55 AA FF" + READ,), ("128",)),
+    Exchange("junk-between", "bytes between requests are ignored", (READ + "00 FF 7F" + READ,), ("128", "128")),
+    Exchange("junk-after", "bytes after a request do not affect the next one", (READ + "42", READ), ("128", "128"), pause_s=0.02),
+    Exchange("escape-before", "a single 1F before a request is ignored", ("1F" + READ,), ("128",)),
+    Exchange("escapes-before", "several 1F before a request are ignored", ("1F 1F 1F" + READ,), ("128",)),
+    Exchange("junk-escape", "1F and a meaningless byte before a request are ignored", ("1F 00" + READ,), ("128",)),
+    Exchange("end-alone", "an end mark without a start is not answered", ("1F FF",)),
+    Exchange("end-before", "an end mark before a request is ignored", ("1F FF" + READ,), ("128",)),
+    Exchange("start-alone", "a start mark alone is not answered", ("1F 7F",)),
     Exchange("starts", "a second start mark restarts the message", ("1F 7F" + READ,), ("128",)),
-    Exchange("cut-off", "a message cut off by another is dropped, the other one answered", ("1F 7F E6" + READ,), ("128",)),
-    Exchange("cut-off-data", "a message with data cut off by another is dropped", ("1F 7F 02 11 22 33" + READ,), ("128",)),
-    Exchange("empty", "a message without an identifier is no request", ("1F 7F 1F FF",)),
+    Exchange("cut-off", "a message interrupted by another is dropped, and the other answered", ("1F 7F E6" + READ,), ("128",)),
+    Exchange("cut-off-data", "a message with data that is interrupted by another is dropped", ("1F 7F 02 11 22 33" + READ,), ("128",)),
+    Exchange("empty", "a message without an ID is not answered", ("1F 7F 1F FF",)),
     Exchange("empty-then-good", "a request after an empty message is answered", ("1F 7F 1F FF" + READ,), ("128",)),
-    Exchange("bad-escape", "1F before another byte within a message ends it without effect", ("1F 7F 80 1F 00",), clause=rule(3)),
+    Exchange("bad-escape", "a bad escape within a message aborts it without effect", ("1F 7F 80 1F 00",), clause=rule(3)),
     Exchange("bad-escape-then-good", "a request after a bad escape is answered", ("1F 7F 80 1F 00" + READ,), ("128",), clause=rule(3)),
     Exchange("start-of-ack", "1F 07 is the start of a reply, not of a request", ("1F 07 80 1F FF",), clause=REPLIES),
     Exchange("start-of-nack", "1F 0F is the start of a reply, not of a request", ("1F 0F 80 1F FF",), clause=REPLIES),
     Exchange("start-of-event", "1F 2F is the start of an event, not of a request", ("1F 2F 80 1F FF",), clause=REPLIES),
     Exchange("start-of-unsolicited", "1F 4F is the start of unsolicited telemetry, not of a request", ("1F 4F 80 1F FF",), clause=REPLIES),
     Exchange("half", "an incomplete message is dropped after a time-out", ("1F 7F 80", "1F FF"), pause_s=LONG_PAUSE_S, clause=rule(2)),
-    Exchange("overlong", "a message that is too long is dropped, the next one answered", ("1F 7F 80" + "00" * 4 * LONGEST_MESSAGE + "1F FF",), clause=rule(4)),
+    Exchange("overlong", "a message that is too long is dropped, and the next one answered", ("1F 7F 80" + "00" * 4 * LONGEST_MESSAGE + "1F FF",), clause=rule(4)),
     Exchange("noise", "noise is not answered", ("FF" * 64 + "00" * 64 + "7F" * 64,)),
     Exchange("escapes", "a run of 1F is not answered", ("1F" * 200,)),
     Exchange("ends", "a run of end marks is not answered", ("1F FF" * 100,)),
@@ -79,7 +79,7 @@ EXCHANGES: Final = (
 add_exchange_cases(FRAMING, EXCHANGES)
 
 
-@FRAMING.case("reply-form", "an answer has the form of its dialect, byte for byte", REPLIES)
+@FRAMING.case("reply-form", "an answer has the format of its dialect, byte for byte", REPLIES)
 def reply_form(probe: SerialProbe) -> None:
     probe.send(bytes.fromhex(READ))
     probe.expecting(128)
@@ -91,7 +91,7 @@ def reply_form(probe: SerialProbe) -> None:
     check_equal(seen, whole.hex().upper(), "bytes")
 
 
-@FRAMING.case("longest", "a message of 512 bytes is still taken, and refused for its length", rule(4))
+@FRAMING.case("longest", "a message of 512 bytes is received and refused for its length", rule(4))
 def longest(probe: SerialProbe) -> None:
     probe.expect_refusal(0x80, bytes(LONGEST_MESSAGE - 1), INVALID_LENGTH)
 
@@ -106,31 +106,31 @@ def _expect_refusal_of(probe: SerialProbe, row_id: int, text: str, code: int) ->
     check(answer.kind == "nack" and answer.code == code, f"refusal with code {code}", answer)
 
 
-@STUFFING.case("id", "identifier 1F doubled is identifier 31, which does not exist")
-def stuffed_identifier(probe: SerialProbe) -> None:
+@STUFFING.case("id", "ID 1F doubled is ID 31, which does not exist")
+def stuffed_id(probe: SerialProbe) -> None:
     _expect_refusal_of(probe, 0x1F, "1F 7F 1F 1F 1F FF", INVALID_ID)
 
 
 @STUFFING.case(
     "id-single",
-    "identifier 1F not doubled is identifier 31 as well",
+    "ID 1F not doubled is ID 31, too",
     "flight software differs: AlbertaSat, RADSAT",
 )
-def single_identifier(probe: SerialProbe) -> None:
-    """Sent with data, since some senders stuff only the data."""
+def single_id(probe: SerialProbe) -> None:
+    """Sent with data, because some senders stuff only the data."""
     _expect_refusal_of(probe, 0x1F, "1F 7F 1F 00 01 1F FF", INVALID_ID)
 
 
 @STUFFING.case("taken-out", "a doubled 1F is one byte of data")
-def taken_out(probe: SerialProbe) -> None:
-    """Parameter 31 does not exist: the device refuses its number, not the length."""
+def unstuffed(probe: SerialProbe) -> None:
+    """Parameter 31 does not exist, so the device refuses its ID, not the length."""
     row = probe.icd.telecommands["select_parameter"]
     _expect_refusal_of(probe, row.id, f"1F 7F {row.id:02X} 1F 1F 1F FF", INVALID_PARAMETER)
 
 
 @STUFFING.case("not-a-mark", "1F 1F FF within data is a byte 1F and a byte FF, not an end")
 def not_a_mark(probe: SerialProbe) -> None:
-    """The device refuses the length: two bytes where select_parameter takes one."""
+    """The device refuses the length: two bytes instead of one for select_parameter."""
     row = probe.icd.telecommands["select_parameter"]
     _expect_refusal_of(probe, row.id, f"1F 7F {row.id:02X} 1F 1F FF 1F FF", INVALID_LENGTH)
 
@@ -142,17 +142,17 @@ INCOMPLETE: Final = frozenset({"uart_incomplete"})
 OVERLONG: Final = "1F 7F 80" + "00" * 600 + "1F FF"
 FLAGS: Final = (
     FlagRow("junk", "bytes outside a message", ("00 55 AA",), PROTOCOL_ERROR),
-    FlagRow("empty", "a message without an identifier", ("1F 7F 1F FF",), PROTOCOL_ERROR),
+    FlagRow("empty", "a message without an ID", ("1F 7F 1F FF",), PROTOCOL_ERROR),
     FlagRow("bad-escape", "a bad escape within a message", ("1F 7F 80 1F 00",), PROTOCOL_ERROR),
     FlagRow("overlong", "a message that is too long", (OVERLONG,), PROTOCOL_ERROR),
-    FlagRow("cut-off", "a message cut off by another", ("1F 7F 02 11 22",), INCOMPLETE, pause_s=None),
-    FlagRow("half", "a message that does not end", ("1F 7F 02 11 22",), INCOMPLETE, pause_s=LONG_PAUSE_S),
+    FlagRow("cut-off", "a message interrupted by another", ("1F 7F 02 11 22",), INCOMPLETE, pause_s=None),
+    FlagRow("half", "an incomplete message", ("1F 7F 02 11 22",), INCOMPLETE, pause_s=LONG_PAUSE_S),
 )
 
 add_flag_cases(ERRORS, FLAGS)
 
 
-@ERRORS.case("none", "good requests set no flag")
+@ERRORS.case("none", "valid requests set no flag")
 def no_flag(probe: SerialProbe) -> None:
     probe.command("clear_counters")
     for _ in range(20):
@@ -167,10 +167,10 @@ def no_flag(probe: SerialProbe) -> None:
 # --- time ---
 
 
-@TIMING.case("pace", "a long reply takes its time on the line")
+@TIMING.case("pace", "a long reply takes at least its time on the line")
 def pace(probe: SerialProbe) -> None:
     if probe.baud is None:
-        raise CaseSkipped("the pace is not checked without --baud, the bit rate of the line")
+        raise CaseSkipped("the pace is checked only with --baud, the bit rate of the line")
     begin = probe.now()
     probe.post(211)
     data = probe.expect_telemetry(211)

@@ -17,18 +17,18 @@ from starhil.hil_tests.conformance.ports import Port
 from starhil.protocol.icd import InterfaceDefinition
 
 BURST_BODY: Final = 23
-"""Identifier, packet number and 20 bytes of data."""
+"""Size of an ID, a packet number and 20 bytes of data."""
 
 GENERATION_2: Final = {0x07: "ack", 0x0F: "nack", 0x2F: "event", 0x4F: "unsolicited"}
 
 
-def framed(identifier: int, data: bytes = b"") -> bytes:
-    """Frame a request: 1F 7F, identifier and data with each 1F doubled, 1F FF."""
-    return b"\x1f\x7f" + (bytes([identifier]) + data).replace(b"\x1f", b"\x1f\x1f") + b"\x1f\xff"
+def framed(row_id: int, data: bytes = b"") -> bytes:
+    """Frame a request: 1F 7F, ID and data with each 1F doubled, 1F FF."""
+    return b"\x1f\x7f" + (bytes([row_id]) + data).replace(b"\x1f", b"\x1f\x1f") + b"\x1f\xff"
 
 
 class SerialProbe(SerialWire, LinkProbe):
-    """Talks over a serial port.
+    """Talks to CubeStar over a serial port.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ class SerialProbe(SerialWire, LinkProbe):
     dialect
         `a`, `b` or `c`.
     baud
-        Bit rate of the line, None if unknown; for the cases on its pace.
+        Bit rate of the line, for the cases on its pace; None if unknown.
     """
 
     def __init__(
@@ -57,17 +57,17 @@ class SerialProbe(SerialWire, LinkProbe):
         self._buffer = bytearray()
         self._asked: list[int] = []
 
-    def post(self, identifier: int, data: bytes = b"") -> None:
+    def post(self, row_id: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
-        self.expecting(identifier)
-        self.send(framed(identifier, data))
+        self.expecting(row_id)
+        self.send(framed(row_id, data))
 
     def expecting(self, *answers: str | int) -> None:
-        """Note the rows that were asked for, in order: dialect b does not say what an answer is about."""
+        """Record the requested rows in order, because answers in dialect b contain no ID."""
         self._asked.extend(map(int, answers))
 
     def expect_exactly(self, answer: str) -> None:
-        """Take the next answer, which must be the telemetry of the row with that number."""
+        """Take the next answer, which must be the telemetry of the row with this ID."""
         self.expect_telemetry(int(answer))
 
     def send_text(self, text: str) -> None:
@@ -98,7 +98,7 @@ class SerialProbe(SerialWire, LinkProbe):
         return self._malformed() if self._buffer else Answer("none")
 
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that come within a time.
+        """Return the messages of unsolicited telemetry that arrive within a time.
 
         Anything else fails the case.
         """
@@ -137,10 +137,7 @@ class SerialProbe(SerialWire, LinkProbe):
         return Answer("malformed", data=data)
 
     def _packet(self) -> tuple[int, bytes] | None:
-        """Take a whole packet off the buffer: its start byte and its body without stuffing.
-
-        None if none is whole.
-        """
+        """Remove a complete packet from the buffer; return its start byte and unstuffed body, or None."""
         if len(self._buffer) < 2 or not self._starts_well():
             return None
         body = bytearray()
@@ -168,7 +165,7 @@ class SerialProbe(SerialWire, LinkProbe):
         if start < 0 or (not body and self.dialect != "b"):
             return Answer("malformed", data=body)
         if start == 0x7F and len(body) == BURST_BODY and body[0] == BURST_ID and not self._expects(len(body)):
-            return Answer("burst", data=body[1:], identifier=BURST_ID)
+            return Answer("burst", data=body[1:], row_id=BURST_ID)
         if self.dialect == "c":
             return self._answer_generation_2(start, body)
         if self.dialect == "b":
@@ -184,28 +181,28 @@ class SerialProbe(SerialWire, LinkProbe):
         row = self.icd.telemetry_by_id.get(self._asked[0]) if self._asked and self.dialect == "b" else None
         return row is not None and row.size == size
 
-    def _plain(self, identifier: int, data: bytes, seen: int | None) -> Answer:
-        """Read generation 1: telemetry as it is, one byte for an acknowledge or refusal."""
-        row = self.icd.telemetry_by_id.get(identifier)
+    def _plain(self, row_id: int, data: bytes, seen: int | None) -> Answer:
+        """Interpret an answer of generation 1: telemetry, or one byte for an acknowledge or refusal."""
+        row = self.icd.telemetry_by_id.get(row_id)
         if row is not None and len(data) == row.size:
-            return Answer("telemetry", data=data, identifier=seen)
-        is_telecommand = identifier < FIRST_TELEMETRY
+            return Answer("telemetry", data=data, row_id=seen)
+        is_telecommand = row_id < FIRST_TELEMETRY
         if len(data) != 1:
-            return Answer("malformed" if is_telecommand else "telemetry", data=data, identifier=seen)
+            return Answer("malformed" if is_telecommand else "telemetry", data=data, row_id=seen)
         if data[0] == 0:
-            return Answer("ack" if is_telecommand else "malformed", data=data, identifier=seen)
-        return Answer("nack", code=data[0], identifier=seen)
+            return Answer("ack" if is_telecommand else "malformed", data=data, row_id=seen)
+        return Answer("nack", code=data[0], row_id=seen)
 
     def _answer_generation_2(self, start: int, body: bytes) -> Answer:
-        identifier, data = body[0], body[1:]
+        row_id, data = body[0], body[1:]
         match GENERATION_2.get(start):
-            case "ack" if identifier >= FIRST_TELEMETRY:
-                return Answer("telemetry", data=data, identifier=identifier)
+            case "ack" if row_id >= FIRST_TELEMETRY:
+                return Answer("telemetry", data=data, row_id=row_id)
             case "ack" if not data:
-                return Answer("ack", identifier=identifier)
+                return Answer("ack", row_id=row_id)
             case "nack" if len(data) == 1 and data[0]:
-                return Answer("nack", code=data[0], identifier=identifier)
+                return Answer("nack", code=data[0], row_id=row_id)
             case "unsolicited" | "event":
-                return Answer("unsolicited", data=data, identifier=identifier)
+                return Answer("unsolicited", data=data, row_id=row_id)
             case _:
                 return Answer("malformed", data=body)

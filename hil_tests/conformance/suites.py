@@ -1,4 +1,4 @@
-"""All cases of a link, under identifiers that begin with the link's name."""
+"""All cases of a link, with IDs that begin with the name of the link."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from starhil.protocol.icd import InterfaceDefinition
 CUBESTAR_ROWS: Final = frozenset(
     {"identification", "communication_status", "acknowledge", "device_status", "parameter"}
 )
-"""Telemetry by which the cases of a CubeStar follow what the unit does."""
+"""Telemetry rows that the cases for CubeStar need."""
 
 
 def is_cubestar(icd: InterfaceDefinition) -> bool:
-    """Return whether a unit has the rows that the CubeStar's cases need; other units get derived cases."""
+    """Return whether a unit has the rows that the cases for CubeStar need; other units get derived cases."""
     return icd.telemetry.keys() >= CUBESTAR_ROWS
 
 
 def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on a serial line: the CubeStar's, or cases derived from its definition.
+    """Return the cases for a unit on a serial line: CubeStar's, or cases derived from its definition.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
 
 
 def can_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on CAN: the CubeStar's, or cases derived from its definition.
+    """Return the cases for a unit on CAN: CubeStar's, or cases derived from its definition.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def _common(icd: InterfaceDefinition) -> list[Case[Any]]:
 
 
 def _named(link: str, *tables: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:
-    """Put the link before identifier and area; the area is the first part of the identifier."""
+    """Prefix case ID and area with the link; the area is the first part of the ID."""
     return tuple(
         replace(item, id=f"{link}.{item.id}", area=f"{link}.{item.id.split('.', 1)[0]}")
         for table in tables

@@ -12,7 +12,7 @@ from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.protocol.can_framing import CanFrame
 
 HOST_TIMEOUT_S: Final = 0.3
-"""Time-out of the most impatient published flight software (AlbertaSat, first version)."""
+"""Shortest time-out in published flight software (AlbertaSat, first version)."""
 
 TIMING: Final = CaseArea[LinkProbe]("timing", "host time-out of AlbertaSat, first version")
 UNSOLICITED: Final = CaseArea[LinkProbe](
@@ -40,7 +40,7 @@ def reply_time(probe: LinkProbe) -> None:
 
 
 def _unsolicited_rows(probe: LinkProbe, name: str, rate: float, seconds: float) -> list[Answer]:
-    """Return the unsolicited telemetry of a row within a time."""
+    """Return the unsolicited telemetry of a row that arrives within a time."""
     row = probe.icd.telemetry[name]
     probe.command("set_unsolicited", telemetry=row.id, rate=rate)
     try:
@@ -49,7 +49,7 @@ def _unsolicited_rows(probe: LinkProbe, name: str, rate: float, seconds: float) 
         probe.command("set_unsolicited", telemetry=row.id, rate=0.0)
 
 
-@UNSOLICITED.case("rate", "unsolicited telemetry comes at its rate, and stops")
+@UNSOLICITED.case("rate", "unsolicited telemetry is sent at its rate, and stops")
 def unsolicited(probe: LinkProbe) -> None:
     row = probe.icd.telemetry["identification"]
     seen = _unsolicited_rows(probe, "identification", 10.0, 2.0)
@@ -57,12 +57,12 @@ def unsolicited(probe: LinkProbe) -> None:
         check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
         return
     check(18 <= len(seen) <= 22, "18 to 22 messages in 2 s", len(seen))
-    check_equal({(item.identifier, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
+    check_equal({(item.row_id, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
     after = probe.receive_unsolicited(0.5)
     check(len(after) <= 1, "no more", f"{len(after)} messages")
 
 
-@UNSOLICITED.case("long", "a long row comes unsolicited as a whole")
+@UNSOLICITED.case("long", "a long row is sent complete as unsolicited telemetry")
 def unsolicited_long(probe: LinkProbe) -> None:
     row = probe.icd.telemetry["star_tracker"]
     seen = _unsolicited_rows(probe, "star_tracker", 5.0, 1.0)
@@ -70,14 +70,12 @@ def unsolicited_long(probe: LinkProbe) -> None:
         check(not seen, f"no unsolicited telemetry in dialect {probe.dialect}", f"{len(seen)} messages")
         return
     check(len(seen) >= 3, "3 messages or more in 1 s", len(seen))
-    check_equal({(item.identifier, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
+    check_equal({(item.row_id, len(item.data)) for item in seen}, {(row.id, row.size)}, "row and length")
     for item in seen:
         checked_values(row, item.data)
 
 
-@UNSOLICITED.case(
-    "refused", "unsolicited telemetry of a row that does not exist is refused", "published error codes"
-)
+@UNSOLICITED.case("refused", "unsolicited telemetry of an unknown row is refused", "published error codes")
 def unsolicited_refused(probe: LinkProbe) -> None:
     probe.expect_refused("set_unsolicited", INVALID_PARAMETER, telemetry=200, rate=1.0)
 
@@ -85,7 +83,7 @@ def unsolicited_refused(probe: LinkProbe) -> None:
 # --- recovery ---
 
 
-@RECOVERY.case("noise", "after noise the next good request is answered")
+@RECOVERY.case("noise", "after noise the next valid request is answered")
 def noise(probe: LinkProbe) -> None:
     rng = random.Random(7)  # noqa: S311 -- noise, not a secret
     if isinstance(probe, SerialProbe):
@@ -95,14 +93,14 @@ def noise(probe: LinkProbe) -> None:
     elif isinstance(probe, CanProbe):
         for _ in range(400):
             kind = rng.choice((0, 2, 3, 5, 6, 9, 13, 20, 31))
-            identifier = kind << 24 | rng.randrange(256) << 16 | probe.host << 8 | probe.device
-            probe.send(CanFrame(identifier, rng.randbytes(rng.randrange(9))))
+            can_id = kind << 24 | rng.randrange(256) << 16 | probe.host << 8 | probe.device
+            probe.send(CanFrame(can_id, rng.randbytes(rng.randrange(9))))
     probe.sleep(probe.times.quiet_s)
     probe.drain()
     probe.expect_alive()
 
 
-@RECOVERY.case("flood", "a flood of requests is answered whole and in order", rule(10))
+@RECOVERY.case("flood", "a flood of requests is answered completely and in order", rule(10))
 def flood(probe: LinkProbe) -> None:
     rows = [probe.icd.telemetry[name] for name in ("identification", "communication_status")]
     for _ in range(100):

@@ -1,4 +1,4 @@
-"""The tester's side of any unit on CAN with the CubeSpace layout of CAN IDs, by its definition."""
+"""The tester's side of any unit on CAN with the CubeSpace layout of CAN IDs, based on its definition."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ KINDS: Final[dict[AnswerKind, ReplyKind]] = {
 
 
 class CanUnitProbe(CanWire, UnitProbe):
-    """Asks a unit for its rows over a CAN bus."""
+    """Talks to a unit over a CAN bus."""
 
     def post(self, request: Request, *, answered: bool = True) -> None:  # noqa: ARG002 -- answers name their row
         """Send a request without waiting."""
         self.post_as(self.host, request.id, request.data)
 
     def next_reply(self) -> Reply | LinkFault | None:
-        """Return the next reply, None if none comes in time."""
+        """Return the next reply, or None if none arrives in time."""
         answer = self.next_answer()
         if answer.kind == "none":
             return None
@@ -36,15 +36,15 @@ class CanUnitProbe(CanWire, UnitProbe):
         return _reply(answer)
 
     def unsolicited_replies(self, seconds: float) -> list[Reply]:
-        """Return the messages of unsolicited telemetry that come within a time."""
+        """Return the messages of unsolicited telemetry that arrive within a time."""
         return [_reply(answer) for answer in self.receive_unsolicited(seconds)]
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
-        """Fail the case if anything comes within a time."""
+        """Fail the case if anything arrives within a time."""
         answer = self.unexpected_answer(self.times.quiet_s if seconds is None else seconds)
         if answer.kind != "none":
             raise CaseFailed(f"nothing ({why})", str(answer))
 
 
 def _reply(answer: Answer) -> Reply:
-    return Reply(KINDS[answer.kind], answer.identifier, answer.data, answer.code)
+    return Reply(KINDS[answer.kind], answer.row_id, answer.data, answer.code)

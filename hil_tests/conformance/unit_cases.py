@@ -31,7 +31,7 @@ ProbeType = TypeVar("ProbeType")
 
 
 def unit_cases(icd: InterfaceDefinition) -> list[Case[Any]]:
-    """Make the cases of a unit with a serial link."""
+    """Return the cases for a unit with a serial link or CAN."""
     stack = build_serial_stack(icd)
     cases: list[Case[Any]] = [*_framing(icd)]
     if isinstance(stack, ComposedStack):
@@ -44,7 +44,7 @@ def unit_cases(icd: InterfaceDefinition) -> list[Case[Any]]:
 def unit_row_cases(
     icd: InterfaceDefinition, stack: object = None, *, lengths: bool = True, clause: str
 ) -> list[Case[UnitProbe]]:
-    """Make the cases of a unit's rows, for any link; `stack` is the serial line's, if it has one."""
+    """Yield the cases for the rows of a unit on any link; `stack` is its serial link, if any."""
     return [
         *_identifiers(icd, stack, clause),
         *_rows(icd),
@@ -52,7 +52,7 @@ def unit_row_cases(
         *_limits(icd),
         *_settings(icd),
         *_subscriptions(icd),
-        _case("recovery", "flood", "a flood of requests is answered whole and in order", _flood, clause),
+        _case("recovery", "flood", "a flood of requests is answered completely and in order", _flood, clause),
     ]
 
 
@@ -69,12 +69,12 @@ def _case(
 
 
 def clause_of_row(row: Row) -> str:
-    """Where a row is written."""
+    """Return the source of a row."""
     return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
 
 
 def marks(icd: InterfaceDefinition) -> bytes:
-    """Return the bytes that have a meaning in the framing."""
+    """Return the bytes that are special in the framing."""
     link = icd.link.serial
     match link.framing if link is not None else None:
         case SlipFraming() as framing:
@@ -105,7 +105,7 @@ def _framing(icd: InterfaceDefinition) -> Iterator[Case[SerialUnitProbe]]:
     def answered(probe: SerialUnitProbe, times: int = 1) -> None:
         for _ in range(times):
             probe.expect_telemetry(probe.lively)
-        probe.expect_silence("no more was asked for")
+        probe.expect_silence("no more was requested")
 
     def one(probe: SerialUnitProbe) -> None:
         probe.send(asked(probe))
@@ -152,14 +152,14 @@ def _framing(icd: InterfaceDefinition) -> Iterator[Case[SerialUnitProbe]]:
         echo = sent if "echo" in probe.lively.answers else b""
         whole = echo + probe.stack.encode_reply(reply, probe.style)
         slip = icd.link.serial is not None and isinstance(icd.link.serial.framing, SlipFraming)
-        end = used[:1] if slip else b""  # which a sender may leave out before a frame
+        end = used[:1] if slip else b""  # which may be omitted before a frame
         check_equal(probe.raw.strip(end), whole.strip(end), "bytes")
 
     yield _case("framing", "one", "a request is answered once", one)
-    yield _case("framing", "reply-form", "a reply is its frame, and not a byte more", form)
-    yield _case("framing", "two-at-once", "two requests in one piece are both answered", two)
-    yield _case("framing", "byte-by-byte", "a request may come byte by byte", bytewise)
-    yield _case("framing", "junk", "bytes that are no message are passed over", junk)
+    yield _case("framing", "reply-form", "a reply is one frame without extra bytes", form)
+    yield _case("framing", "two-at-once", "two requests sent together are both answered", two)
+    yield _case("framing", "byte-by-byte", "a request may be sent byte by byte", bytewise)
+    yield _case("framing", "junk", "bytes that are not a message are ignored", junk)
     yield _case("framing", "half", "an incomplete message is dropped after a time-out", half)
     yield _case("framing", "overlong", "a message that is too long is dropped", overlong)
 
@@ -243,12 +243,12 @@ def _silent_header(
     return _case("header", name, f"a message with {what} is not answered", run)
 
 
-# --- identifiers ---
+# --- row IDs ---
 
 
 def _identifiers(icd: InterfaceDefinition, stack: object, clause: str) -> Iterator[Case[UnitProbe]]:
     for klass in [item.name for item in icd.classes if item.code is not None] or [""]:
-        title = f"unknown identifiers{f' of class {klass}' if klass else ''} are refused"
+        title = f"unknown IDs{f' of class {klass}' if klass else ''} are refused"
         run = _unknown(icd, stack, klass)
         yield _case("identifiers", klass or "unknown", title, run, clause, intrusive=True)
 
@@ -280,7 +280,7 @@ def _rows(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
         yield _case("telemetry", row.name, title, _read_twice(row), clause_of_row(row))
         bound = {field.value: name for name, field in row.named_fields.items() if field.value}
         if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
-            title = f"{row.name} has a quaternion of length 1 when it is valid"
+            title = f"{row.name} has a quaternion of length 1 if it is valid"
             yield _case("attitude", row.name, title, _unit_length(row, bound), clause_of_row(row))
 
 
@@ -352,7 +352,7 @@ def _settings(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
     for row in icd.telemetry.values():
         source = next((field.telecommand for field in row.named_fields.values() if field.telecommand), None)
         if source is not None and icd.telecommands[source].action in (None, "nothing"):
-            title = f"{row.name} reports the bytes that {source} has set"
+            title = f"{row.name} reports the bytes set by {source}"
             run = _read_back(icd.telecommands[source], row, used)
             yield _case("settings", row.name, title, run, clause_of_row(row), intrusive=True)
 
@@ -376,7 +376,7 @@ def _read_back(command: Row, row: Row, used: bytes) -> Run:
 
 
 def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
-    """Return a value within the limits: of bytes that the framing uses, if it may have them, or random."""
+    """Return a value within the limits, if possible of bytes special in the framing, or else random."""
     pattern = (
         (used * (turn + field.size))[turn:][: field.size] if turn < 2 and used else rng.randbytes(field.size)
     )
@@ -405,7 +405,7 @@ def _value(field: Field, used: bytes, turn: int, rng: random.Random) -> Value:
 def _echoes(icd: InterfaceDefinition) -> Iterator[Case[SerialUnitProbe]]:
     for row in icd.rows:
         if "echo" in row.answers:
-            title = f"{row.name} is echoed byte for byte before anything else"
+            title = f"{row.name} is echoed byte for byte before any other answer"
             intrusive = row.kind == "telecommand"
             yield _case("echo", row.name, title, _echoed(row), clause_of_row(row), intrusive=intrusive)
 
@@ -433,7 +433,7 @@ def _subscriptions(icd: InterfaceDefinition) -> Iterator[Case[UnitProbe]]:
         klass = str(row.arguments.get("class", ""))
         offered = [item for item in icd.telemetry.values() if klass in ("", item.klass)][:2]
         if row.action == "subscribe" and fields and offered:
-            title = f"{row.name} starts and stops telemetry that is not asked for"
+            title = f"{row.name} starts and stops unsolicited telemetry"
             run = _subscribed(row, fields, offered)
             yield _case("subscriptions", row.name, title, run, clause_of_row(row), intrusive=True)
 
@@ -463,7 +463,7 @@ def _clock(icd: InterfaceDefinition, stack: object) -> Iterator[Case[UnitProbe]]
     for command in icd.telecommands.values():
         arguments = {field.argument: name for name, field in command.named_fields.items()}
         if command.action == "set_clock" and "microseconds" in arguments and row is not None:
-            title = "the times of replies run from what the clock was set to"
+            title = "the times in replies follow the clock after it was set"
             run = _clock_runs(command, arguments["microseconds"], row)
             yield _case("clock", command.name, title, run, clause_of_row(command), intrusive=True)
 

@@ -1,4 +1,4 @@
-"""The tester's side of any unit, by its definition: its rows on any link, and its serial line."""
+"""The tester's side of any unit, based on its definition: rows on any link, and the serial line."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.values import Value
 
 PAUSE: Final = 1.6
-"""Silence after which a message has surely timed out, in time-outs."""
+"""Silence after which a message has certainly timed out, as a multiple of the time-out."""
 
 
 class UnitProbe(PortProbe):
-    """Asks a unit for its rows over a link.
+    """Talks to a unit over a link.
 
     Attributes
     ----------
     lively
-        Row by which the unit shows that it answers.
+        Row that is requested to check that the unit answers.
     """
 
     def __init__(self, port: Port[Any], icd: InterfaceDefinition, times: ProbeTimes | None) -> None:
@@ -50,14 +50,14 @@ class UnitProbe(PortProbe):
 
     @abstractmethod
     def next_reply(self) -> Reply | LinkFault | None:
-        """Return the next reply, None if none comes in time."""
+        """Return the next reply, or None if none arrives in time."""
 
     @abstractmethod
     def unsolicited_replies(self, seconds: float) -> list[Reply]:
-        """Return the messages of unsolicited telemetry that come within a time."""
+        """Return the messages of unsolicited telemetry that arrive within a time."""
 
     def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- for links on which it depends
-        """Return whether replies of a class can say that a request is refused."""
+        """Return whether replies of a class can express a refusal."""
         return True
 
     @property
@@ -68,11 +68,11 @@ class UnitProbe(PortProbe):
     # --- requests ---
 
     def request(self, row: Row, data: bytes = b"") -> Request:
-        """Return the request of a row."""
+        """Return the request for a row."""
         return self.icd.request(row, data)
 
     def ask(self, request: Request) -> Reply | LinkFault | None:
-        """Send a request and return the answer; one in several parts counts as its last."""
+        """Send a request and return the answer; of an answer in several parts, return the last."""
         self.post(request)
         answer = self.next_reply()
         while isinstance(answer, Reply) and not answer.final:
@@ -80,7 +80,7 @@ class UnitProbe(PortProbe):
         return answer
 
     def telemetry(self, row: Row) -> Reply:
-        """Return the telemetry of a row; anything else fails the case."""
+        """Return the telemetry of a row; any other answer fails the case."""
         self.post(self.request(row))
         return self.expect_telemetry(row)
 
@@ -105,11 +105,11 @@ class UnitProbe(PortProbe):
         check(accepted, f"acknowledge of {row.name}", describe(answer))
 
     def expect_refusal(self, request: Request, code: ErrorCode) -> None:
-        """Send a request that must be refused, or not answered where the unit's replies cannot refuse."""
+        """Send a request that must be refused, or not answered if replies cannot express a refusal."""
         what = f"{request.klass} {request.id}".strip()
         if not self.can_refuse(request.klass):
             self.post(request, answered=False)
-            self.expect_silence(f"no reply can refuse {what}")
+            self.expect_silence(f"no reply can express the refusal of {what}")
             return
         answer = self.ask(request)
         refused = isinstance(answer, Reply) and answer.kind is ReplyKind.NACK
@@ -118,14 +118,14 @@ class UnitProbe(PortProbe):
             check_equal(int(answer.code), int(self.icd.error_number(code)), f"code of the refusal of {what}")
 
     def expect_alive(self) -> None:
-        """Fail the case unless the next good request is answered."""
+        """Fail the case unless the next valid request is answered."""
         self.drain()
         self.telemetry(self.lively)
 
     # --- around a run ---
 
     def silence(self, *, booting: bool) -> str | None:
-        """Return the invalid answer to three requests, None if one is answered correctly."""
+        """Send three requests; return None if one is answered correctly, otherwise the invalid answer."""
         end = self.now() + (self.times.boot_s if booting else 0.0)
         while True:
             self.drain()
@@ -136,7 +136,7 @@ class UnitProbe(PortProbe):
                 return describe(answer)
 
     def settings(self) -> Sequence[tuple[Row, Row]]:
-        """Return the telecommands whose values a telemetry row reports, with that row."""
+        """Return the telecommands whose values a telemetry row reports, each with this row."""
         rows = ((row, next(iter(row.named_fields.values()), None)) for row in self.icd.telemetry.values())
         return [
             (self.icd.telecommands[field.telecommand], row)
@@ -145,11 +145,11 @@ class UnitProbe(PortProbe):
         ]
 
     def prepare(self) -> None:
-        """Note the settings that can be read."""
+        """Record the settings that can be read."""
         self._settings = [(command, self.telemetry(row).data) for command, row in self.settings()]
 
     def restore(self) -> None:
-        """Put the settings back."""
+        """Restore the settings."""
         self.recover()
         self.drain()
         for command, data in self._settings:
@@ -157,7 +157,7 @@ class UnitProbe(PortProbe):
 
 
 class SerialUnitProbe(SerialWire, UnitProbe):
-    """Talks over a serial port.
+    """Talks to a unit over a serial port.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ class SerialUnitProbe(SerialWire, UnitProbe):
     icd
         Definition of the unit.
     style
-        Dialect of the replies, of a unit that has dialects.
+        Dialect of the replies, if the unit has dialects.
     """
 
     def __init__(
@@ -181,13 +181,13 @@ class SerialUnitProbe(SerialWire, UnitProbe):
         self.stack = build_serial_stack(icd)
         self.timeout_s = icd.link.serial.timeout if icd.link.serial is not None else 0.5
         self.style = style or getattr(self.stack, "dialect", None)
-        """Dialect of the replies, of a unit that has dialects."""
+        """Dialect of the replies, if the unit has dialects."""
         self.drain()
 
     # --- the line ---
 
     def sleep_past_timeout(self) -> None:
-        """Let a message that has begun time out."""
+        """Wait until an incomplete message has timed out."""
         self.sleep(PAUSE * self.timeout_s)
 
     def drain(self) -> None:
@@ -208,7 +208,7 @@ class SerialUnitProbe(SerialWire, UnitProbe):
         self._note("<-", data)
         self.raw += data
         self._received += data
-        while self._received:  # byte by byte, since each reply decides what is expected next
+        while self._received:  # byte by byte, because each reply determines what is expected next
             self._take(self._received.pop(0))
         return True
 
@@ -243,14 +243,14 @@ class SerialUnitProbe(SerialWire, UnitProbe):
         self.send(self.stack.encode_request(request))
 
     def next_reply(self) -> Reply | LinkFault | None:
-        """Return the next reply, None if none comes in time; one with data in several parts as one."""
+        """Return the next reply, or None if none arrives in time; data in several parts are joined."""
         end = self.now() + self.times.answer_s
         while not self._replies and (left := end - self.now()) > 0:
             self._receive(left)
         return self._replies.popleft() if self._replies else None
 
     def can_refuse(self, klass: str) -> bool:
-        """Return whether replies of a class can say that a request is refused."""
+        """Return whether replies of a class can express a refusal."""
         stack = self.stack
         return not isinstance(stack, ComposedStack) or bool(
             stack.reply_header.roles_in(klass) & {"status", "ack"}
@@ -262,20 +262,20 @@ class SerialUnitProbe(SerialWire, UnitProbe):
         return not isinstance(self.stack, ComposedStack) or "status" in self.stack.reply_header.roles
 
     def expect_silence(self, why: str, seconds: float | None = None) -> None:
-        """Fail the case if anything comes within a time."""
+        """Fail the case if anything arrives within a time."""
         before = len(self.raw)
         self.sleep(self.times.quiet_s if seconds is None else seconds)
         check(len(self.raw) == before, f"nothing ({why})", self.raw[before:][:SHOWN_BYTES])
 
     def unsolicited_replies(self, seconds: float) -> list[Reply]:
-        """Return the messages of unsolicited telemetry that come within a time."""
+        """Return the messages of unsolicited telemetry that arrive within a time."""
         self._unsolicited.clear()
         self.sleep(seconds)
         return list(self._unsolicited)
 
 
 def describe(answer: Reply | LinkFault | None) -> str:
-    """Describe an answer in a line."""
+    """Describe an answer in one line."""
     if answer is None:
         return "nothing"
     if isinstance(answer, LinkFault):

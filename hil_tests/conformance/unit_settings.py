@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 LINK_PARAMETERS: Final = frozenset(
     {"serial_dialect", "serial_baud", "can_address", "host_address", "canopen_node"}
 )
-"""Parameters that would cut the tester off; no case leaves another value in them than it found."""
+"""Parameters that would disconnect the tester; every case restores their values."""
 SAVE_S: Final = 5.0
 
 
@@ -25,9 +25,9 @@ class UnitSettings:
     Attributes
     ----------
     running, stored
-        Values of the parameters by name, as numbers: those in use, and those that a restart brings.
+        Values of the parameters by name, as numbers: current ones, and those that apply after a restart.
     defaults
-        The unit's own defaults.
+        Defaults of the unit.
     mode
         Name of the mode.
     """
@@ -41,7 +41,7 @@ class UnitSettings:
     def read(probe: LinkProbe) -> UnitSettings:
         """Read the settings.
 
-        Where stored parameters differ from those in use, they are in use afterwards.
+        Stored parameters that differ from the current ones become current.
         """
         status = probe.telemetry("device_status")
         rows = _read_parameters(probe)
@@ -54,12 +54,12 @@ class UnitSettings:
         return UnitSettings(running, stored, defaults, str(status["mode"]))
 
     def prepare(self, probe: LinkProbe) -> None:
-        """Give the cases a unit in standby with its own defaults."""
+        """Set standby and the defaults of the unit."""
         probe.standby()
         set_parameters(probe, self.defaults)
 
     def restore(self, probe: LinkProbe) -> None:
-        """Put parameters, stored parameters and mode back."""
+        """Restore parameters, stored parameters and mode."""
         probe.standby()
         set_parameters(probe, self.stored)
         save_parameters(probe)
@@ -69,13 +69,13 @@ class UnitSettings:
             probe.command("set_mode", mode="lost_in_space" if self.mode == "tracking" else self.mode)
 
     def __str__(self) -> str:
-        """Parameters that are not at their defaults, for a user who has to put them back."""
+        """Parameters that differ from their defaults, for a user who has to restore them."""
         own = {name: value for name, value in self.stored.items() if value != self.defaults[name]}
         return ", ".join(f"{name} = {value:g}" for name, value in own.items()) or "all at their defaults"
 
 
 def _read_parameters(probe: LinkProbe) -> dict[str, dict[str, float]]:
-    """Read value and default of each parameter that a run may change."""
+    """Read value and default of each parameter that the run may change."""
     return {
         name: {key: float(seen[key]) for key in ("value", "default")}
         for name in probe.icd.parameters
@@ -85,7 +85,7 @@ def _read_parameters(probe: LinkProbe) -> dict[str, dict[str, float]]:
 
 
 def set_parameters(probe: LinkProbe, values: Mapping[str, float]) -> None:
-    """Set parameters in any order; those that another one bounds are set in a second pass."""
+    """Set parameters in any order; those limited by others are set in a second pass."""
     refused: list[str] = []
     for name, value in values.items():
         try:
@@ -97,7 +97,7 @@ def set_parameters(probe: LinkProbe, values: Mapping[str, float]) -> None:
 
 
 def save_parameters(probe: LinkProbe) -> None:
-    """Have the parameters stored, which must succeed."""
+    """Store the parameters, which must succeed."""
     probe.command("save_parameters")
     seen = probe.wait_for("acknowledge", {"processed": True}, SAVE_S)
     check_equal(seen["error"], "ok", "result of save_parameters")

@@ -1,4 +1,4 @@
-"""Tables of raw traffic on any link: the expected answers, and the error flags set in `communication_status`."""
+"""Tables of raw traffic on any link with the expected answers, or with the flags set in `communication_status`."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ class Exchange:
     Attributes
     ----------
     id, title, clause
-        As of a case; None for the clause of the area.
+        As in a case; clause None: that of the area.
     sent
-        Raw traffic, as `LinkProbe.send_text` takes it.
+        Raw traffic, in the format of `LinkProbe.send_text`.
     answers
-        Expected answers, as `LinkProbe.expect_exactly` takes them; no more may come.
+        All expected answers, in the format of `LinkProbe.expect_exactly`.
     pause_s
-        Pause after each piece, s.
+        Pause after each item, s.
     """
 
     id: str
@@ -64,8 +64,8 @@ def _exchange(row: Exchange, probe: LinkProbe | CanWire) -> None:
         probe.sleep(row.pause_s)
     for answer in row.answers:
         probe.expect_exactly(answer)
-    probe.expect_silence("no more was asked for")
-    # a message that was left open ends at the start of the next one
+    probe.expect_silence("no more was requested")
+    # an incomplete message ends at the start of the next one
     probe.expect_alive()
 
 
@@ -78,9 +78,9 @@ class FlagRow:
     id, title
         Name of the case, and the defect of the traffic.
     sent
-        Raw traffic, as `LinkProbe.send_text` takes it.
+        Raw traffic, in the format of `LinkProbe.send_text`.
     flags
-        Flags that must be set, and no others.
+        Exactly these flags must be set.
     pause_s
         Silence expected before the flags are read, s; None to read them at once.
     """
@@ -103,7 +103,7 @@ def check_flags(probe: LinkProbe, expected: frozenset[str]) -> dict[str, Value]:
 def add_flag_cases(area: CaseArea[ProbeType], rows: Iterable[FlagRow]) -> None:
     """Add one case per row."""
     for row in rows:
-        area.case(row.id, f"{row.title} sets its flag and counts as nothing")(partial(_flags, row))
+        area.case(row.id, f"{row.title} sets its flag and is not counted")(partial(_flags, row))
 
 
 def _flags(row: FlagRow, probe: LinkProbe) -> None:

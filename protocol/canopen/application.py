@@ -62,7 +62,7 @@ def check_status(status: int, what: str) -> None:
 
 
 def abort_of(error: MessageError) -> SdoAbortError:
-    """Return the SDO abort for a value that violates the interface definition."""
+    """Return the SDO abort that corresponds to a violation of the interface definition."""
     return SdoAbortError(
         AbortCode.LENGTH if isinstance(error, LengthError) else AbortCode.VALUE_RANGE, str(error)
     )
@@ -101,7 +101,7 @@ class StandInApplication:
         return row.encode(self.rows.get(row.name, {}))
 
     def telecommand(self, row: Row, payload: bytes) -> None:
-        """Record the telecommand; telemetry that reports its values has them from now on."""
+        """Record the telecommand, and set its values in the telemetry that reports them."""
         values = dict(row.decode(payload))
         self.commands.append((row.name, values))
         for name in self._reported[row.name]:

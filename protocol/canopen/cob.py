@@ -52,7 +52,7 @@ def check_can_id(cob_id: int) -> None:
 
 
 def check_replacement(old: int, new: int, *, lives_before: bool, lives_after: bool) -> None:
-    """Reject a change of the CAN ID in a COB-ID entry of an object that exists before and after."""
+    """Reject a change of the CAN ID of a communication object that stays enabled."""
     if lives_before and lives_after and (old ^ new) & (ID_MASK | EXTENDED):
         raise SdoAbortError(
             AbortCode.VALUE_RANGE, "disable the communication object before changing its CAN ID"

@@ -54,7 +54,7 @@ class SlaveEvent:
     now
         Time of the event, s, on the caller's clock.
     value
-        A number: NMT state, node-ID, error code, bit/s, Unix time in s.
+        A number: NMT state, node ID, error code, bit/s, Unix time in s.
     detail
         One line of text.
     """

@@ -1,4 +1,4 @@
-"""The object dictionary of a device, from communication profile and interface definition."""
+"""The object dictionary of a device, built from communication profile and interface definition."""
 
 from __future__ import annotations
 
@@ -48,8 +48,7 @@ DATA_TYPES: Final[dict[str, int]] = {
     "enum8": datatypes.UNSIGNED8,
     "bytes": datatypes.OCTET_STRING,
 }
-"""Types of the interface definition → CANopen. A bool is a byte, because a BOOLEAN is one bit in a
-PDO."""
+"""Type in the interface definition → CANopen data type; bool is a byte, as BOOLEAN takes one bit in PDOs."""
 
 Key = tuple[int, int]
 
@@ -83,7 +82,7 @@ class DeviceDictionary(Dictionary):
         self._sizes: dict[Key, int] = {}
         self._names: dict[str, Key] = {}
         self._placed: dict[tuple[str, str, int | None], Key] = {}
-        """Kind, name and slot of a row → entry that holds it; the slot is None for the whole row."""
+        """Kind, name and slot of a row → key of its entry; the slot is None for the whole row."""
         self._cache: dict[str, bytes] = {}
         self._cached_at = -1
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
@@ -101,7 +100,7 @@ class DeviceDictionary(Dictionary):
             self.entries[key].maximum_size = size
 
     def row_bytes(self, row: Row) -> bytes:
-        """Return a telemetry row's bytes, read from the application once per sampling instant."""
+        """Return the bytes of a telemetry row, read from the application once per sampling instant."""
         if self._cached_at != self.instant:
             self._cache.clear()
             self._cached_at = self.instant
@@ -188,7 +187,7 @@ class DeviceDictionary(Dictionary):
         add_record(objects, placed.name, members)
 
     def _setter_of(self, placed: PlacedObject, row: Row) -> Row:
-        """Return the telecommand that sets a record, whose values its telemetry row reports and nothing else."""
+        """Return the telecommand that sets a record, whose telemetry row must include it alone."""
         command = self.icd.telecommands[str(placed.telecommand)]
         reported = {field.telecommand for field in row.named_fields.values()}
         if reported != {command.name} or row.size != command.size:
@@ -198,7 +197,7 @@ class DeviceDictionary(Dictionary):
         return command
 
     def _execute_field(self, command: Row, row: Row, slot: Slot, payload: bytes) -> Deferred | None:
-        """Execute a telecommand with the values that its row reports, one of them changed."""
+        """Execute a telecommand with the values reported by its telemetry row and one changed value."""
         data = bytearray(self.row_bytes(row))
         data[span_of(slot)] = in_order(slot, payload)
         return self._execute(command, bytes(data))
@@ -256,7 +255,7 @@ class DeviceDictionary(Dictionary):
             default = int(default)
         data_type = DATA_TYPES[parameter.type]
         member = variable(name, *key, data_type, "rw", default, mappable=True)
-        set_limits(member, *_held_limits(parameter.type, parameter.minimum, parameter.maximum))
+        set_limits(member, *_representable_limits(parameter.type, parameter.minimum, parameter.maximum))
         member.unit = parameter.unit
         member.description = parameter.doc
         if parameter.enum is not None:
@@ -316,7 +315,7 @@ class DeviceDictionary(Dictionary):
     def _telecommand_variable(self, name: str, key: Key, row: Row, type_: str | None = None) -> ODVariable:
         """Return the variable whose write executes a telecommand.
 
-        The client writes the only value, all bytes (as a number if a type is given), or 1 if the telecommand
+        The client writes the only field, all bytes (as a number if a type is given), or 1 if the telecommand
         has no data.
         """
         text = type_ is None and [field.kind for field in row.fields] == ["text"]
@@ -427,7 +426,7 @@ def build_dictionary(icd: InterfaceDefinition) -> DeviceDictionary:
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
-    """Return the slots of a row that have named fields, each with these fields."""
+    """Return the slots of a row that have named fields, each with its fields."""
     slots = []
     for slot in row.slots:
         fields = [field for field in row.named_fields.values() if field.slot.index == slot.index]
@@ -455,10 +454,7 @@ def in_order(slot: Slot, data: bytes) -> bytes:
 
 
 def _describe(member: ODVariable, fields: list[Field]) -> None:
-    """Copy unit, scale, limits, names and text of a field to its variable.
-
-    Name the bits of a bit field.
-    """
+    """Copy unit, scale, limits, enumeration and description of a field to its variable, and name its bits."""
     first = fields[0]
     if first.width:
         for field in fields:
@@ -472,9 +468,9 @@ def _describe(member: ODVariable, fields: list[Field]) -> None:
         member.value_descriptions = dict(first.enum.names)
     elif first.minimum is not None or first.maximum is not None:
         limits = first.physical_limits if first.kind == "float" else first.raw_limits
-        set_limits(member, *_held_limits(first.slot.type, *limits))
+        set_limits(member, *_representable_limits(first.slot.type, *limits))
 
 
-def _held_limits(kind: str, low: float, high: float) -> tuple[float, float]:
-    """Return limits that a number of a type can equal: the nearest f32 may lie just outside the definition's limits."""
+def _representable_limits(kind: str, low: float, high: float) -> tuple[float, float]:
+    """Widen limits to values that the type can represent: the nearest f32 may be just outside."""
     return (min(low, to_f32(low)), max(high, to_f32(high))) if kind == "f32" else (low, high)

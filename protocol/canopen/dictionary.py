@@ -19,7 +19,7 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 Value = int | float | bool | str | bytes
 
 MAXIMUM_STRING: Final = 256
-"""Longest string or octet string, bytes, that may be written unless the entry has another limit."""
+"""Longest string or octet string that may be written, in bytes, unless the entry has its own limit."""
 
 COMMUNICATION: Final = range(0x1000, 0x2000)
 """Indices of the communication profile; higher indices belong to the application."""
@@ -30,8 +30,8 @@ class Deferred:
 
 
 Writer = Callable[[bytes], Deferred | None]
-"""Writes a value that passed all checks; raises `SdoAbortError`, or returns a token if the result
-follows later."""
+"""Writes a value that has passed all checks; raises `SdoAbortError`, or returns a token if the result follows
+later."""
 
 
 @dataclass(slots=True)
@@ -69,7 +69,7 @@ class Entry:
 
     @property
     def size(self) -> int | None:
-        """Bytes on the wire, or None for strings and domains."""
+        """Size on the wire in bytes, or None for strings and domains."""
         return type_size(self.variable.data_type)
 
     def read(self) -> bytes:
@@ -82,7 +82,7 @@ class Entry:
 
 
 def type_size(data_type: int | None) -> int | None:
-    """Return the bytes of a CANopen data type, or None if the length varies (strings, DOMAIN)."""
+    """Return the size of a CANopen data type in bytes, or None if it varies (strings, DOMAIN)."""
     if data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
         return 6
     packer = ODVariable.STRUCT_TYPES.get(data_type if data_type is not None else -1)
@@ -150,7 +150,7 @@ class Dictionary:
         self.changed: set[tuple[int, int]] = set()
         """Keys written since the node last cleared them."""
         self.instant = 0
-        """Number of the sampling instant; within one, a reader may return the same sample again."""
+        """Number of the sampling instant, within which a reader may return the same sample again."""
 
     def __iter__(self) -> Iterator[Entry]:
         return iter(self.entries.values())
@@ -167,7 +167,7 @@ class Dictionary:
     def load_defaults(self, indices: range, node_id: int) -> None:
         """Set the entries of a range of indices to their defaults.
 
-        Relative defaults include the node-ID.
+        Relative defaults include the node ID.
         """
         for (index, _), entry in self.entries.items():
             if index in indices and entry.reader is None:
@@ -210,7 +210,7 @@ class Dictionary:
 
 
 def default_bytes(variable: ODVariable, node_id: int) -> bytes:
-    """Return a variable's default as bytes; zero or empty if it has none."""
+    """Return the default of a variable as bytes; zero or empty if it has none."""
     default = variable.default
     if default is None:
         return bytes(type_size(variable.data_type) or 0)
@@ -220,7 +220,7 @@ def default_bytes(variable: ODVariable, node_id: int) -> bytes:
 
 
 def check_length(entry: Entry, length: int) -> None:
-    """Reject a length that the entry's type does not have, bytes."""
+    """Reject a length in bytes that is invalid for the entry."""
     lowest, highest = (0, entry.maximum_size) if entry.size is None else (entry.size, entry.size)
     if length > highest:
         raise SdoAbortError(

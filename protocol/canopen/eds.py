@@ -1,6 +1,6 @@
 """The electronic data sheet (EDS, CiA 306) of a node, generated from its object dictionary.
 
-`canopen.export_od` is not used: it writes the time of the call, and entries that EDS checkers reject.
+`canopen.export_od` is not used because it writes the current time, and entries that EDS checkers reject.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Section = list[tuple[str, str]]
 
 
 def build_eds(dictionary: Dictionary) -> str:
-    """Return the text of the EDS that describes an object dictionary."""
+    """Return the EDS of an object dictionary."""
     sections: list[tuple[str, Section, str]] = [
         ("FileInfo", _file_info(dictionary), ""),
         ("DeviceInfo", _device_info(dictionary), ""),
@@ -40,7 +40,11 @@ def build_eds(dictionary: Dictionary) -> str:
             ],
             "",
         ),
-        ("Comments", [("Lines", "1"), ("Line1", "Made from the interface definition; do not edit.")], ""),
+        (
+            "Comments",
+            [("Lines", "1"), ("Line1", "Generated from the interface definition; do not edit.")],
+            "",
+        ),
     ]
     indices = sorted(dictionary.od.indices)
     lists: dict[str, list[int]] = {"MandatoryObjects": [], "OptionalObjects": [], "ManufacturerObjects": []}

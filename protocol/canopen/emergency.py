@@ -19,8 +19,7 @@ COB_ID: Final = (0x1014, 0)
 INHIBIT: Final = (0x1015, 0)
 INHIBIT_UNIT_S: Final = 1e-4
 LONGEST_QUEUE: Final = 32
-"""Most messages that wait for the inhibit time; beyond it the oldest is dropped (its error stays in
-the history)."""
+"""Maximum number of messages that wait for the inhibit time; one more drops the oldest."""
 
 
 MESSAGE: Final = construct.Struct(
@@ -96,7 +95,7 @@ class EmergencyProducer:
             self._history.clear()
 
     def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> bool:
-        """Report an error unless it is active already.
+        """Report an error unless it is already active.
 
         Parameters
         ----------
@@ -107,7 +106,7 @@ class EmergencyProducer:
         data
             Up to 5 manufacturer-specific bytes.
         key
-            Distinguishes errors of one code (a PDO number, a node-ID).
+            Distinguishes errors with the same code (a PDO number, a node ID).
 
         Returns
         -------

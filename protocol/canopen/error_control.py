@@ -61,7 +61,7 @@ class ErrorControl:
         self._guarding_lost = False
 
     def configure(self) -> None:
-        """Restart: toggle bit 0, next heartbeat after one period, no node heard yet."""
+        """Reset: toggle bit 0, next heartbeat after one period, no heartbeat received yet."""
         self._toggle = 0
         self._life_deadline = None
         self._guarding_lost = False
@@ -109,7 +109,7 @@ class ErrorControl:
             self._emergency.clear_error(ErrorCode.HEARTBEAT, key=GUARDING_KEY)
 
     def tick(self) -> None:
-        """Send the heartbeat that is due; note who has fallen silent."""
+        """Send the heartbeat if it is due, and check which nodes have fallen silent."""
         now = self._context.now
         if self._next_heartbeat is not None and now >= self._next_heartbeat:
             self._context.send(ERROR_CONTROL + self._context.node_id, bytes([self._context.state]))

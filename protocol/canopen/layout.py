@@ -1,4 +1,4 @@
-"""The layout of the interface definition in the object dictionary: its table `[canopen]`."""
+"""The table `[canopen]` of an interface definition: the layout of its object dictionary."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class PackedField(_Model):
     source: str = Field(alias="from")
     """`ROW.FIELD`; a bit selects the whole bit field that contains it."""
     name: str | None = None
-    """Name in the record; default: the field's."""
+    """Name in the record; default: the name of the field."""
     type: PackedType
     """Type of the entry."""
     scale: Annotated[float, Field(gt=0)] = 1.0
@@ -48,7 +48,7 @@ class PlacedMember(_Model):
     parameter: str | None = None
     """Parameter that is read and set."""
     domain: Literal["ro", "wo"] | None = None
-    """A DOMAIN that never has data, such as a file that is absent: access is refused with 0800 0024h."""
+    """A DOMAIN that never has data, such as a missing file: access is refused with 0800 0024h."""
 
     @model_validator(mode="after")
     def _one_kind(self) -> PlacedMember:
@@ -61,7 +61,8 @@ class PlacedMember(_Model):
 class PlacedObject(_Model):
     """An application object.
 
-    The keys from `requests` on give its content: one of them, or `telecommand` with `value` or `telemetry`.
+    Its content is given by one of the keys from `requests` on, or by `telecommand` with `value` or
+    `telemetry`.
     """
 
     index: Index
@@ -69,9 +70,9 @@ class PlacedObject(_Model):
     name: str
     """Name of the object."""
     requests: bool = False
-    """A record of all rows, by ID as sub-index: telemetry to read, telecommands to write."""
+    """A record of all rows, with the ID as sub-index: read a telemetry row, write a telecommand."""
     telemetry: str | None = None
-    """A record of the fields of a telemetry row; with `telecommand`, which the row must include, a write to
+    """A record of the fields of a telemetry row. With `telecommand`, which the row must include, a write to
     one field executes the telecommand with the other fields unchanged."""
     value: str | None = None
     """A telemetry field to read, as `ROW.FIELD`."""
@@ -80,7 +81,7 @@ class PlacedObject(_Model):
     type: Literal["u8", "u16", "u32", "u64"] | None = None
     """Integer type that holds all data of the telecommand, so that a PDO can carry it."""
     parameters: bool = False
-    """A record of all parameters, by ID as sub-index."""
+    """A record of all parameters, with the ID as sub-index."""
     image: Literal["frame", "stored"] | None = None
     """A record of the last frame or the stored image: pixels (DOMAIN), width, height, frame counter."""
     packed: list[PackedField] = []
@@ -107,7 +108,7 @@ class PlacedObject(_Model):
         if self.type is not None and (
             self.telecommand is None or self.value is not None or self.telemetry is not None
         ):
-            raise ValueError("`type` is for a telecommand alone")
+            raise ValueError("`type` is only for a telecommand")
         return self
 
 
@@ -133,7 +134,7 @@ class PdoModel(_Model):
 
 
 class CanopenModel(_Model):
-    """The CANopen node: its identity and what its object dictionary holds."""
+    """The CANopen node: its identity and the content of its object dictionary."""
 
     device_type: Unsigned32
     """Object 1000h."""
@@ -158,16 +159,16 @@ class CanopenModel(_Model):
 
 
 def read_layout(icd: InterfaceDefinition) -> CanopenModel:
-    """Return the layout of the interface definition in the object dictionary.
+    """Return the layout of the object dictionary.
 
     Raises
     ------
     IcdError
-        The definition has none, or it is invalid; the text names file and key.
+        The definition has no `[canopen]`, or it is invalid; the text names file and key.
     """
     table = icd.canopen
     if table is None:
-        raise IcdError(f"unit {icd.name}: has no CANopen: its definition lacks the table [canopen]")
+        raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
     try:
         return CanopenModel.model_validate(table.document)
     except ValidationError as error:

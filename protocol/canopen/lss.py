@@ -1,4 +1,4 @@
-"""LSS slave: sets node-ID and bit rate, answers inquiries and identity scans (CiA 305)."""
+"""LSS slave: sets node ID and bit rate, answers inquiries and identity scans (CiA 305)."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ class Command(IntEnum):
 
 
 class LssHost(Protocol):
-    """What the LSS slave requires of its node."""
+    """Functions of the node that the LSS slave calls."""
 
     def activate_node_id(self, node_id: int) -> None:
-        """Leave the unconfigured state with a node-ID."""
+        """Leave the unconfigured state with a node ID."""
 
     def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
         """Change the bit rate: silence for `delay_s` before and after."""
 
     def store_lss(self, node_id: int, bit_rate: int) -> None:
-        """Save node-ID and bit rate; raise `ProtocolError` if that fails."""
+        """Save node ID and bit rate; raise `ProtocolError` if that fails."""
 
 
 class LssSlave:

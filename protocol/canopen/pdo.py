@@ -25,7 +25,7 @@ class ReceivePdo:
         self.next_deadline: float | None = None
 
     def configure(self) -> None:
-        """Apply the current records; drop messages that wait for SYNC."""
+        """Apply the current records and drop messages that wait for SYNC."""
         self.records.changed = False
         self._objects = self.records.mapped()
         self._size = sum(mapped.size for mapped in self._objects)
@@ -34,11 +34,11 @@ class ReceivePdo:
 
     @property
     def can_id(self) -> int | None:
-        """CAN ID of its message, None while the PDO is invalid or maps nothing."""
+        """CAN ID of the message; None while the PDO is disabled or maps no objects."""
         return self.records.can_id if self.records.valid and self._objects else None
 
     def receive(self, data: bytes) -> None:
-        """Process a message; report a wrong length, and drop a message that is too short."""
+        """Process a message; report a wrong length and drop a message that is too short."""
         if len(data) < self._size:
             detail = bytes([*self._key, len(data)])
             self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
@@ -118,7 +118,7 @@ class TransmitPdo:
         self._event_at: float | None = None
 
     def configure(self) -> None:
-        """Apply the current records; restart the timers and the SYNC count."""
+        """Apply the current records and restart the timers and the SYNC count."""
         self.records.changed = False
         self._objects = self.records.mapped()
         self._keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
@@ -130,7 +130,7 @@ class TransmitPdo:
 
     @property
     def active(self) -> bool:
-        """Whether it may be sent."""
+        """Whether the PDO may be sent."""
         return self.records.valid and bool(self._objects) and self._context.state is NmtState.OPERATIONAL
 
     @property
@@ -154,7 +154,7 @@ class TransmitPdo:
         self._event = not self._synchronous
 
     def trigger(self, keys: frozenset[tuple[int, int]]) -> None:
-        """Mark an event of one of these objects; `tick` sends an event-driven PDO as soon as the inhibit time allows."""
+        """Mark an event of these objects; `tick` sends an event-driven PDO once the inhibit time allows."""
         if self.active and not self._keys.isdisjoint(keys):
             self._event = True
 

@@ -13,9 +13,9 @@ from starhil.protocol.canopen.cob import BIT_30, ID_MASK, INVALID, check_can_id,
 from starhil.protocol.canopen.dictionary import Dictionary, Entry, type_size
 
 LARGEST_MAPPING: Final = 8
-"""Most objects in a PDO: the granularity is 8 bits."""
+"""Maximum number of objects in a PDO; the granularity is 8 bits."""
 LARGEST_PDO: Final = 8
-"""Most bytes in a PDO."""
+"""Maximum number of bytes in a PDO."""
 FIRST_DUMMY: Final = 0x0002
 LAST_DUMMY: Final = 0x0007
 """Data types whose index may be mapped in an RPDO as a placeholder (INTEGER8 to UNSIGNED32)."""
@@ -130,12 +130,12 @@ class PdoRecords:
 
     @property
     def valid(self) -> bool:
-        """Whether the PDO exists."""
+        """Whether the PDO is enabled."""
         return not self._cob_id.number() & INVALID
 
     @property
     def can_id(self) -> int:
-        """CAN ID of its message."""
+        """CAN ID of the message."""
         return self._cob_id.number() & ID_MASK
 
     @property

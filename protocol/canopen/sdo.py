@@ -25,13 +25,12 @@ LENGTH: Final = 8
 """Data bytes of every SDO frame."""
 ABORT: Final = 0x80
 RESULT_TIMEOUT_S: Final = 30.0
-"""Longer than any result takes: an exposure, after the processing of the image before it, takes
-seconds."""
+"""Longer than any result takes: an exposure that waits for the previous image takes seconds."""
 
 
 @dataclass
 class _Waiting:
-    """A download that is accepted and not yet answered."""
+    """A download that was accepted but not yet answered."""
 
     deferred: Deferred
     answers: list[bytes]
@@ -57,8 +56,7 @@ class SdoServer:
         self._waiting: _Waiting | None = None
         self.deadline: float | None = None
         self.faults: list[str] = []
-        """Texts of other errors than `SdoAbortError` that the application raised; the node reports
-        them as events."""
+        """Texts of unexpected errors in the application, which the node reports as events."""
 
     @property
     def busy(self) -> bool:
@@ -72,10 +70,7 @@ class SdoServer:
         self.deadline = None
 
     def finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> list[bytes]:
-        """Answer a download whose result is known.
-
-        Return nothing if the client no longer waits for it.
-        """
+        """Answer a download whose result is known; return nothing if the client no longer waits for it."""
         waiting = self._waiting
         if waiting is None or waiting.deferred is not deferred:
             return []
@@ -86,21 +81,21 @@ class SdoServer:
         return [self._abort(refusal.code, waiting.index, waiting.subindex)]
 
     def tick(self, now: float) -> list[bytes]:
-        """Abort a transfer whose client or whose result exceeds its timeout."""
+        """Abort a transfer whose client or result has timed out."""
         active = self._transfer or self._waiting
         if active is None or self.deadline is None or now < self.deadline:
             return []
         return [self._abort(AbortCode.TIMEOUT, active.index, active.subindex)]
 
     def receive(self, data: bytes, now: float) -> list[bytes]:
-        """Take the data of one frame and return the data of the answers.
+        """Process the data of one CAN frame and return the data of the answers.
 
         Parameters
         ----------
         data
-            Data of a frame with the request's COB-ID; any other length than 8 is ignored.
+            Data of a frame with the COB-ID of requests; a length other than 8 is ignored.
         now
-            Present time, s.
+            Current time, s.
         """
         if len(data) != LENGTH:
             return []
@@ -129,7 +124,7 @@ class SdoServer:
         return isinstance(self._transfer, BlockDownload) and self._transfer.streaming
 
     def _begins(self, data: bytes) -> bool:
-        """Return whether a request initiates a transfer, and so replaces the active one."""
+        """Return whether a request initiates a transfer, which replaces the active one."""
         if self._streaming():
             return False
         command = data[0]

@@ -1,4 +1,4 @@
-"""The master's side of SDO: transfers as generators that yield a request of 8 bytes and are sent its response."""
+"""SDO client: transfers as generators that yield requests of 8 bytes and are sent the responses."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starhil.protocol.codec import Row, Slot
 from starhil.protocol.messages import ErrorCode
 
 SdoTransfer = Generator[bytes, bytes, bytes]
-"""Returns the data of an upload, none after a download; raises `SdoAbortError` on an abort."""
+"""Returns the data of an upload, or no data after a download; raises `SdoAbortError` on an abort."""
 
 ERROR_OF_ABORT: Final = {
     AbortCode.NO_OBJECT: ErrorCode.INVALID_ID,
@@ -27,7 +27,7 @@ ERROR_OF_ABORT: Final = {
     AbortCode.UNSUPPORTED_ACCESS: ErrorCode.NOT_IMPLEMENTED,
     AbortCode.DEVICE_STATE: ErrorCode.BUSY,
 }
-"""Abort code → published error code; any other is an internal error."""
+"""Abort code → published error code; all others are internal errors."""
 
 _ABORT: Final = 0x80
 _SEGMENT: Final = 7
@@ -51,7 +51,7 @@ def upload(index: int, subindex: int) -> SdoTransfer:
 
 
 def download(index: int, subindex: int, data: bytes) -> SdoTransfer:
-    """Write an entry, expedited up to 4 bytes, else in segments."""
+    """Write an entry, expedited up to 4 bytes, otherwise in segments."""
     if 0 < len(data) <= 4:
         command = 0x23 | (4 - len(data)) << 2
         _checked((yield struct.pack("<BHB", command, index, subindex) + data.ljust(4, b"\0")))
@@ -67,7 +67,7 @@ def download(index: int, subindex: int, data: bytes) -> SdoTransfer:
 
 
 def row_transfer(dictionary: DeviceDictionary, row: Row, data: bytes = b"") -> SdoTransfer:
-    """Execute a telecommand with its data, or read a telemetry row, by the entries that hold it.
+    """Execute a telecommand with its data, or read a telemetry row, through the entries that hold it.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def _write(data: bytes, entries: Sequence[tuple[Key, Slot | None]]) -> SdoTransf
 
 
 def requests_of(transfer: SdoTransfer) -> list[bytes]:
-    """Return the requests of a download that nothing aborts."""
+    """Return the requests of a download, assuming that it is not aborted."""
     requests = [next(transfer)]
     with suppress(StopIteration):
         while True:
@@ -108,7 +108,7 @@ def requests_of(transfer: SdoTransfer) -> list[bytes]:
 
 
 def _checked(answer: bytes) -> bytes:
-    """Return an answer of 8 bytes that is no abort."""
+    """Return an answer if it has 8 bytes and is not an abort."""
     if answer[0] == _ABORT:
         number = int.from_bytes(answer[4:], "little")
         if number in ABORT_TEXTS:

@@ -1,8 +1,8 @@
 """Segmented and block SDO transfers, server side: one object per active transfer (CiA 301, SDO protocols).
 
 A transfer receives the 8 bytes of each further request and returns the 8-byte answers; `done` is set when it
-has ended. A violation of the protocol raises `SdoAbortError`; the server sends the abort and drops the
-transfer.
+has ended. It raises `SdoAbortError` if the protocol is violated; the server then sends the abort and drops
+the transfer.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from starhil.protocol.canopen.dictionary import Deferred
 SEGMENT: Final = 7
 """Data bytes of a segment."""
 MAXIMUM_BLOCK: Final = 127
-"""Most segments in a block."""
+"""Maximum number of segments in a block."""
 
 Commit = Callable[[bytes], Deferred | None]
-"""Writes the complete data to the object; raises `SdoAbortError`, or returns a token if the result
-follows later."""
+"""Writes the complete data to the object; raises `SdoAbortError`, or returns a token if the result follows
+later."""
 
 
 class Transfer:
@@ -32,22 +32,22 @@ class Transfer:
         self.subindex = subindex
         self.done = False
         self.deferred: Deferred | None = None
-        """Set at the end of a download whose result follows later; the answer waits for it."""
+        """Set at the end of a download whose result follows later and has to be awaited."""
 
     def request(self, data: bytes) -> list[bytes]:
-        """Answer one request; the base class rejects all."""
+        """Answer one request; the base class rejects all requests."""
         raise SdoAbortError(AbortCode.COMMAND, f"0x{data[0]:02X}")
 
 
 class ReceiveBuffer:
-    """Collects the data of a download, up to the announced size and the size that the object accepts.
+    """Collects the data of a download, up to the announced size and the maximum size of the object.
 
     Parameters
     ----------
     announced
         Size announced by the client, or None.
     maximum
-        Most bytes that the object accepts.
+        Maximum size of the object in bytes.
     """
 
     def __init__(self, announced: int | None, maximum: int) -> None:
@@ -56,14 +56,14 @@ class ReceiveBuffer:
         self.data = bytearray()
 
     def check(self) -> None:
-        """Reject more data than the object accepts or the client announced."""
+        """Reject more data than the maximum or the announced size."""
         if len(self.data) > self.maximum:
             raise SdoAbortError(AbortCode.LENGTH_HIGH, f"{len(self.data)} bytes, at most {self.maximum}")
         if self.announced is not None and len(self.data) > self.announced:
             raise SdoAbortError(AbortCode.LENGTH, f"{len(self.data)} bytes, {self.announced} announced")
 
     def finish(self) -> bytes:
-        """Return the complete data; reject less than announced."""
+        """Return the complete data; reject less data than announced."""
         self.check()
         if self.announced is not None and len(self.data) != self.announced:
             raise SdoAbortError(AbortCode.LENGTH, f"{len(self.data)} bytes, {self.announced} announced")
@@ -125,8 +125,7 @@ class SegmentedUpload(Transfer):
 class BlockDownload(Transfer):
     """The client writes blocks of up to 127 unconfirmed segments, with a CRC over all data at the end.
 
-    After a gap, the confirmation of the block names the last segment in sequence; the client repeats the
-    rest.
+    After a gap, the block is confirmed up to the last segment in sequence; the client repeats the others.
     """
 
     def __init__(
@@ -184,7 +183,7 @@ class BlockDownload(Transfer):
 class BlockUpload(Transfer):
     """The client reads blocks of up to 127 segments.
 
-    It confirms each block and may request the rest of it again.
+    The client confirms each block and may request segments again.
     """
 
     def __init__(self, index: int, subindex: int, data: bytes, block_size: int, *, crc: bool) -> None:

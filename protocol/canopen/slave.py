@@ -1,7 +1,7 @@
-"""A sans-I/O CANopen slave: frames and the time in, frames and events out (CiA 301, CiA 305).
+"""A sans-I/O CANopen slave: CAN frames and time in, CAN frames and events out (CiA 301, CiA 305).
 
 The caller owns bus and clock: it passes each frame to `receive`, calls `tick` at `next_deadline`, sends the
-returned frames in order, and collects the events. The slave never waits, reads a clock or starts a thread.
+returned frames in order, and collects the events. The slave does not block, read a clock or start threads.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ class CanopenSlave:
     dictionary
         Object dictionary with at least the communication profile of `communication.add_communication`.
     node_id
-        1 to 127, or 255 for a node that waits for LSS; a node-ID stored by LSS takes precedence.
+        1 to 127, or 255 for a node that waits for LSS; a node ID stored by LSS takes precedence.
     bit_rate
         Current bit rate, bit/s; a bit rate stored by LSS takes precedence.
     storage
-        Storage of the parameters; by default they do not survive a restart.
+        Storage of the parameters; the default keeps them only until a restart.
     sdo_timeout_s
         Silence of an SDO client after which its transfer is aborted.
     bit_rates
@@ -59,7 +59,7 @@ class CanopenSlave:
     Raises
     ------
     ProtocolError
-        The node-ID is invalid.
+        The node ID is invalid.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class CanopenSlave:
         bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
     ) -> None:
         if not 1 <= node_id <= 127 and node_id != UNCONFIGURED:
-            raise ProtocolError(f"CANopen node-ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
+            raise ProtocolError(f"CANopen node ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
         self.dictionary = dictionary
         self._context = context = Context(dictionary, node_id)
         self.store = ParameterStore(context, MemoryStorage() if storage is None else storage)
@@ -89,8 +89,8 @@ class CanopenSlave:
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
         self.pdos = PdoService(context, self.emergency)
         self.on_reset: Callable[[], int | None] | None = None
-        """Resets the application when NMT resets the node; a returned node-ID applies unless LSS
-        has stored one."""
+        """Called to reset the application when NMT resets the node; a returned node ID applies unless LSS has
+        stored one."""
         self._clock_offset_us = 0
         self._silence: tuple[float, float] | None = None
         self._pending_bit_rate = bit_rate
@@ -104,7 +104,7 @@ class CanopenSlave:
 
     @property
     def node_id(self) -> int:
-        """Current node-ID, 255 while it waits for LSS."""
+        """Current node ID, 255 while it waits for LSS."""
         return self._context.node_id
 
     def start(self, now: float) -> list[CanFrame]:
@@ -139,7 +139,7 @@ class CanopenSlave:
         return self._collect_frames()
 
     def next_deadline(self) -> float | None:
-        """Return when `tick` must be called, on the caller's clock; None while nothing is due."""
+        """Return the time at which `tick` must be called, on the caller's clock; None if nothing is due."""
         if self._silence is not None:
             return self._silence[0] if self._context.now < self._silence[0] else self._silence[1]
         if self._context.state is NmtState.INITIALISING:
@@ -163,7 +163,7 @@ class CanopenSlave:
     def finish_write(
         self, deferred: Deferred, now: float, refusal: SdoAbortError | None = None
     ) -> list[CanFrame]:
-        """Report the result of a write that the application deferred: success, or a refusal."""
+        """Report the result of a deferred write: success, or a refusal."""
         self._begin(now)
         for data in self.sdo.finish(deferred, refusal):
             self._context.send(SDO_TRANSMIT + self.node_id, data)
@@ -184,7 +184,7 @@ class CanopenSlave:
         return self._collect_frames()
 
     def reset_node(self, now: float, node_id: int | None = None) -> list[CanFrame]:
-        """Restart as after NMT "reset node", at the request of the application and without the event.
+        """Restart as after NMT "reset node", at the request of the application and without an event.
 
         A `node_id` applies from now on, unless LSS has stored one.
         """
@@ -204,13 +204,13 @@ class CanopenSlave:
         self._initialise(application=False)
 
     def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
-        """Stop sending, switch the bit rate after `delay_s`, resume after another (LSS)."""
+        """Stop sending, switch the bit rate after `delay_s`, and resume after another `delay_s` (LSS)."""
         now = self._context.now
         self._pending_bit_rate = bit_rate
         self._silence = (now + delay_s, now + 2 * delay_s)
 
     def store_lss(self, node_id: int, bit_rate: int) -> None:
-        """Save node-ID and bit rate (LSS)."""
+        """Save node ID and bit rate (LSS)."""
         self.store.save_lss(node_id, bit_rate)
 
     def _bind(self) -> None:
@@ -259,7 +259,7 @@ class CanopenSlave:
             self._silence = None
 
     def _route(self) -> None:
-        """Say which CAN ID goes where; everything but LSS needs a node-ID."""
+        """Assign a handler to each CAN ID; all services except LSS need a node ID."""
         routes: dict[int, list[Handler]] = {}
 
         def add(can_id: int | None, handler: Handler) -> None:

@@ -22,7 +22,7 @@ class StorageError(ProtocolError):
 
 
 class ParameterStorage(Protocol):
-    """Keeps groups of named values across a restart."""
+    """Stores groups of named values across a restart."""
 
     def load(self, group: str) -> dict[str, bytes]:
         """Return a group's values, empty if none are stored.
@@ -41,7 +41,7 @@ class ParameterStorage(Protocol):
 
 
 class MemoryStorage:
-    """Keeps values for the lifetime of the object."""
+    """Stores values for the lifetime of the object."""
 
     def __init__(self) -> None:
         self._groups: dict[str, dict[str, bytes]] = {}
@@ -60,13 +60,13 @@ class MemoryStorage:
 
 
 class FileStorage:
-    """Keeps values in one JSON file with a checksum; a save writes a new file and renames it over the old one.
+    """Stores values in a JSON file with a checksum; a save writes a new file and renames it over the old one.
 
     Parameters
     ----------
     path
-        The file; the first save creates its folder. One process at a time may use it: the emulator locks its
-        state folder.
+        The file; the first save creates its folder. Only one process at a time may use it; the emulator locks
+        its state folder.
     """
 
     def __init__(self, path: Path) -> None:

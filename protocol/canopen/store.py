@@ -37,9 +37,9 @@ class ParameterStore:
         self._context = context
         self._storage = storage
         self.on_save: Callable[[], Deferred | None] | None = None
-        """Saves the application's own parameters; raises `SdoAbortError` if it cannot."""
+        """Saves the parameters of the application; raises `SdoAbortError` on failure."""
         self.on_restore: Callable[[], Deferred | None] | None = None
-        """Resets the application's own parameters to the defaults at its next restart."""
+        """Resets the parameters of the application to their defaults at its next restart."""
         for index, action in ((STORE, self._store), (RESTORE, self._restore)):
             for subindex in (ALL, *GROUPS):
                 entry = context.dictionary.find(index, subindex)
@@ -62,14 +62,14 @@ class ParameterStore:
         self._context.dictionary.load_defaults(indices, self._context.node_id)
 
     def load_lss(self) -> tuple[int, int] | None:
-        """Return the node-ID and the bit rate, bit/s, that LSS stored, or None."""
+        """Return the node ID and the bit rate, bit/s, that LSS stored, or None."""
         values = self._stored(LSS)
         if "node_id" not in values or "bit_rate" not in values:
             return None
         return int.from_bytes(values["node_id"], "little"), int.from_bytes(values["bit_rate"], "little")
 
     def save_lss(self, node_id: int, bit_rate: int) -> None:
-        """Save node-ID and bit rate, bit/s. Raises `StorageError` if that fails."""
+        """Save node ID and bit rate, bit/s. Raises `StorageError` if that fails."""
         self._storage.save(LSS, {"node_id": bytes([node_id]), "bit_rate": bit_rate.to_bytes(4, "little")})
 
     def clear_lss(self) -> None:
@@ -105,7 +105,7 @@ class ParameterStore:
         return deferred
 
     def _save(self, group: str) -> None:
-        """Save the group's values that are not their defaults; a default relative to the node-ID stays relative."""
+        """Save the values of a group that differ from their defaults, which may depend on the node ID."""
         values = {
             f"{entry.key[0]:04X}:{entry.key[1]:02X}": entry.value
             for entry in self._context.dictionary

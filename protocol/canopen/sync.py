@@ -56,7 +56,7 @@ class SyncService:
         return data[0] if data else 0
 
     def tick(self) -> int | None:
-        """Produce a SYNC if one is due; return its counter so that the node acts on it too."""
+        """Produce a SYNC if one is due; return its counter, because the node must act on it too."""
         now, deadline = self._context.now, self.next_deadline
         if deadline is None or now < deadline:
             return None

@@ -1,4 +1,4 @@
-"""TIME consumer: the device receives the master's time of day (CiA 301: 1012h, TIME_OF_DAY)."""
+"""TIME consumer: receives the time of day from the master (CiA 301: 1012h, TIME_OF_DAY)."""
 
 from __future__ import annotations
 
@@ -56,5 +56,5 @@ class TimeConsumer:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
         check_can_id(new)
         if new & BIT_30:
-            raise SdoAbortError(AbortCode.VALUE_RANGE, "this node produces no TIME message")
+            raise SdoAbortError(AbortCode.VALUE_RANGE, "this node does not produce TIME messages")
         check_replacement(old, new, lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES))

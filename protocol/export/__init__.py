@@ -20,21 +20,21 @@ FORMATS: Final[Mapping[str, str]] = MappingProxyType(
         "cosmos": "command and telemetry definition of OpenC3 COSMOS",
     }
 )
-"""Description of each format of one text, by name."""
+"""Description of each format that is a single text, by name."""
 
 FOLDER_FORMATS: Final[Mapping[str, str]] = MappingProxyType(
     {
         "c": "C99 codec and serial link, header and source",
-        "cosmos-plugin": "plugin of OpenC3 COSMOS: target, interface and protocol of the serial line",
+        "cosmos-plugin": "plugin for OpenC3 COSMOS: target, interface and serial protocol",
     }
 )
-"""Description of each format of several files, by name."""
+"""Description of each format that consists of several files, by name."""
 
 
 def export(icd: InterfaceDefinition, name: str) -> str:
-    """Return the interface definition in a format of one text.
+    """Return the interface definition in a format that is a single text.
 
-    Raises ProtocolError for an unknown name, and for a definition that the format cannot hold.
+    Raises ProtocolError for an unknown format, and for a definition that the format cannot hold.
     """
     return cast("Callable[[InterfaceDefinition], str]", _exporter(name, FORMATS).render)(icd)
 
@@ -42,7 +42,7 @@ def export(icd: InterfaceDefinition, name: str) -> str:
 def export_folder(icd: InterfaceDefinition, name: str) -> Mapping[str, str]:
     """Return the interface definition in a format of several files: texts by path within the folder.
 
-    Raises ProtocolError for an unknown name, and for a definition that the format cannot hold.
+    Raises ProtocolError for an unknown format, and for a definition that the format cannot hold.
     """
     render = _exporter(name, FOLDER_FORMATS).render_folder
     return cast("Callable[[InterfaceDefinition], Mapping[str, str]]", render)(icd)

@@ -1,8 +1,7 @@
 """The interface definition as command and telemetry text of OpenC3 COSMOS.
 
-A packet is the row's identifier followed by its data; in a unit with classes the code of the class is the
-identifier's upper byte. COSMOS truncates the raw values that it computes, so a scaled parameter may be sent
-one step too small.
+A packet is the ID of a row followed by its data; in a unit with classes, the code of the class is the upper
+byte of the ID. COSMOS truncates computed raw values, so a scaled parameter may be sent one step too small.
 """
 
 from __future__ import annotations
@@ -23,7 +22,10 @@ IDENTIFIER: Final = "PACKET_ID"
 
 def render(icd: InterfaceDefinition) -> str:
     """Return commands and telemetry as one text."""
-    head = (f"# {icd.name} {icd.version}: {icd.doc}", "# Made from the interface definition; do not edit.")
+    head = (
+        f"# {icd.name} {icd.version}: {icd.doc}",
+        "# Generated from the interface definition; do not edit.",
+    )
     return "\n".join((*head, *commands(icd, TARGET), *telemetry(icd, TARGET))) + "\n"
 
 
@@ -35,7 +37,7 @@ def commands(icd: InterfaceDefinition, target: str) -> Iterator[str]:
         doc = row.doc if row.kind == "telecommand" else f"Request {row.name}."
         key = key_of(icd, row)
         yield from ("", f"COMMAND {target} {name.upper()} BIG_ENDIAN {_quoted(doc)}")
-        yield f'  APPEND_ID_PARAMETER {IDENTIFIER} {bits} UINT {key} {key} {key} "Identifier"'
+        yield f'  APPEND_ID_PARAMETER {IDENTIFIER} {bits} UINT {key} {key} {key} "Row ID"'
         if row.kind == "telecommand":
             yield from _fields(row, bits)
 
@@ -47,7 +49,7 @@ def telemetry(icd: InterfaceDefinition, target: str) -> Iterator[str]:
         if row.kind == "telecommand":
             continue
         yield from ("", f"TELEMETRY {target} {row.name.upper()} BIG_ENDIAN {_quoted(row.doc)}")
-        yield f'  APPEND_ID_ITEM {IDENTIFIER} {bits} UINT {key_of(icd, row)} "Identifier"'
+        yield f'  APPEND_ID_ITEM {IDENTIFIER} {bits} UINT {key_of(icd, row)} "Row ID"'
         yield from _fields(row, bits)
 
 
@@ -87,7 +89,7 @@ def _field(row: Row, field: Field, index: int, start: int) -> Iterator[str]:
 
 
 def _state(label: str) -> str:
-    """Return the name of a state: capitals, and no character that COSMOS would take for the end of a word."""
+    """Return the name of a state in capitals, without characters that end a word in COSMOS."""
     return re.sub(r"[^\w.-]", "_", label).upper()
 
 

@@ -39,7 +39,7 @@ class _Message:
 def render(icd: InterfaceDefinition) -> str:
     """Return the text of the database. Raises IcdError for a unit without a CAN link."""
     if icd.link.can is None:
-        raise IcdError(f"unit {icd.name}: has no CAN link ([link.can]), and a DBC holds messages of CAN only")
+        raise IcdError(f"unit {icd.name}: has no CAN link ([link.can]), and a DBC holds only CAN messages")
     host = int(icd.device_parameters["host_address"].default)
     device = int(icd.device_parameters["can_address"].default)
     messages = [message for row in icd.rows for message in _messages(row, icd, host, device)]
@@ -99,7 +99,7 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
 
 
 def _error_codes(icd: InterfaceDefinition) -> EnumDefinition:
-    """Return the numbers of refusals: the unit's enumeration, else the published ones."""
+    """Return the error codes: the unit's, or the published ones if it has none."""
     published = {code.name.lower(): int(code) for code in ErrorCode}
     return icd.enums.get("error_code") or EnumDefinition("error_code", "", published)
 

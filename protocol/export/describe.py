@@ -10,16 +10,16 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import EnumDefinition, Parameter, Section
 
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
-PARAMETER_COLUMNS: Final = ("Id", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
+PARAMETER_COLUMNS: Final = ("ID", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
 
 _BEHAVIOUR: Final = (
     (
-        "A telecommand with a value outside its range is refused with invalid_parameter and changes nothing. A number in telemetry "
-        "that is beyond its range is carried as the nearest limit (clipped) or by its lowest bits (wraps), as the range says; a "
-        "floating-point number without a range is carried as it is."
+        "A telecommand with a value outside its range is refused with invalid_parameter and changes nothing. In telemetry, a number "
+        "beyond its range is sent as the nearest limit (clipped) or modulo the range (wraps), as the range column states; a "
+        "floating-point number without a range is sent unchanged."
     ),
     (
-        "Source of a row or field: confirmed (public flight software or a manual has it, named at the row), proxy (public for "
+        "Source of a row or field: confirmed (by public flight software or a manual, named with the row), proxy (public for "
         "another unit of the same family) or ours (no public source; chosen here)."
     ),
 )
@@ -29,7 +29,7 @@ def introduction(icd: InterfaceDefinition) -> Iterator[str]:
     """Paragraphs before the tables."""
     first = icd.first_telemetry_id
     kinds = (
-        f" Identifiers below {first} are telecommands, from {first} on telemetry."
+        f" IDs below {first} are telecommands, IDs from {first} on are telemetry."
         if first is not None
         else ""
     )
@@ -43,13 +43,13 @@ def number(value: float) -> str:
 
 
 def title(row: Row) -> str:
-    """Return the heading of a row: class, if it has one, id and name."""
+    """Return the heading of a row: its class, if it has one, ID and name."""
     klass = f"{row.klass} " if row.klass else ""
     return f"{klass}{row.id} (0x{row.id:02X}) {row.name}"
 
 
 def anchor(row: Row) -> str:
-    """Return a name for a row's place in a page that no other row has."""
+    """Return the anchor of a row in a page; it is unique."""
     return f"row-{row.kind}-{row.klass}-{row.id}"
 
 
@@ -60,7 +60,7 @@ def facts(row: Row) -> str:
 
 
 def beyond(row: Row, field: Field) -> str:
-    """Return what telemetry does with a number beyond its range: "clipped", "wraps" or nothing."""
+    """Return how telemetry treats a number beyond its range: "clipped", "wraps" or nothing."""
     if row.kind != "telemetry" or field.kind not in ("integer", "float", "bits"):
         return ""
     if field.wrap:
@@ -70,7 +70,7 @@ def beyond(row: Row, field: Field) -> str:
 
 
 def meaning(row: Row, field: Field) -> str:
-    """Return text and behaviour beyond the range, for formats without a range column."""
+    """Return description and behaviour beyond the range, for formats without a range column."""
     low, high = (number(limit) for limit in field.physical_limits) if beyond(row, field) else ("", "")
     match beyond(row, field):
         case "wraps":

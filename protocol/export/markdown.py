@@ -29,7 +29,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     for heading, rows in describe.sections(icd):
         yield from ("", f"## {heading}", "")
         yield from _table(
-            ("Id", "Name", "Bytes", "Source", "Meaning"),
+            ("ID", "Name", "Bytes", "Source", "Meaning"),
             ((str(row.id), _link(row), str(row.size), row.provenance, row.doc) for row in rows),
         )
         for row in rows:

@@ -28,7 +28,7 @@ _PLACEHOLDERS: Final = {
 
 
 def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
-    """Return the sections on the links that the unit has."""
+    """Return the sections about the links of the unit."""
     found: list[Section] = []
     if icd.link.serial is not None:
         cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
@@ -44,8 +44,8 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
 def _composed(link: SerialLinkModel) -> Section:
     messages = (("request", link.request_header), ("reply", link.reply_header))
     text = (
-        f"{link.baud} bit/s, 8 data bits, no parity, 1 stop bit. A message is its header, the data of its row and the check, put between bytes "
-        f"by the framing. Framing: {_settings(link.framing)}. Check: {_settings(link.check)}."
+        f"{link.baud} bit/s, 8 data bits, no parity, 1 stop bit. A message consists of header, data of the row and check; the framing marks "
+        f"where it begins and ends. Framing: {_settings(link.framing)}. Check: {_settings(link.check)}."
     )
     return Section(
         "Serial line",
@@ -112,12 +112,12 @@ def _serial() -> Section:
     request = _format_message(encode_request(Request.of(_TELECOMMAND, data)))
     text = (
         f"A request is {request}, with every byte 1F of the data doubled; 8 data bits, no parity, 1 stop bit. "
-        "The form of the replies is the parameter serial_dialect; the code is a number of the enumeration error_code."
+        "The parameter serial_dialect selects the format of the replies; the code is a number of the enumeration error_code."
     )
     choice = (
-        "Dialect a is for OBC software written for the CubeComputer: a reply repeats the identifier. Dialect b is for software that "
-        "talks to a stand-alone node: a reply begins with the data, and only the request says what they are. Dialect c is "
-        "generation 2. Nothing in a message names its dialect: with b instead of a, each value is read one byte late and "
+        "Dialect a is for OBC software written for the CubeComputer: a reply repeats the ID. Dialect b is for software that "
+        "talks to a stand-alone node: a reply begins with the data and can only be interpreted with its request. Dialect c is "
+        "generation 2. The dialect cannot be recognised from a message: with b instead of a, each value is shifted by one byte and "
         "telecommands seem unanswered."
     )
     return Section(
@@ -144,10 +144,10 @@ def _can() -> Section:
         "CAN",
         (
             (
-                "Extended identifiers of 29 bits: type (bits 28 to 24), identifier of the row (23 to 16), source address (15 to 8), destination "
+                "29-bit CAN IDs: type (bits 28 to 24), row ID (23 to 16), source address (15 to 8), destination "
                 "address (7 to 0). By default the device has address 4 and the OBC 1 (parameters can_address and host_address)."
             ),
-            f"A message of more than 8 bytes goes in segments: up to {SEGMENT_DATA} bytes of data, then the number of segments still to come.",
+            f"A message of more than 8 bytes is sent in segments: up to {SEGMENT_DATA} bytes of data, then the number of remaining segments.",
         ),
         ("Type", "Message"),
         tuple(
@@ -164,7 +164,7 @@ def _objects(layout: CanopenModel) -> Section:
         (
             (
                 "The rows, fields and parameters of this definition as objects; types, sub-indices and limits are in the EDS. "
-                "Objects below 2000h are those of CiA 301."
+                "Objects below 2000h are defined by CiA 301."
             ),
         ),
         ("Index", "Name", "Content"),
@@ -174,9 +174,9 @@ def _objects(layout: CanopenModel) -> Section:
 
 def _content(placed: PlacedObject) -> str:
     if placed.requests:
-        return "all rows: the sub-index is the identifier; telecommands to write, telemetry to read"
+        return "all rows, with the ID as sub-index: write a telecommand, read a telemetry row"
     if placed.parameters:
-        return "all parameters: the sub-index is the parameter's identifier"
+        return "all parameters, with the ID as sub-index"
     if placed.image is not None:
         return f"image {placed.image}: pixels as DOMAIN, size, frame counter"
     if placed.packed:
@@ -185,10 +185,10 @@ def _content(placed: PlacedObject) -> str:
             + ", ".join(
                 f"{field.name or field.source}{' (wraps)' if field.wrap else ''}" for field in placed.packed
             )
-            + "; a number beyond its type is clipped"
+            + "; a number beyond the range of its type is clipped"
         )
     if placed.telemetry is not None:
-        return f"telemetry {placed.telemetry}: a sub-index a field"
+        return f"telemetry {placed.telemetry}: one sub-index per field"
     if placed.members:
         return ", ".join(member.name for member in placed.members)
     shown = [] if placed.value is None else [f"reads {placed.value}"]
@@ -202,7 +202,7 @@ def _pdos(layout: CanopenModel) -> Section:
     rows += [("RPDO", number, pdo) for number, pdo in enumerate(layout.rpdo, 1)]
     return Section(
         "CANopen PDOs",
-        ("The mapping by default; all of them can be remapped while the node is running.",),
+        ("The default mapping; all PDOs can be remapped while the node is running.",),
         ("PDO", "Name", "At start", "Transmission type", "Mapped"),
         tuple((f"{kind} {number}", *_pdo(pdo)) for kind, number, pdo in rows),
     )

@@ -1,7 +1,7 @@
 """The interface definition as XTCE 1.2 (XML Telemetric and Command Exchange).
 
-A packet is the row's identifier followed by its data; in a unit with classes the code of the class is the
-identifier's upper byte.
+A packet is the ID of a row followed by its data; in a unit with classes, the code of the class is the upper
+byte of the ID.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Base classes of all transports: non-blocking send, counters, and reconnection after a loss."""
+"""Base classes of all transports: non-blocking send, counters, and reconnection."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ReportError = Callable[[ProtocolError], None]
 class TransportError(ProtocolError):
     """A port or bus that is not available or was lost.
 
-    The text names it, the reason and the remedy.
+    The text names the port or bus, the reason and the remedy.
     """
 
 
@@ -38,11 +38,11 @@ class Statistics:
     sent: int = 0
     received: int = 0
     dropped: int = 0
-    """Items not sent because the peer does not read or the port is gone."""
+    """Items not sent because the peer did not read or the port was lost."""
     errors: int = 0
     """Failures reported to the error callback."""
     reconnects: int = 0
-    """Times that a lost port or bus came back."""
+    """Number of times that a lost port or bus came back."""
 
 
 class Transport(ABC, Generic[Item]):
@@ -50,7 +50,7 @@ class Transport(ABC, Generic[Item]):
 
     def __init__(self, description: str, statistics: Statistics | None = None) -> None:
         self.description = description
-        """Specification that opens the same port again; final once started."""
+        """Specification that opens the same port again; valid once started."""
         self.statistics: Final = statistics or Statistics()
         self._on_receive: Receive[Item] | None = None
         self._on_error: ReportError | None = None
@@ -58,9 +58,9 @@ class Transport(ABC, Generic[Item]):
         """Called with each received item before it is processed."""
 
     async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
-        """Open the port and pass what arrives to `on_receive`.
+        """Open the port and pass received items to `on_receive`.
 
-        Raises TransportError if the port is not available now. Later failures go to `on_error`, and the
+        Raises TransportError if the port is not available. Later failures are passed to `on_error`, and the
         transport reconnects automatically.
         """
         self._on_receive = on_receive
@@ -73,7 +73,7 @@ class Transport(ABC, Generic[Item]):
 
     @abstractmethod
     def send(self, item: Item) -> bool:
-        """Queue an item; never blocks. Returns False if it was dropped, which is counted."""
+        """Queue an item without blocking. Returns False if it was dropped; drops are counted."""
 
     @abstractmethod
     async def drain(self) -> None:
@@ -96,7 +96,7 @@ class Transport(ABC, Generic[Item]):
 
 
 class ReconnectingTransport(Transport[Item]):
-    """A port or bus that may disappear: reports the loss once, then retries with growing pauses."""
+    """A port or bus that may disappear: reports the loss once, then retries with increasing pauses."""
 
     kind: ClassVar[str]
     """Kind of port, the first word of every error text."""
@@ -126,7 +126,7 @@ class ReconnectingTransport(Transport[Item]):
         self._reconnection = asyncio.get_running_loop().create_task(self._reconnect())
 
     def _disconnect_safely(self) -> None:
-        """Disconnect; report a failure, which a half-lost port may cause."""
+        """Disconnect, and report a failure to do so."""
         try:
             self._disconnect()
         except Exception as error:  # noqa: BLE001 (the port is opened again or abandoned in any case)

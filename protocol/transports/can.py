@@ -1,4 +1,4 @@
-"""Choice of the CAN transport: kernel CAN, the TCP hub, or another bus of python-can."""
+"""Selection of the CAN transport: kernel CAN, the TCP hub, or another bus of python-can."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def open_can(
     Parameters
     ----------
     spec:
-        `auto` (vcan0 where the kernel has it, else the hub at `hub_host:hub_port`, started in this process if
-        none answers there), a kernel interface such as `vcan0` or `socketcan:can0`,
+        `auto` (vcan0 if the kernel has it, otherwise the hub at `hub_host:hub_port`, which is started in this
+        process if none answers there), a kernel interface such as `vcan0` or `socketcan:can0`,
         `socketcand:HOST:PORT/BUS`, `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only),
         or `slcan:PORT`.
     bitrate:
@@ -67,7 +67,7 @@ def open_can(
     Raises
     ------
     TransportError
-        The specification is not one of these.
+        The specification is invalid.
     """
     if spec == "auto":
         if kernel_can_is_up(DEFAULT_BUS):
@@ -111,7 +111,7 @@ def _open_bus(interface: str, channel: str, options: dict[str, Any]) -> can.BusA
 
 
 def _enlarge_receive_buffer(kernel_socket: socket.socket) -> None:
-    """Enlarge a socket's buffer, if permitted: the kernel drops what overflows."""
+    """Enlarge the buffer of a socket, if permitted: the kernel drops frames when it is full."""
     try:
         kernel_socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
     except PermissionError:

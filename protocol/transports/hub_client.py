@@ -18,7 +18,7 @@ from starhil.protocol.transports.base import ReconnectingTransport, TransportErr
 _LOGGER: Final = logging.getLogger("starhil.transport")
 
 BACKLOG_LIMIT: Final = 4 * 1024 * 1024
-"""Most bytes that wait for a hub that does not read."""
+"""Maximum number of bytes that wait for a hub that does not read."""
 
 HANDSHAKE_S: Final = 5.0
 """Longest time for the server's greeting and answers."""
@@ -32,7 +32,8 @@ EnsureServer = Callable[[], Awaitable[None]]
 class _Connection(TurnProtocol):
     """One connection to a server: answers during the handshake, frames after it.
 
-    While the server does not read, nothing is read from it either: replies to more requests would only wait.
+    While the server does not read, nothing is read from it either, because replies to more requests could not
+    be sent.
     """
 
     def __init__(
@@ -114,7 +115,7 @@ class HubTransport(ReconnectingTransport[CanFrame]):
     Parameters
     ----------
     host, port, bus:
-        Server and name of the bus there.
+        Address of the server, and name of the bus there.
     ensure_server:
         Awaited before each connection; starts a server if there is none (used by `auto`).
     """

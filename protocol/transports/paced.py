@@ -1,4 +1,4 @@
-"""Serial transports that send at the line's bit rate and never block."""
+"""Serial transports that send at the bit rate of the line and never block."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Statistics, Transport
 
 BACKLOG_LIMIT: Final = 64 * 1024
-"""Most bytes that wait for the line or for a peer that does not read."""
+"""Maximum number of bytes that wait for the line or for a peer that does not read."""
 
 TICK_S: Final = 0.002
-"""Time between two writes of a long message, which is sent in chunks as a line would carry it."""
+"""Time between two writes of a long message, which is sent in chunks at the pace of the line."""
 
 RETRY_S: Final = 0.005
-"""Time until the next attempt when the port is full."""
+"""Time until the next attempt if the port is full."""
 
 
 class PacedWriter:
-    """Writes queued bytes to a port no faster than its line.
+    """Writes queued bytes to a port no faster than the line carries them.
 
     Parameters
     ----------
     write:
-        Writes without blocking and returns how many bytes it accepted (0 if the port is full). OSError means
-        that the port is lost; the bytes are dropped, as on a line without a peer.
+        Writes without blocking and returns how many bytes were accepted (0 if the port is full). OSError
+        means that the port is lost; the bytes are dropped, as on a line without a peer.
     schedule:
-        Byte times of the line, or None for no pacing.
+        Schedule of bytes on the line, or None for no pacing.
     """
 
     def __init__(
@@ -45,9 +45,9 @@ class PacedWriter:
         self.schedule = schedule
         self._statistics = statistics
         self._queue: deque[tuple[float, bytes]] = deque()
-        """Messages with the time at which the first byte begins."""
+        """Messages, each with the time at which its first byte begins."""
         self._written = 0
-        """Bytes of the first message that have been written."""
+        """Number of bytes of the first message that have been written."""
         self._backlog = 0
         self._timer: asyncio.TimerHandle | None = None
         self._idle = asyncio.Event()
@@ -56,11 +56,11 @@ class PacedWriter:
 
     @property
     def backlog(self) -> int:
-        """Bytes that wait."""
+        """Number of waiting bytes."""
         return self._backlog
 
     def send(self, data: bytes) -> bool:
-        """Queue a message, whole or not at all."""
+        """Queue a complete message, or drop it."""
         if self._backlog + len(data) > BACKLOG_LIMIT:
             self._statistics.dropped += len(data)
             return False
@@ -80,7 +80,7 @@ class PacedWriter:
         await self._idle.wait()
 
     def when_idle(self, action: Callable[[], None]) -> None:
-        """Call `action` once the queue is empty; it replaces an earlier action."""
+        """Call `action` once the queue is empty; replaces an earlier action."""
         self._idle_action = action
         if self._idle.is_set():
             self._become_idle()
@@ -124,7 +124,7 @@ class PacedWriter:
             self._become_idle()
 
     def _due_bytes(self, now: float) -> tuple[bytes, float]:
-        """Return the bytes whose stop bit has passed at `now`, and the time of the next check."""
+        """Return the number of bytes that the line has carried by `now`, and the time of the next check."""
         if self.schedule is None:
             whole = b"".join(data for _, data in self._queue)
             return whole[self._written :], now
@@ -159,7 +159,7 @@ class SerialTransport(Transport[bytes]):
 
 
 class PacedTransport(SerialTransport):
-    """Common base: a port behind a paced writer."""
+    """Base of the ports with a paced writer."""
 
     def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
         super().__init__(description)
@@ -188,7 +188,7 @@ class PacedTransport(SerialTransport):
         self._writer = PacedWriter(self._write, self._schedule, self.statistics)
 
     def send(self, item: bytes) -> bool:
-        """Queue a message, whole or not at all; without an open port it is dropped."""
+        """Queue a complete message, or drop it; without an open port it is dropped."""
         if self._writer is None:
             self.statistics.dropped += len(item)
             return False
@@ -219,7 +219,7 @@ def write_fd(fd: int, data: bytes) -> int:
 
 @contextlib.contextmanager
 def termios_as_os_error() -> Iterator[None]:
-    """Raise `termios.error`, which does not derive from OSError, as an OSError."""
+    """Convert `termios.error`, which does not derive from OSError, to OSError."""
     try:
         yield
     except termios.error as error:

@@ -1,8 +1,7 @@
-"""Serial transport over a pseudo-terminal, and the detection of who has its slave side open.
+"""Serial transport over a pseudo-terminal, with detection of peers on its slave side.
 
-A wire stores nothing for an absent reader, but a pseudo-terminal does. The master reports a hang-up while no
-process has the slave side open. inotify reports the openings and closings when one peer leaves and another
-comes at once.
+Unlike a wire, a pseudo-terminal stores bytes for an absent reader. The master reports a hang-up while no
+process has the slave side open; if a peer leaves and another comes at once, only inotify reports this.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _EVENTS_SIZE: Final = 256 * _EVENT.size
 
 
 class PtyPeers:
-    """Watches the slave side of a pseudo-terminal, which this process must not hold open.
+    """Watches the slave side of a pseudo-terminal, which this process must not have open.
 
     Parameters
     ----------
@@ -42,8 +41,7 @@ class PtyPeers:
     path
         Path of the slave side.
 
-    Without inotify (the system has no more instances), a peer that leaves and is replaced at once goes
-    unnoticed.
+    Without inotify (if the system has no free instance), a peer that is replaced at once goes unnoticed.
     """
 
     def __init__(self, master: int, path: str) -> None:
@@ -59,7 +57,7 @@ class PtyPeers:
         self._present = self.present
 
     def fileno(self) -> int:
-        """Return the descriptor that is readable when data wait or a peer came or left."""
+        """Return the descriptor that is readable when data are waiting or a peer came or left."""
         return self._wake.fileno()
 
     def acknowledge(self) -> None:
@@ -72,12 +70,12 @@ class PtyPeers:
         return not self._hang_up.poll(0)
 
     def all_left(self) -> bool:
-        """Return whether all peers have left since the last call, if only for a moment."""
+        """Return whether all peers have left at some time since the last call."""
         before, self._present = self._present, self.present
         return _replaced(self._new_events()) or (before and not self._present)
 
     def discard_unread(self) -> None:
-        """Drop what was written to the master and has not been read."""
+        """Drop the bytes written to the master that have not been read."""
         termios.tcflush(self._master, termios.TCOFLUSH)  # on the way to the line discipline
         with contextlib.suppress(PermissionError, BlockingIOError):
             slave = os.open(self._path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
@@ -85,9 +83,9 @@ class PtyPeers:
                 termios.tcflush(slave, termios.TCIFLUSH)  # in the line discipline
             finally:
                 os.close(slave)
-        for (
-            _
-        ) in self._new_events():  # of this call, and of peers that came since, for whom nothing stale is left
+        for _ in (
+            self._new_events()
+        ):  # of this call, and of peers that came since, for whom no stale bytes are left
             pass
         self._present = self.present
 
@@ -119,7 +117,7 @@ def _replaced(events: Iterator[int]) -> bool:
 
 
 def _watch(path: str) -> int:
-    """Return an inotify descriptor for a file's openings and closings, or -1 if none is left."""
+    """Return an inotify descriptor that reports when a file is opened or closed, or -1 if none is free."""
     events = int(_LIBC.inotify_init1(os.O_NONBLOCK | os.O_CLOEXEC))
     if events >= 0 and _LIBC.inotify_add_watch(events, os.fsencode(path), _IN_OPEN | _IN_CLOSE) < 0:
         os.close(events)
@@ -130,8 +128,8 @@ def _watch(path: str) -> int:
 class PtyTransport(PacedTransport):
     """A new pseudo-terminal; peers open its slave side like any tty, as often as they want.
 
-    As on a wire, bytes sent while no peer has the slave side open are lost, and so are those that a peer left
-    unread.
+    As on a wire, bytes sent while no peer has the slave side open are lost; so are bytes that a peer has not
+    read when it leaves.
     """
 
     def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
@@ -146,7 +144,7 @@ class PtyTransport(PacedTransport):
             self._master, slave = os.openpty()
         except OSError as error:
             raise TransportError(
-                f"serial pty: the system has no pseudo-terminal left: {error.strerror}"
+                f"serial pty: the system has no free pseudo-terminal: {error.strerror}"
             ) from None
         try:
             with termios_as_os_error():
@@ -202,7 +200,7 @@ class PtyTransport(PacedTransport):
             peers.discard_unread()
 
     def send(self, item: bytes) -> bool:
-        """Queue a message, whole or not at all; without a peer it is dropped."""
+        """Queue a complete message, or drop it; without a peer it is dropped."""
         if self._peers is not None:
             self._drop_unread(self._peers)
             if not self._peers.present:

@@ -17,13 +17,13 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
 
 QUEUE_LIMIT: Final = 10_000
-"""Most frames that wait for the bus."""
+"""Maximum number of frames that wait for the bus."""
 
 RETRY_S: Final = 0.001
-"""Time until the next attempt when the bus's transmit buffer is full."""
+"""Time until the next attempt if the transmit buffer of the bus is full."""
 
 READ_TIMEOUT_S: Final = 0.2
-"""Longest wait of one read in the reader thread (buses without a file descriptor)."""
+"""Timeout of one read in the reader thread (for buses without a file descriptor)."""
 
 READS_PER_TURN: Final = 256
 """Frames read per turn of the loop."""
@@ -35,10 +35,10 @@ ECHO_S: Final = 5.0
 """Time within which a bus that echoes returns a sent frame."""
 
 ECHO_LIMIT: Final = 10_000
-"""Most sent frames whose echo is awaited; beyond it the oldest is forgotten."""
+"""Maximum number of sent frames whose echo is awaited; one more replaces the oldest."""
 
 BUS_OFF: Final = 0x40
-"""Flag of the kernel's error frames: the controller has left the bus."""
+"""Flag in error frames of the kernel: the controller is bus-off."""
 
 OpenBus = Callable[[], can.BusABC]
 
@@ -53,7 +53,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
     open_bus:
         Opens the bus; runs in a thread, since it may block.
     echoes:
-        The bus returns sent frames (udp_multicast); the transport removes these echoes.
+        Whether the bus returns sent frames (udp_multicast); the transport removes these echoes.
     """
 
     kind = "CAN"
@@ -155,7 +155,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         self._receive(frame)
 
     def _is_echo(self, frame: CanFrame) -> bool:
-        """Return whether a frame is the echo of a sent one, which is then no longer awaited."""
+        """Return whether a frame is an awaited echo, and stop waiting for it."""
         if self._echoes is None:
             return False
         now = time.monotonic()

@@ -1,4 +1,4 @@
-"""Choice of the serial transport by specification, and the transports over a tty and over TCP."""
+"""Selection of the serial transport by specification, and the transports over a tty and over TCP."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from starhil.protocol.transports.paced import PacedTransport, SerialTransport, t
 from starhil.protocol.transports.pty import PtyTransport
 
 STREAM_LIMIT: Final = 65536
-"""Most bytes that wait in a TCP connection for a peer that does not read."""
+"""Maximum number of bytes that wait in a TCP connection for a peer that does not read."""
 DEFAULT_BAUD: Final = 115200
 RATE_RETRY_S: Final = 0.002
-"""Time between checks whether the kernel has sent everything, before the bit rate changes."""
+"""Interval at which the kernel's buffer is checked before the bit rate changes."""
 
 
 def open_serial(
@@ -37,20 +37,20 @@ def open_serial(
     ----------
     spec:
         `auto` or `pty` for a new pseudo-terminal, the path of a tty, `socket://HOST:PORT` to connect, or
-        `listen://HOST:PORT` to wait for one peer (with port 0, `description` has the free port that was
-        chosen).
+        `listen://HOST:PORT` to wait for one peer (with port 0, a free port is chosen and given in
+        `description`).
     baud:
-        Bit rate, 8N1. It sets the pacing, and the hardware of a real tty.
+        Bit rate, 8N1, for the pacing and for the hardware of a real tty.
     symlink:
-        Path of a symlink to the pseudo-terminal; made atomically, removed at close.
+        Path of a symlink to the pseudo-terminal; created atomically, removed on close.
     paced:
-        Whether bytes are sent no faster than the bit rate; by default true, except on a real tty, whose
-        hardware does it.
+        Whether bytes are sent no faster than the bit rate; true by default, except for a real tty, which is
+        paced by its hardware.
 
     Raises
     ------
     TransportError
-        The specification is not one of these.
+        The specification is invalid.
     """
     schedule = PacingSchedule(baud)
     pace = schedule if paced is None or paced else None
@@ -219,7 +219,7 @@ class _StreamProtocol(TurnProtocol):
 
 
 class _TcpTransport(_ReconnectingSerial):
-    """Common base of both TCP transports."""
+    """Base of both TCP transports."""
 
     def __init__(self, scheme: str, host: str, port: int, schedule: PacingSchedule | None) -> None:
         super().__init__(f"{scheme}://{host}:{port}", schedule)
@@ -229,7 +229,7 @@ class _TcpTransport(_ReconnectingSerial):
         self._protocol: _StreamProtocol | None = None
 
     def attach(self, protocol: _StreamProtocol, stream: asyncio.Transport) -> None:
-        """Use a connection; a second one at the same time is rejected."""
+        """Use a connection; a second one is rejected."""
         if self._stream is not None:
             stream.abort()
             return
@@ -248,7 +248,7 @@ class _TcpTransport(_ReconnectingSerial):
 
     @abstractmethod
     def _peer_gone(self, why: str) -> None:
-        """React to the end of the connection."""
+        """Handle the loss of the peer."""
 
     def _write(self, data: bytes) -> int:
         if self._stream is None:

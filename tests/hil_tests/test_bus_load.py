@@ -160,7 +160,7 @@ def test_a_bad_device_on_serial_is_found(fault: Answer, dialect: Dialect) -> Non
 def test_a_device_without_unsolicited_telemetry_is_reported() -> None:
     async def main() -> None:
         async with can_device(good) as spec:
-            with pytest.raises(BenchError, match="only 0 messages came"):
+            with pytest.raises(BenchError, match="only 0 messages were received"):
                 await unsolicited_jitter(ICD, spec, 0.1, 20.0, device=DEVICE)
         async with can_device(silent) as spec:
             with pytest.raises(BenchError, match="does not answer"):

@@ -37,7 +37,7 @@ def row(kind: str, number: int, name: str, fields: str = "", more: str = "") -> 
 
 
 @pytest.mark.parametrize(
-    ("unit", "message"), [("sagitta", "has no reply dialects"), ("cubestar-gen2", "has dialect c alone")]
+    ("unit", "message"), [("sagitta", "has no reply dialects"), ("cubestar-gen2", "has only dialect c")]
 )
 def test_a_dialect_that_the_unit_does_not_have_is_refused(unit, message):
     request = ConformanceRequest(unit=unit, serial="/dev/null", dialect="b")

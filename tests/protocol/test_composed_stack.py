@@ -207,7 +207,7 @@ HEADER = [{"role": "id", "type": "u8"}]
                 "framing": {"kind": "slip"},
                 "request_header": [{"type": "bits8", "bits": [{"role": "id", "width": 5}]}],
             },
-            "the bits make 5, must be 8",
+            "the bits add up to 5, must be 8",
         ),
         ({"framing": {"kind": "slip", "end": 1, "escape": 1}, "request_header": HEADER}, "must differ"),
         (

@@ -24,7 +24,7 @@ def last_cells(section: Section) -> dict[str, str]:
 
 
 EXAMPLE = last_cells(SECTIONS["Attitude convention"])
-OTHERS = last_cells(SECTIONS["Attitude of other programs"])
+OTHERS = last_cells(SECTIONS["Attitude in other programs"])
 
 
 def numbers(cell: str) -> np.ndarray:
@@ -66,7 +66,7 @@ def test_the_quaternion_turns_vectors_into_the_sensor_frame():
     assert turned[:3] == pytest.approx(seen, abs=4 * DIGITS)
     assert MATRIX @ v == pytest.approx(seen, abs=4 * DIGITS)
     assert Rotation.from_quat(Q).apply(v) == pytest.approx(seen, abs=4 * DIGITS)
-    place = numbers(EXAMPLE["its place in the image"])
+    place = numbers(EXAMPLE["its position in the image"])
     assert 468.0 + 1220.4842 * seen[:2] / seen[2] == pytest.approx(place, abs=0.006)
 
 

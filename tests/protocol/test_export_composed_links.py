@@ -197,5 +197,5 @@ def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     stack = build_stack(model, framings=custom, checks={"mine": lambda _data: b""})
     assert isinstance(stack, ComposedStack)
     assert isinstance(model.framing, CustomFraming) or isinstance(model.check, CustomCheck)
-    with pytest.raises(ProtocolError, match="'mine' is code of the unit's plugin"):
+    with pytest.raises(ProtocolError, match="'mine' is Python code in the unit's plugin"):
         link_text(stack)

@@ -1,4 +1,4 @@
-"""Replies of the ST-16 whose data depend on the request: memory, and the result structure by address or by parts.
+"""Replies of the ST-16 whose data depend on the request: memory, and the result structure by address or in parts.
 
 Layout of the result: `sinclair_stt_result_operational` in hsfl/cosmos-core, libraries/device/sinclair_lib.h.
 """
@@ -13,23 +13,23 @@ from starhil.protocol.messages import ErrorCode
 from starhil.protocol.plugin import action
 
 VALID = 0x01 | 0x02 | 0x04 | 0x08 | 0x10 | 0x40
-"""Return code of a full and consistent solution from two good images."""
+"""Return code for a full and consistent solution from two good images."""
 FAILED = 0x10
-"""Return code where full processing found no attitude."""
+"""Return code if full processing found no attitude."""
 
 PARTS = ((0x00, 4), (0x04, 4), (0x08, 32), (0x28, 24), (0x40, 8), (0x48, 56), (0x80, 172))
-"""Offset and size of the part for each bit of a combination, the lowest first."""
+"""Offset and size of the part selected by each bit of a combination, lowest bit first."""
 RESULT_SIZE = 0x80 + 172
 ANALOG_ADDRESS = 0x04
 LENGTH_ADDRESS = 0x4C
 EDAC_SIZE = 0x50
-LARGEST_FRAME = 256
-"""Bytes of the result in one frame (ours)."""
+MAX_MESSAGE_SIZE = 256
+"""Bytes of the result in one message (ours)."""
 
 
 def reader(device: Any) -> Callable[[str], float]:
-    """Return a function that reads quantities of the device by name; 0 where there is no value."""
-    # Imported here: whoever only reads the definition needs no emulator.
+    """Return a function that reads quantities of the device by name, or 0 if a quantity has no value."""
+    # Imported here because reading the definition must not require the emulator.
     from starhil.emulator.device.quantities import getter_of
     from starhil.emulator.device.snapshot import Snapshot
 
@@ -59,7 +59,7 @@ def result(device: Any) -> bytes:
 
 
 def edac(device: Any) -> bytes:
-    """Return the memory that is read in flight: analog values, and the length of the result."""
+    """Return the memory that can be read: analog values, and the length of the result."""
     value = reader(device)
     names = ("mcu_current", "bus_voltage", "core_voltage", "mcu_voltage", "io_voltage", "mcu_temperature",
              "supervisor_voltage", "detector_voltage")  # fmt: skip
@@ -70,8 +70,8 @@ def edac(device: Any) -> bytes:
     return bytes(memory)
 
 
-def placed(memory: bytes, address: int, count: int) -> bytes:
-    """Return the address and the bytes at it."""
+def memory_reply(memory: bytes, address: int, count: int) -> bytes:
+    """Return the data of a reply: an address and the bytes there."""
     from starhil.emulator.device.refusal import Refused
 
     if address + count > len(memory):
@@ -81,8 +81,8 @@ def placed(memory: bytes, address: int, count: int) -> bytes:
 
 @action("read_edac")
 def read_edac(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
-    """Answer with the address and the memory at it."""
-    return [placed(edac(device), arguments["address"], arguments["count"])]
+    """Answer with an address and the memory there."""
+    return [memory_reply(edac(device), arguments["address"], arguments["count"])]
 
 
 @action("go")
@@ -93,17 +93,17 @@ def go(_device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
 
 @action("read_result")
 def read_result(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
-    """Answer with the offset and the bytes of the result, in as many frames as it takes."""
+    """Answer with an offset and the bytes of the result there, in as many messages as needed."""
     start, end = arguments["address"], arguments["address"] + arguments["count"]
     memory = result(device)
-    starts = range(start, max(end, start + 1), LARGEST_FRAME)
-    return [placed(memory, at, min(LARGEST_FRAME, end - at)) for at in starts]
+    starts = range(start, max(end, start + 1), MAX_MESSAGE_SIZE)
+    return [memory_reply(memory, offset, min(MAX_MESSAGE_SIZE, end - offset)) for offset in starts]
 
 
 @action("combination")
 def combination(device: Any, arguments: Mapping[str, Any]) -> list[bytes]:
-    """Answer with the parts of the result that the bits name, a frame each."""
+    """Answer with the parts of the result that the bits select, one message each."""
     wanted = arguments["parts_low"] | arguments["parts_high"] << 16
     memory = result(device)
-    frames = [placed(memory, *part) for bit, part in enumerate(PARTS) if wanted >> bit & 1]
-    return frames or [placed(memory, 0, 0)]
+    replies = [memory_reply(memory, *part) for bit, part in enumerate(PARTS) if wanted >> bit & 1]
+    return replies or [memory_reply(memory, 0, 0)]

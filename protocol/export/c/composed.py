@@ -1,4 +1,4 @@
-"""The serial link of a unit that is composed of framing, check and headers, as C."""
+"""A serial link composed of framing, check and headers, as C code."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from starhil.protocol.serial_interface import RowShape
 from starhil.protocol.values import IcdError
 
 _MARKS: Final = 8
-"""Bytes that start and end of a frame take at most, apart from those that a definition lists."""
+"""Maximum size of the start and end marks of a message, in bytes, apart from those in a definition."""
 
 
 def link_parts(stack: ComposedStack) -> tuple[str, str, str]:
-    """Return the link's part of the header, functions of which it calls some, and its part of the source.
+    """Return the declarations of the link, its helper functions, and its source.
 
-    Raises IcdError for what is not data, or not supported.
+    Raises IcdError for a part of the link that is Python code or not supported.
     """
     framing = "counted" if stack.link.framing.kind in ("length", "fixed") else stack.link.framing.kind
     header = max(stack.request_header.size(name) for name in ("", *stack.classes.by_name))
@@ -65,7 +65,7 @@ def link_parts(stack: ComposedStack) -> tuple[str, str, str]:
 
 
 class _Writer:
-    """Writes the functions that follow from headers, rows and check."""
+    """Writes the functions that depend on headers, rows and check."""
 
     def __init__(self, stack: ComposedStack) -> None:
         self._stack = stack
@@ -74,7 +74,7 @@ class _Writer:
         self._coded = "class" in stack.request_header.roles
 
     def constants(self) -> dict[str, str]:
-        """Declarations of the names that the texts use, by name."""
+        """Declarations of the constants that the code uses, by name."""
         stack = self._stack
         found = {
             "START_SIZE": f"static const size_t START_SIZE = {len(stack.framing.start)}u;",
@@ -105,7 +105,7 @@ class _Writer:
         return found | {name: f"#define {name} {_number(value)}" for name, value in macros.items()}
 
     def row_tests(self) -> Iterator[str]:
-        """Functions that say what a row is."""
+        """Functions that test the kind of a row."""
         check = self._stack.check.size
         yield _test("is_row", self._keys)
         yield _test("is_telecommand", self._select(lambda row: row.kind is RequestKind.TELECOMMAND))
@@ -117,7 +117,7 @@ class _Writer:
         yield self._lookup("reply_size", "long", lambda row: row.reply_size, -1)
 
     def header_size(self) -> str:
-        """Function with the size of a request's header."""
+        """Function that returns the size of a request header."""
         return self._lookup("header_size", "size_t", self._header_size)
 
     def _header_size(self, row: RowShape) -> int:
@@ -133,12 +133,12 @@ class _Writer:
         return f"static {kind} {name}(uint32_t id)\n{{\n    switch (id) {{{cases}\n    default:\n        return {otherwise};\n    }}\n}}"
 
     def lengths(self) -> str:
-        """Functions with what the length fields of a request and of a reply say."""
+        """Functions that return the value of the length field in a request and in a reply."""
         headers = {"request_length": self._stack.request_header, "length_of": self._stack.reply_header}
         return "\n\n".join(_length(name, self._stack, header) for name, header in headers.items())
 
     def pack_header(self) -> str:
-        """Function that packs a request's header."""
+        """Function that packs a request header."""
         lines = []
         for field in self._stack.request_header.fields:
             put = (
@@ -169,7 +169,7 @@ class _Writer:
         return f"if ({tests}) {{\n        " + statements.replace("\n", "\n    ") + "\n    }"
 
     def unpack_header(self) -> str:
-        """Function that reads a reply's header."""
+        """Function that unpacks a reply header."""
         header = self._stack.reply_header
         lines = []
         for field in header.fields:
@@ -304,7 +304,7 @@ def _snippet(name: str, kind: str) -> str:
     found = re.search(rf"^// {kind}\n(.*?)(?=^// \w+$|\Z)", _part(f"{name}.c"), re.MULTILINE | re.DOTALL)
     if found is None:
         raise IcdError(
-            f"link.serial: {name} of kind {kind!r} is code of the unit's plugin, which no export can hold"
+            f"link.serial: {name} of kind {kind!r} is Python code in the unit's plugin and cannot be exported"
         )
     return found[1].strip("\n") + "\n"
 
@@ -315,10 +315,10 @@ typedef struct {
     size_t capacity, size;
 } output_t;
 
-/* What the header of a reply says. */
+/* Content of a reply header. */
 typedef struct {
     size_t size;
-    long data_size; /* -1: no message is so */
+    long data_size; /* -1: invalid */
     bool is_ours, has_row, is_refused, is_unsolicited, is_final;
     uint32_t id, status;
     uint64_t ticks, time, length;

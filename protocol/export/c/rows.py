@@ -1,4 +1,4 @@
-"""The rows of a definition as C: identifiers, structures of physical values, and their codecs."""
+"""The rows of a definition as C code: IDs, structures of physical values, and codecs."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def comment(*paragraphs: str) -> str:
 
 
 def enumerations(icd: InterfaceDefinition) -> dict[str, EnumDefinition]:
-    """Return the enumerations of a definition and of its rows' fields, by their name in C."""
+    """Return the enumerations of a definition and of the fields of its rows, by name in C."""
     of_fields = (
         (enum_name(row, field), field.enum)
         for row in icd.rows
@@ -48,7 +48,7 @@ def enumerations(icd: InterfaceDefinition) -> dict[str, EnumDefinition]:
 
 
 def enum_name(row: Row, field: Field) -> str:
-    """Return the name of a field's enumeration; one that the field alone has is named after it."""
+    """Return the name of a field's enumeration; one defined in the field itself has the field's name."""
     if field.enum is None or field.enum.name == MAP:
         return f"{row.name}_{field.name}"
     return field.enum.name
@@ -73,7 +73,7 @@ def membership(name: str, enum: EnumDefinition) -> str:
 
 
 def declaration(row: Row, key: int) -> Iterator[str]:
-    """Yield identifier, size, structure and functions of a row."""
+    """Yield the declarations of a row: ID, size, structure and functions."""
     name = _name(row)
     yield comment(f"{row.kind.capitalize()} {row.id}. {row.doc}")
     yield f"#define {name.upper()}_ID {key}u"
@@ -192,7 +192,7 @@ def _integer(value: int, *, signed: bool) -> str:
 
 
 def member_name(field: Field) -> str:
-    """Return the name of a field's member of the structure."""
+    """Return the name of the structure member for a field."""
     return f"{field.name}_" if _KEYWORDS.fullmatch(field.name) else field.name
 
 
@@ -200,7 +200,7 @@ def member_name(field: Field) -> str:
 
 
 def _check(row: Row, field: Field, index: int) -> Iterator[str]:
-    """Yield the test of a member against its limits; none if its type holds nothing else."""
+    """Yield the test of a member against its limits; none if its type cannot exceed them."""
     value = f"values->{member_name(field)}"
     test = ""
     match field.kind:

@@ -1,4 +1,4 @@
-"""The constants and functions of a composed serial link, as the Python text of the plugin's protocol."""
+"""The constants and functions of a composed serial link, as Python code for the plugin's protocol."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from starhil.protocol.values import IcdError
 
 
 def link_text(stack: ComposedStack) -> str:
-    """Return the text of a link: constants, check, framing and the class Link.
+    """Return the code of a link: constants, check, framing and the class Link.
 
-    Raises IcdError for a framing or check from a plugin, which is not data.
+    Raises IcdError for a framing or check from a plugin.
     """
     framing, check = stack.link.framing, stack.link.check
     for what, model in (("framing", framing), ("check", check)):
         if isinstance(model, CustomFraming | CustomCheck):
             raise IcdError(
-                f"link.serial.{what}: {model.name!r} is code of the unit's plugin, which no export can hold"
+                f"link.serial.{what}: {model.name!r} is Python code in the unit's plugin and cannot be exported"
             )
     kind = "counted" if framing.kind in ("length", "fixed") else framing.kind
     constants = {

@@ -107,7 +107,7 @@ def test_a_bench_of_another_unit_than_the_profile_is_rejected():
     process = EmulatorProcess(["none"])
     process.ready = {"unit": "/my%20units/one"}
     process.check_unit("/my units/one")
-    with pytest.raises(BenchError, match="the profile's unit is /my units/one: give --unit"):
+    with pytest.raises(BenchError, match="the profile's unit is /my units/one: add --unit"):
         process.check_unit(None)
     process.ready = {"unit": "cubestar"}
     process.check_unit(None)
@@ -123,7 +123,7 @@ def test_a_bench_of_another_unit_than_the_profile_is_rejected():
         (
             "cubestar-gen2",
             {"serial": {"dialect": "a"}},
-            "links.serial.dialect: unit cubestar-gen2 has dialect c alone",
+            "links.serial.dialect: unit cubestar-gen2 has only dialect c",
         ),
     ],
 )
@@ -150,7 +150,7 @@ def test_a_conformance_run_takes_the_links_that_the_unit_has(name, node, links):
 def test_the_load_of_the_links_is_refused_for_a_unit_without_its_rows():
     done = CliRunner().invoke(bench, ["bus", "--unit", "sagitta"])
     assert isinstance(done.exception, BenchError)
-    assert "unit sagitta lacks the rows of a CubeStar that load its links (identification, " in str(
+    assert "unit sagitta lacks the CubeStar rows that are used to load the links (identification, " in str(
         done.exception
     )
 

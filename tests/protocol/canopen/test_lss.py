@@ -1,4 +1,4 @@
-"""LSS slave: switch mode, node-ID, bit timing, store, identity, identify, fastscan (CiA 305)."""
+"""LSS slave: switch mode, node ID, bit timing, store, identity, identify, fastscan (CiA 305)."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def test_reset_communication_restores_communication_only(bench):
 
 @pytest.mark.parametrize("node_id", [0, 128, 254, -1, 300])
 def test_node_id_that_is_none(node_id):
-    with pytest.raises(ProtocolError, match="node-ID"):
+    with pytest.raises(ProtocolError, match="node ID"):
         CanopenSlave(build_dictionary(load_unit()), node_id)
 
 

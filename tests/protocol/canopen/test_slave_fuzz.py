@@ -109,9 +109,9 @@ def all_entries(bench: Bench):
 
 
 def alive(bench: Bench, unit: str) -> Bench:
-    """After a node reset it boots up and answers; a slave whose node-ID changed is replaced."""
+    """After a node reset it boots up and answers; a slave whose node ID changed is replaced."""
     bench.now += LONGEST_SILENCE_S
-    bench.frame(0x000, bytes((0x81, NODE)))  # also puts a node-ID of LSS into force
+    bench.frame(0x000, bytes((0x81, NODE)))  # also puts a node ID of LSS into force
     bench.advance(0.1)
     if bench.slave.node_id != NODE:
         return shown(unit)
