@@ -85,8 +85,7 @@ def agreement(
 ) -> Row:
     """Make a check for agreement with a published number.
 
-    The value checked is from the author's version of the algorithm, or else from the printed one, or else
-    ours.
+    The value checked is the author's version, or else the printed one, or else ours.
 
     Raises
     ------
