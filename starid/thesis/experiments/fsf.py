@@ -220,8 +220,8 @@ def _agreeing(
         counts = results[f"{kind}-f{f}-x{scale:g}"][name]
         for ours, published in zip(counts, TABLES[kind, f], strict=True):
             theirs = _percent(published, indicator)
-            greatest, _ = sampling(theirs, _trials(ours, published, indicator))
-            matches.append(abs(_percent(ours, indicator) - theirs) <= greatest)
+            largest, _ = sampling(theirs, _trials(ours, published, indicator))
+            matches.append(abs(_percent(ours, indicator) - theirs) <= largest)
     return matches
 
 
