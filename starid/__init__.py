@@ -1,7 +1,6 @@
 """Star catalogue, camera, detection, identification and attitude: the numerics of a star tracker.
 
-The public names are listed here and imported from their modules on first use, so that ``import starid``
-is quick.
+Public names are imported from their modules on first use, to keep ``import starid`` quick.
 """
 
 from __future__ import annotations

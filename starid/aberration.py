@@ -1,13 +1,12 @@
 """Stellar aberration: the apparent directions of stars for a moving observer.
 
 The observer's velocity v relative to the barycentre of the solar system turns every direction towards v, by
-up to 20.5″ for the Earth and 5.2″ more for a low orbit. With β = v/c and γ = 1/√(1 − β²), the direction p of
-a star is seen as
+up to 20.5″ for the Earth and 5.2″ more for a low orbit. With β = v/c and γ = 1/√(1 − β²), p is seen as
 
     p' = [p/γ + (1 + (p·β)/(1 + 1/γ)) β] / (1 + p·β)
 
-(Urban & Seidelmann 2013, eq. 7.40; the inverse has −β). The deflection of light by the Sun, 4 mas at an
-elongation of 90°, is neglected.
+(Urban & Seidelmann 2013, eq. 7.40; the inverse has −β). Light deflection by the Sun (4 mas at 90°) is left
+out.
 """
 
 from __future__ import annotations

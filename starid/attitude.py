@@ -142,7 +142,7 @@ class Attitude:
         """
         if not (math.isfinite(ra_deg) and math.isfinite(roll_deg) and -90.0 <= dec_deg <= 90.0):
             raise StaridError(
-                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: must be finite degrees, Dec within ±90"
+                f"attitude: RA {ra_deg}, Dec {dec_deg}, roll {roll_deg}: must be degrees, Dec within ±90"
             )
         north, east, boresight = _local_frame(math.radians(ra_deg % 360.0), math.radians(dec_deg))
         roll = math.radians(roll_deg % 360.0)

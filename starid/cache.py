@@ -164,8 +164,7 @@ def cached_tables(name: str, build: Callable[[], Tables]) -> Tables:
     Parameters
     ----------
     name : str
-        File name without suffix. It must depend on everything that the arrays depend on, so that a change
-        gives another name.
+        File name without suffix. It must depend on everything on which the arrays depend.
     build : callable
         Returns the arrays by name.
 

@@ -64,14 +64,12 @@ class Camera:
         Mapping from direction to image plane. "flat" is longitude and latitude about the boresight;
         `flat_view` maps the thesis's flat RA–Dec plane to it.
     distortion : tuple of 5 floats
-        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, applied in the image plane;
-        missing terms are zero.
+        Brown–Conrady ``(k1, k2, p1, p2, k3)`` in OpenCV's order and signs, in the image plane.
 
     Raises
     ------
     StaridError
-        A value is out of range, or the distortion folds the image, so that one pixel would see two
-        directions.
+        A value is out of range, or the distortion folds the image (two directions on one pixel).
     """
 
     width: int
@@ -239,8 +237,7 @@ class Camera:
         Returns
         -------
         xy : ndarray (n, 2)
-            Pixels. A direction just outside the field gets its true position; one that the lens cannot map
-            gets NaN.
+            Pixels. Positions just outside the field are valid; NaN if the lens cannot map the direction.
         inside : ndarray (n,) of bool
             The direction falls on the pixel array: [−0.5, width − 0.5) × [−0.5, height − 0.5).
         """
@@ -271,8 +268,7 @@ def flat_view(camera: Camera, ra_deg: float, dec_deg: float) -> tuple[Camera, At
     of the centre. This is not a rotation of the sphere, but it is the "flat" model seen from the celestial
     equator with the centre of the image moved by δ_c: the returned attitude points at (α_c, 0°) with roll 0,
     and the returned camera has ``cy + fy·δ_c``. With this pair the point (α_c, δ_c) falls on the centre of
-    the given camera, east is left and north is up, and it can be used to project and back-project like any
-    other.
+    the given camera, east is left and north is up, and it projects and back-projects like any other.
 
     Parameters
     ----------

@@ -359,8 +359,7 @@ def _chord(angle_rad: float) -> float:
 def _close_pairs(ones: Array, others: Array, separation_rad: float) -> NDArray[np.intp]:
     """Pairs (m, 2) of rows of two arrays of unit vectors that are at most an angle apart.
 
-    The second array is sorted by z, where partners lie within the chord. (Importing a k-d tree would take
-    half a second.)
+    The second array is sorted by z, where partners lie within the chord. (A k-d tree takes 0.5 s to import.)
     """
     chord = _chord(separation_rad)
     order = np.argsort(others[:, 2], kind="stable")

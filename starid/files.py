@@ -135,8 +135,8 @@ def open_stream(path: str | Path) -> BinaryIO:
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file by filling a temporary one and renaming it.
 
-    Where `path` is a link, its target is replaced. A device, a pipe or standard output receives the content
-    once it is complete.
+    Where `path` is a link, its target is replaced. A device, pipe or standard output gets the complete
+    content.
 
     Parameters
     ----------

@@ -88,20 +88,15 @@ def read_hip2(path: Path, expected: int = STAR_COUNT) -> dict[str, Array]:
     Raises
     ------
     StaridError
-        The file is missing, unreadable or truncated, or a line is malformed; the message names the file, line
-        and field.
+        The file is missing, unreadable or truncated, or a line is malformed; the message says where.
     """
     lines = _lines(path)
     for number, line in enumerate(lines, start=1):
         if len(line) != _RECORD:
             where = f"star catalogue {path}: line {number}"
             if number == len(lines):
-                raise StaridError(
-                    f"{where} is incomplete, the file is truncated; download it again from CDS I/311"
-                )
-            raise StaridError(
-                f"{where} is {len(line)} characters long, must be {_RECORD}; is this a hip2.dat?"
-            )
+                raise StaridError(f"{where} is incomplete, the file is truncated; download it again")
+            raise StaridError(f"{where} is {len(line)} characters long, must be {_RECORD}; is it a hip2.dat?")
     if len(lines) != expected:
         what = "truncated" if len(lines) < expected else "not the Hipparcos new reduction"
         raise StaridError(

@@ -72,8 +72,7 @@ class StarIdentifier(Protocol):
         flux : array (n,)
             Flux in any linear unit.
         xy_sigma_px : array (n,) or (n, 2), optional
-            One-sigma error of each position, one for both axes or one each for x and y, pixels; by default
-            estimated from the residuals.
+            One-sigma error of each position, per star or per axis, pixels; by default estimated.
         observer_velocity : array (3,), optional
             Velocity of the camera relative to the barycentre of the solar system, ICRS, m/s. The attitude is
             then corrected for aberration (`starid.aberration`). By default it is not.

@@ -214,9 +214,7 @@ def _warn_not_kept(folder: Path, reason: str) -> None:
 
 @cache
 def source_stamp(module: str) -> str:
-    """Checksum of the sources of a module and of all modules that it imports.
-
-    Only modules of the same top-level package and of `starid` count, and only imports outside functions.
+    """Checksum of a module and of what it imports of its top-level package and `starid`, outside functions.
 
     Parameters
     ----------

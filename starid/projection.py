@@ -1,8 +1,7 @@
 """Compiled projection between directions and pixels for all camera models, on plain arrays.
 
 A camera is one array of numbers (`starid.camera.Camera.params`), so that other compiled kernels can call
-these functions without a Python object. Each model maps a direction (x, y, z) in the sensor frame, of any
-length, to the image plane:
+these functions without a Python object. A model maps a direction (x, y, z) in the sensor frame to the plane:
 
 - pinhole: ``(x/z, y/z)``, z > 0;
 - equidistant: ``θ·(x, y)/hypot(x, y)``, θ the angle from the boresight;

@@ -90,12 +90,7 @@ class SingleCameraIdentifier(ABC):
         *,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
-        """Find the attitude without prior knowledge (lost in space).
-
-        Parameters
-        ----------
-        xy_px, flux, xy_sigma_px, observer_velocity
-            See `starid.interface.StarIdentifier.identify`.
+        """Find the attitude without prior knowledge, see `StarIdentifier.identify`.
 
         Raises
         ------
@@ -116,12 +111,7 @@ class SingleCameraIdentifier(ABC):
         window_px: float | None = None,
         observer_velocity: ArrayLike | None = None,
     ) -> Solution:
-        """Find the attitude near a predicted one; invalid, with the reason, if verification fails.
-
-        Parameters
-        ----------
-        xy_px, flux, predicted, xy_sigma_px, window_px, observer_velocity
-            See `starid.interface.StarIdentifier.track`.
+        """Find the attitude near a predicted one, see `StarIdentifier.track`.
 
         Raises
         ------

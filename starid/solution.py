@@ -55,13 +55,11 @@ class Solution:
     hip : ndarray (m,) int32
         Hipparcos numbers of the matched catalogue stars.
     covariance : ndarray (3, 3)
-        Covariance of the rotation vector e in the sensor frame, rad²: measured attitude =
-        ``truth.rotated(e)``.
+        Covariance of the rotation vector e in the sensor frame, rad²: attitude = ``truth.rotated(e)``.
     rms_px : float
         Root mean square distance between matched detections and their predicted positions, pixels.
     sigma_px : float
-        Centroid noise per axis on which the covariance is based, pixels: estimated, or the scaled mean of the
-        errors given.
+        Centroid noise per axis on which the covariance is based, pixels: estimated, or from the errors given.
     probability_false : float
         Upper bound on the probability that an agreement this good occurs by chance anywhere in the search.
     elapsed : float

@@ -35,11 +35,6 @@ def checked_detections(
 ) -> tuple[Array, Array, Array]:
     """Check detections; return contiguous positions (n, 2), flux (n,) and errors (n, 2), by default ones.
 
-    Parameters
-    ----------
-    xy_px, flux, xy_sigma_px
-        See `starid.interface.StarIdentifier.identify`.
-
     Raises
     ------
     StaridError

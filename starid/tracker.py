@@ -87,8 +87,7 @@ class Tracker:
         time_s : float
             Time of the exposure, seconds on any monotonic clock.
         rate_hint_rad_s : array (3,), optional
-            Body rate in the sensor frame from another source, such as a gyro; it replaces the tracker's
-            estimate.
+            Body rate in the sensor frame from another source, such as a gyro; replaces the estimate.
 
         Returns
         -------

@@ -1,8 +1,7 @@
 """The largest group of proposed matches whose mutual distances agree with the catalogue.
 
 Most published algorithms end by checking that the matched stars belong together: that they lie in one field,
-or that they are the right distances apart. The second check works for every sensor and is implemented here
-for all.
+or that they are the right distances apart. The second check, which works for every sensor, is here.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ votes. In a second vote two matches vote for each other if their catalogue stars
 observed ones, and the matches whose votes are near the highest are kept.
 
 own choice: "near the highest" is at least half of the highest, which a star reaches if it agrees with more
-than half of the stars that the best one agrees with. own choice: a tolerance of 1.5 standard deviations. A
+than half of the stars that the best one agrees with.
+own choice: a tolerance of 1.5 standard deviations. A
 larger one adds many chance votes, most of them in crowded parts of the sky, and hardly any true ones: on
 random fields of 42° and 12°, 1.5 identified more than 0.75 and 3 at every noise from 0.5 px upwards.
 """

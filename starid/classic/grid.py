@@ -11,8 +11,8 @@ the largest group of matches that fits into one field is the result.
 
 own choice: pattern radius 0.65 of the width of the field, buffer 0.15 of the pattern radius (a nearer
 neighbour turns the grid by more than a cell at its rim), g = 40 as in the paper, and at least 4 votes. Up to
-four guide stars with equal votes are all passed to the last step. own choice: "fits into one field" is tested
-as agreement of all distances, as for all algorithms here.
+four guide stars with equal votes are all passed to the last step.
+own choice: "fits into one field" is tested as agreement of all distances, as for all algorithms here.
 """
 
 from __future__ import annotations

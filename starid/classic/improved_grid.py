@@ -10,14 +10,13 @@ and the pyramid algorithms, and the thesis quotes their rates from the same plac
 
 The grid algorithm is changed in three ways. Neighbours are clustered by brightness, and the grid is aligned
 with several bright ones in turn, since a bright star is seldom missing or out of order. The two best matches
-of every lookup are kept. The threshold on the votes is the Bayesian decision between a true and a chance
-match.
+of every lookup are kept. The threshold on the votes is the Bayesian decision between truth and chance.
 
 own choice: the bright cluster is the brighter half of a pattern; guide patterns are aligned with its nearest
-star beyond the buffer, observed ones with its three nearest in turn. own choice: votes are binomial. An
-observed cell is in the true pattern with probability 0.5 (noise, the rim of the field, missing and false
-stars), and in any other with the mean share of cells that a pattern fills. A match is accepted when its odds
-outweigh the prior of one guide star among all.
+star beyond the buffer, observed ones with its three nearest in turn.
+own choice: votes are binomial. An observed cell is in the true pattern with probability 0.5 (noise, the rim
+of the field, missing and false stars), and in any other with the mean share of cells that a pattern fills. A
+match is accepted when its odds outweigh the prior of one guide star among all.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ candidates vote, each end for the candidates of its own star, with a higher thre
 star has one candidate or none. At least five stars must be identified with distances that agree.
 
 own choice: a candidate needs 0.4 of the highest votes of its star in the first round, and 0.15 more in each
-of four further rounds. own choice: a tolerance of two standard deviations, for the reason given in
+of four further rounds.
+own choice: a tolerance of two standard deviations, for the reason given in
 `starid.classic.geometric_voting`; the iteration copes with more chance votes.
 """
 

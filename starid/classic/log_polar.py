@@ -10,7 +10,8 @@ patterns are compared at every shift; their similarity is the number of sectors 
 
 own choice: 120 sectors of 3° and 48 radial bins between 0.1 and 1 times the pattern radius, which is 0.65 of
 the width of the field: for 937 pixels a bin is 29 px wide at the rim and 3 px at the inner end. Neighbouring
-bins count as equal. own choice: the paper finds the shift by a string search (Knuth, Morris, Pratt) that
+bins count as equal.
+own choice: the paper finds the shift by a string search (Knuth, Morris, Pratt) that
 tolerates mismatches. Here an index of the strings by radial bin finds equal codes, and a histogram of the
 shifts that align them counts the agreements at all shifts at once.
 """

@@ -7,7 +7,8 @@ pairs that share a star form a match group: that star is the candidate for the p
 neighbours. The largest group whose members also agree in their mutual distances identifies the field.
 
 own choice: magnitudes are compared as differences within the pair, which need no calibration, with a gate of
-0.6 mag. own choice: each of the ten brightest stars is tried as a pole, and the mutual distances are tested
+0.6 mag.
+own choice: each of the ten brightest stars is tried as a pole, and the mutual distances are tested
 for its five largest groups; where several neighbours fit one star, the nearest in distance is taken.
 """
 

@@ -12,7 +12,8 @@ the shading that the observed stars miss, weighted by their brightness. The patt
 
 own choice: the shading is a Gaussian of the distance from the star to the centre of the cell, 0.7 cells wide
 and cut off beyond the eight surrounding cells. It is stored in 8 bits (40 × 40 bytes per star; for 4 612
-stars these are the published 7 380 kB). own choice: the weight falls from 2 for the brightest neighbour to 1
+stars these are the published 7 380 kB).
+own choice: the weight falls from 2 for the brightest neighbour to 1
 for the faintest, linearly in magnitude, because bright stars are seldom false or missing. The best pattern
 must cost less than 0.65 of the total weight, and less than any other.
 """

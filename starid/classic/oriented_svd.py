@@ -12,8 +12,8 @@ star is kept if it is reliable: if it has enough votes, and clearly more than an
 own choice: a triangle is a star with two of its five nearest neighbours beyond a buffer (0.05 of the width of
 the field). Its corners are ordered by the opposite sides; the sense in which they then run is the
 orientation, and must be equal. The search is by the second singular value, and the third is checked: the
-squares of all three add up to three. own choice: a match is reliable with at least three votes and 1.3 times
-the votes of the next guide star.
+squares of all three add up to three.
+own choice: a match is reliable with at least three votes and 1.3 times the votes of the next guide star.
 """
 
 from __future__ import annotations
@@ -57,10 +57,7 @@ def _triangle_rows(vectors: Array, radius: float, buffer: float) -> Indices:
 
 
 def oriented_triangles(vectors: Array, corners: Indices) -> tuple[Indices, Array, NDArray[np.int8]]:
-    """Order the corners of triangles and drop repeats.
-
-    Returns the corners (m, 3), the second and third singular values (m, 2) and the orientation (m,), ±1.
-    """
+    """Order triangles: unique corners (m, 3), 2nd and 3rd singular values (m, 2), orientation (m,) of ±1."""
     corners = np.unique(np.sort(corners, axis=1), axis=0).reshape(-1, 3)
     places = vectors[corners]
     opposite = np.linalg.norm(np.roll(places, -1, axis=1) - np.roll(places, -2, axis=1), axis=2)

@@ -2,8 +2,7 @@
 
 Distances are chords, 2·sin(angle/2): their order is that of the angles, they keep their precision at small
 angles, and need no trigonometry. The k-vector (Mortari 1996, Search-less algorithm) counts the pairs below
-each of as many evenly spaced values as there are pairs, so that a range of distances takes two reads instead
-of a search.
+each of as many evenly spaced values as there are pairs, so that a range takes two reads instead of a search.
 """
 
 from __future__ import annotations

@@ -9,7 +9,8 @@ triangle is confirmed by a fourth star, whose three angles to the triad must fit
 pyramid. The remaining stars are identified by their angles to the pyramid.
 
 own choice: a field of just three stars has no fourth; its triad is accepted if it is unique, as the paper
-allows. own choice: 15 guide stars per field. A wide field of coarse pixels has many similar triangles, the
+allows.
+own choice: 15 guide stars per field. A wide field of coarse pixels has many similar triangles, the
 more the deeper the catalogue; with 15 stars and a tolerance of 4 px in 937 a triad fits 0.2 wrong triangles
 on average. For the same reason the tolerance is two standard deviations of a distance, not three: a triad
 that falls outside is followed by another.
@@ -40,10 +41,7 @@ def _triple_product(ones: Array, i: int, j: int, k: int) -> float:
 def _link_partners(
     table: PairTable, low: float, high: float, head: Indices, link: Indices
 ) -> tuple[int, int]:
-    """Link the pairs of a range into one chain per star.
-
-    Link 2·e belongs to the first star of pair e, link 2·e + 1 to the second.
-    """
+    """Chain the pairs of a range per star; links 2·e and 2·e + 1 belong to the two stars of pair e."""
     start, end = pair_range(table, low, high)
     for pair in range(start, end):
         a, b = table.first[pair], table.second[pair]

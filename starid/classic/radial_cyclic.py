@@ -8,8 +8,7 @@ with an observed star. The cyclic feature decides among them: the directions to 
 sectors, form a bit string that is compared at its best circular shift.
 
 own choice: 60 sectors of 6°. The ten guide stars with the most rings in common, at least four, are compared.
-The one whose string has the most bits in common at one shift, to within one sector, is taken unless two are
-equal.
+The one whose string has the most bits in common at one shift, to within one sector, is taken if unique.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The radial pattern of the pole star and the radial and cyclic algorithms: rings that hold a neighbour.
 
 The distances from a star to its neighbours, quantised into rings, form a binary vector that does not change
-under rotation. A lookup table leads from each ring to the guide stars with a neighbour in it; each ring of an
-observed star is a vote for them.
+under rotation. A lookup table leads from each ring to the guide stars with a neighbour in it; each ring is a
+vote.
 
 own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.2 px of 937 each).
 """

@@ -10,10 +10,8 @@ own choices for all of them:
 - The papers assume a calibrated detection threshold. Where the magnitude of unit flux is known (`zero_point`)
   it is used; otherwise as many of the brightest detections are taken as a field has guide stars.
 - There is one tolerance, for the difference of two distances. It is given in pixels (at the coarsest scale in
-  the field), or follows from the errors given with the positions, as the algorithm's number of standard
-  deviations of a distance.
-- The attitude is computed from the largest group of matches that agree in all distances
-  (`starid.classic.agreement`).
+  the field), or follows from the errors given with the positions, in standard deviations of a distance.
+- The attitude is computed from the largest consistent group of matches (`starid.classic.agreement`).
 """
 
 from __future__ import annotations
@@ -68,15 +66,12 @@ class ClassicOptions:
     zero_point : float or None
         V magnitude of unit flux, where it is known.
     tolerance_px : float or None
-        Largest difference of two distances, pixels, where no position errors are given; the default depends
-        on the algorithm.
+        Largest difference of two distances, pixels, without position errors; default: the algorithm's.
     verify : bool
-        Verify the answer as strictly as the geometric identifier does its own (True), or return it as the
-        algorithm finds it, right or wrong: then "valid" only means that there is an answer, and aberration is
-        not corrected.
+        Verify the answer as strictly as the geometric identifier does its own (True), or return the raw
+        answer, right or wrong, without correction for aberration.
     cache : bool
-        Keep the verification's index in the cache folder. (Databases are built in memory: each takes less
-        than ten seconds.)
+        Keep the verification's index in the cache folder. (Databases are built in memory, in seconds.)
     """
 
     stars_per_field: float | None = None

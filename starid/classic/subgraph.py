@@ -11,7 +11,8 @@ catalogue with the attitude of the subgraph verifies it.
 own choice: a set of v stars has N·λ₂·λ₃·λ₄…λᵥ chance matches. λ₂ is the number of stars in a ring about the
 first, λ₃ in two crossings of rings, λ₄ and further in one crossing, at the mean density of guide stars; the
 typical distance is a quarter of the width of the field. v is the least number, at least 3, with fewer than
-0.01 expected matches. own choice: the reprojection must put a guide star on at least half of the observed
+0.01 expected matches.
+own choice: the reprojection must put a guide star on at least half of the observed
 stars. Poles and groups are tried as in `starid.classic.match_group`, but without magnitudes.
 """
 
@@ -68,11 +69,7 @@ def _groups(
     partners: list[tuple[int, int, int]],
     size: Indices,
 ) -> None:
-    """Collect the match groups of a pole.
-
-    `partners` receives (candidate, neighbour, its star) of the catalogue pairs that fit, and `size` the
-    number of neighbours of each candidate.
-    """
+    """Collect a pole's match groups: (candidate, neighbour, its star) of fitting pairs, and their sizes."""
     partners.clear()
     size[:] = 0
     last = np.full(size.shape[0], -1, dtype=np.int64)

@@ -11,9 +11,9 @@ brightest star is tried first as the reference; if nothing in the database has i
 own choice: the four are the nearest beyond a buffer (0.05 of the width of the field), in order of distance, a
 choice that does not depend on where in the field the reference is. The first singular value follows from the
 other two (their squares add up to the number of stars), so the keys are sorted by the second and compared in
-the second and third. own choice: a key is confirmed by its attitude, which must bring all five stars within
-the tolerance. References are tried until `CONFIRMED` of them agree, and the shared step computes the attitude
-from all their stars.
+the second and third.
+own choice: a key is confirmed by its attitude, which must bring all five stars within the tolerance.
+References are tried until `CONFIRMED` of them agree, and the attitude is computed from all their stars.
 """
 
 from __future__ import annotations

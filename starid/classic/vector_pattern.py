@@ -6,12 +6,12 @@ for Star Sensors", Sensors 15(7), 16412–16429, 2015.
 The neighbours of a star are rotated until its alignment star lies on the x' axis. The pattern is their
 positions along x', sorted into the elements of one vector, and the plane angle between each and the alignment
 star. It does not change as the image rotates, so no circular shift is needed. Patterns are found by an index
-over the elements of the vector.
+over the elements.
 
 own choice: 200 elements over the diameter; pattern radius and buffer as in `starid.classic.grid`. An observed
 neighbour votes for a guide star with a neighbour in the same or an adjacent element whose angle differs by at
-most 4°. (Position and angle together determine where a neighbour is; the sign of the angle separates the two
-mirror images at equal x'.) own choice: the angle of a near neighbour is uncertain, so the allowed difference
+most 4°. (The sign of the angle separates the two mirror images at equal x'.)
+own choice: the angle of a near neighbour is uncertain, so the allowed difference
 grows inversely with its distance from the pivot.
 """
 

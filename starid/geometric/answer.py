@@ -110,8 +110,7 @@ def test_and_refine(
     used : (int, int, int)
         Detections from which the attitude was derived.
     min_matched : int
-        Least number of matches. Below `MIN_MATCHED`, a few detections are not tested individually: only the
-        bound decides.
+        Least number of matches. Below `MIN_MATCHED`, a few detections are not tested individually.
     prior : (float, float)
         See `log_false_probability`.
 

@@ -1,8 +1,7 @@
 """The geometric star identifier: verified triangles of bright stars, over the whole sky, for any camera.
 
 It combines the lost-in-space search (`starid.geometric.search`), tracking (`starid.geometric.tracking`),
-refinement (`starid.geometric.refinement`) and verification (`starid.geometric.verification`) for one camera
-and one catalogue.
+refinement (`starid.geometric.refinement`) and verification (`starid.geometric.verification`).
 """
 
 from __future__ import annotations
@@ -88,8 +87,7 @@ class Effort:
         Number of detections, brightest first, whose triangles are all tried afterwards in each quadrant and
         in the middle of the field; 0 skips this stage.
     max_false_probability, max_false_probability_tracking : float
-        Largest accepted bound on the probability of a false solution, when lost in space and near a predicted
-        attitude.
+        Largest accepted bound on the probability of a false solution, lost in space and in tracking.
     """
 
     tolerance_px: float = 4.0
@@ -142,8 +140,7 @@ class Identifier(SingleCameraIdentifier):
     limiting_magnitude : float, optional
         Faintest V in the index; by default some 200 stars per field, at least V 6.
     fov_tolerance : float
-        Relative uncertainty of the focal length, 0 for a calibrated camera. If it is not 0, solutions carry
-        the refined camera.
+        Relative uncertainty of the focal length, 0 for a calibrated camera. If not 0, solutions refine it.
     blend_px : float
         Stars closer than this are merged, pixels.
     effort : Effort
@@ -270,15 +267,7 @@ class Identifier(SingleCameraIdentifier):
     ) -> Solution:
         """Verify an attitude that was selected from the whole sky, as strictly as `identify` does.
 
-        Parameters
-        ----------
-        xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity
-            See `track`. Unlike there, agreement with the candidate is not taken as evidence.
-
-        Raises
-        ------
-        StaridError
-            See `track`.
+        Parameters and errors are as in `track`, but agreement with the candidate is not taken as evidence.
         """
         search = functools.partial(self._track, anywhere=True)
         return near(xy_px, flux, candidate, xy_sigma_px, window_px, observer_velocity, search)

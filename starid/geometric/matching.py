@@ -144,8 +144,7 @@ def match_detections(
 ) -> int:
     """Match each detection to the likeliest star in its window; return the number of matches.
 
-    The likeliest star has the least cost ``(r/σ)² + (Δm/s)²``. If two detections choose the same star, the
-    one with the lower cost keeps it.
+    The likeliest star has the least cost ``(r/σ)² + (Δm/s)²``. A star keeps the detection of lowest cost.
 
     Parameters
     ----------
@@ -153,8 +152,7 @@ def match_detections(
         Detections that are not matched.
     windows : (reach, sigma, gate, px_per_rad)
         Window for all detections in pixels, or `BY_NOISE`; noise in pixels of a detection of unit error;
-        largest deviation from the expected magnitude; lowest scale in the field, pixels per radian, for a
-        quick first test.
+        largest deviation from the expected magnitude; lowest scale in the field, pixels per radian.
     zero_point, scatter : float
         Catalogue minus instrumental magnitude, and its scatter s.
     stars, costs : ndarray (n,)

@@ -89,10 +89,7 @@ def by_decreasing_flux(flux: Array) -> Indices:
 
 @inner
 def fill_direction(params: Array, scale: float, column: float, row: float, table: Table, n: int) -> bool:
-    """Fill in the direction and gradients of a position for a focal length divided by `scale`.
-
-    Returns False outside the image circle.
-    """
+    """Fill in direction and gradients for a focal length over `scale`; False outside the image circle."""
     fx, fy, model = params[FX] / scale, params[FY] / scale, params[MODEL]
     a, b = (column - params[CX]) / fx, (row - params[CY]) / fy
     j11, j12, j22 = 1.0, 0.0, 1.0

@@ -54,8 +54,8 @@ class IndexArrays(NamedTuple):
     grid_start, grid_stars : ndarray int32
         Sky grid, see `starid.geometric.sky_grid`.
     counts : ndarray (cells + 1, bins) int32
-        Stars down to a magnitude bin in a cap with the area of the field around each coarse cell; the last
-        row counts the whole sky.
+        Stars down to a magnitude bin in a cap with the area of the field around each coarse cell, and in the
+        whole sky.
     row_start : ndarray int32
         The triangles of row r (`pattern_row`) are in ``[start[r], start[r + 1])``, sorted by shortest side.
     sides : ndarray (p, 3) uint16
@@ -107,8 +107,7 @@ class IndexSettings:
     field_area_sr : float
         Solid angle of the field.
     bright_sides_rad, deep_sides_rad : (float, float)
-        Shortest and longest side of a triangle of bright pattern stars, and of any other; the first range
-        contains the second.
+        Shortest and longest side of a triangle of bright pattern stars, and of any other (within the first).
     bright_quota, deep_quota : int
         Number of pattern stars in a neighbourhood of half the field's area.
     cells_per_edge : int

@@ -160,8 +160,7 @@ def _outlier(
     """Find the match most inconsistent with the others; −1 if that may be chance.
 
     Leaving match i out lowers χ² by ``r' (1 − H)⁻¹ r``, where H is its block of the hat matrix. The ratio of
-    this drop to the remaining χ² follows an F distribution with 2 and ν − 2 degrees of freedom, whose tail is
-    ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
+    this drop to the remaining χ² is F(2, ν − 2)-distributed, with the tail ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
     """
     rest = float(freedom - 2)
     known = PRIOR_FREEDOM if settings[SIGMAS_KNOWN] > 0.0 else 0.0
@@ -212,8 +211,7 @@ def normal_equations(
 ) -> float:
     """Fill the normal matrix (4, 4) and right side (4,) over the matches; return Σ (r/σ)².
 
-    The unknowns are the rotation v of the sensor (3) and, if there are 4, the change of the logarithm of the
-    scale.
+    The unknowns are the rotation v of the sensor (3) and, if there are 4, the change of log scale.
     """
     for a in range(4):
         right[a] = 0.0

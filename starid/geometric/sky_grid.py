@@ -2,8 +2,7 @@
 
 The sphere is divided into the six faces of a cube with n × n cells each. A cell lists every star inside it
 *or nearer to it than a margin*, so that all stars within the margin of a direction are in the single cell of
-that direction. Stars are numbered by decreasing brightness and the lists are sorted, so that a search can
-stop at a magnitude.
+that direction. Stars are numbered by decreasing brightness and the lists are sorted, to stop at a magnitude.
 """
 
 from __future__ import annotations

@@ -157,8 +157,7 @@ def _try_detections(
 ) -> float:
     """Try all pairs of stars near two detections; return the bound of the first accepted outright, or 0.
 
-    Other candidates are compared through `best` and ``bounds`` (`_keep_better`). `work` counts the pairs, and those
-    of equal separation.
+    Other candidates are compared through `best` and ``bounds`` (`_keep_better`). `work` counts pairs.
     """
     i, j = detections
     separation = chord(observed, i, j)

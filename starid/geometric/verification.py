@@ -1,8 +1,7 @@
 """Verification: a fast sequential test, then a bound on the probability that an agreement is chance.
 
 There are two stages. `worth_refining` tests a candidate attitude star by star with Wald's sequential
-probability ratio test: wrong candidates fail after a handful of lookups. `log_false_probability` computes the
-bound.
+probability ratio test: wrong candidates fail after a few lookups. `log_false_probability` computes the bound.
 
 The bound compares two explanations of the detections. *Chance*: each of n detections lies anywhere in the
 field of area A. *Sky*: an attitude is drawn uniformly from all rotations; then each detection is, with
@@ -21,8 +20,7 @@ a probability of at most 1/B, however long the search was: 1/B is the bound repo
 Near a prediction a second rival is as serious as chance: *one star* is where it was expected, and all others
 are chance. Its factor is at most A·w·z/Ω, where Ω is the solid angle (px²) in which the prediction lets that
 star lie, and z the share of the zero points that fit it. If this exceeds 1, B is divided by it. Two true
-stars are no rival: they determine the attitude. When lost in space, Ω is the whole sphere and the rival never
-counts.
+stars are no rival: they determine the attitude. Lost in space, Ω is the whole sphere: no rival.
 """
 
 from __future__ import annotations
@@ -279,8 +277,7 @@ def log_false_probability(
     rotation, stars, matched, normal, numbers
         From `starid.geometric.refinement.refine`.
     prior : (float, float)
-        Prior volume of rotations, rad³, and solid angle in which one star may lie, sr: `WHOLE_SKY` when lost
-        in space.
+        Prior volume of rotations, rad³, and solid angle for one star, sr: `WHOLE_SKY` when lost in space.
     """
     spread = settings[SCALE_TOLERANCE]
     freedom = 2 * matched - (4 if spread > 0.0 else 3)

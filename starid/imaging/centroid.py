@@ -21,7 +21,7 @@ X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
 """Columns of a table of fits; STATE is one of the numbers below."""
 
 UNUSABLE: Final = 1e9
-"""Counts from this value up have no weight: saturated and masked pixels are set to infinity."""
+"""Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
 
 GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
 
@@ -95,8 +95,8 @@ def trail_model(
 ) -> None:
     """As `spot_model`, for a spot that moves uniformly by `trail` pixels during the exposure, centred on x, y.
 
-    Along the trail the light is a Gaussian smeared over its length, across it a Gaussian. The size of a pixel adds 1/12
-    square pixel to the variance of the spot.
+    Along the trail the light is a Gaussian smeared over its length, across it a Gaussian; the pixel's own size
+    counts as 1/12 square pixel more of the spot's variance.
     """
     left, top, columns, rows = window
     length = math.hypot(trail[0], trail[1])
@@ -206,12 +206,12 @@ def fit_star(
     shape : (float, float, float)
         Standard deviation of the spot, and the trail along x and y, pixels.
     noise : (float, float, float)
-        Variance of a pixel without star light (counts²); variance per count of star light (1/gain, 0 if unknown);
-        relative error of the model in a pixel.
+        Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
+        unknown); relative error of the model in a pixel.
     model : ndarray (3, rows·columns)
         On return, the model near the result.
     work : ndarray (5, side)
-        Scratch; at least as wide as the window, and at least 11.
+        Scratch; side at least that of the window, and 11.
     result : ndarray (FIT_COLUMNS,)
         Filled; CHI2 is the weighted sum of squares over PIXELS pixels.
     """
@@ -267,7 +267,7 @@ def fit_star(
 
 @compiled_sums
 def _best_flux(pixels: Array32, model: Array) -> float:
-    """Best-fitting flux at a fixed position, with all pixels weighted equally."""
+    """Best-fitting flux at a fixed position, with equal weights of all pixels."""
     above = 0.0
     below = 1e-12
     for k in range(pixels.size):

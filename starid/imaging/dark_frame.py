@@ -46,9 +46,7 @@ def without_dark(image: Counts, excess_dn: Array32) -> Counts:
 
     if image.shape != excess_dn.shape:
         here, there = ("×".join(str(side) for side in reversed(array.shape)) for array in (excess_dn, image))
-        raise StaridError(
-            f"dark frame of {here} pixels: the image has {there}; give a dark frame of the same camera"
-        )
+        raise StaridError(f"dark frame of {here} pixels: the image has {there}; give one of the same camera")
     most = np.iinfo(image.dtype).max
     result = np.clip(np.rint(image - excess_dn), 0, most).astype(image.dtype)
     blind = excess_dn > _BLIND_SHARE * float(image.max(initial=1))

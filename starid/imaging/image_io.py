@@ -89,7 +89,7 @@ def image_suffix(path: Path) -> str:
         The suffix is not supported, or the path is a folder.
     """
     if path.is_dir():
-        raise StaridError(f"image {path}: is a folder; give a file name in it")
+        raise StaridError(f"image {path}: is a folder; name a file in it")
     suffix = path.suffix.lower() or (".png" if is_stream(path) else "")
     if suffix not in SUFFIXES:
         raise StaridError(f"image {path}: suffix must be one of {', '.join(SUFFIXES)}, not {suffix!r}")

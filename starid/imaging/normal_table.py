@@ -1,4 +1,4 @@
-"""The normal distribution and its density for compiled loops: a small table with Taylor interpolation."""
+"""The normal distribution and its density for compiled loops: a small table and a Taylor step from its nearest entry."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from starid.jit import compiled_ieee
 
 REACH: Final = 8.0
-"""Number of standard deviations beyond which the distribution is taken as 0 or 1."""
+"""Beyond this many standard deviations the distribution is taken as 0 or 1."""
 
 _PER_SIGMA: Final = 32
 _COUNT: Final = int(2 * REACH) * _PER_SIGMA + 1

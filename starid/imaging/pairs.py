@@ -86,11 +86,11 @@ def fit_pair(
     Parameters
     ----------
     pixels, window, shape, noise, work
-        See `fit_star`.
+        As in `fit_star`.
     models : ndarray (6, rows·columns)
         On return, the models of both stars.
     enough : float
-        CHI2 that the fit must reach in its first steps; otherwise it is abandoned.
+        CHI2 that a fit has to reach in its first steps, or it is abandoned.
     pair : ndarray (2, FIT_COLUMNS)
         First guesses of X, Y and FLUX on entry; filled with the fits. CHI2 and PIXELS are for both together.
 

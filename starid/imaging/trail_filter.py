@@ -31,9 +31,9 @@ def _sum_along(
     sums: npt.NDArray[np.uint16] | npt.NDArray[np.uint32],
     out: npt.NDArray[np.uint16],
 ) -> None:
-    """Sum the image at `steps` positions along the trail of each tile, shifted right; `sums` is a row of a tile.
+    """Sum of the image at `steps` positions along the trail of each tile, shifted right; `sums` is a tile's row.
 
-    Indices are unsigned: without negative ones to handle, the loops are vectorised.
+    Indices are unsigned: without the case of negative ones the loops become vector instructions.
     """
     height, width = image.shape
     pixels, target = image.reshape(image.size), out.reshape(out.size)

@@ -63,7 +63,7 @@ def _rows(u: float, v: float, rows: Array) -> None:
 
 @compiled_ieee
 def mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[float, float]:
-    """Distance between the measured trail k and the flow, and the sign that minimises it."""
+    """Distance between the measured trail k and the flow's, and the sense (±1) that minimises it."""
     dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
     forth = math.hypot(trails[k, 0] - dx, trails[k, 1] - dy)
     back = math.hypot(trails[k, 0] + dx, trails[k, 1] + dy)
@@ -184,7 +184,7 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
 
 @compiled_ieee
 def typical_trail(flow: Array, positions: Array, trails: Array) -> tuple[float, float]:
-    """Median length of the flow at positions (n, 2), and median distance to measured trails (n, 2), pixels."""
+    """Median length of a flow's trails at positions (n, 2), and median distance from the measured ones (n, 2), pixels."""
     lengths = np.empty(positions.shape[0])
     off = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):

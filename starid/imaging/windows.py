@@ -30,10 +30,8 @@ WINDOW_COLUMNS: Final = 14
     RADIUS_X,
     RADIUS_Y,
 ) = range(WINDOW_COLUMNS)
-"""Columns of a table of windows.
-
-Position and size; start in the packed pixels; first guess of the star; sky and noise of a pixel (counts); half-width of
-the saturated patch; trail; half-widths of the window (pixels)."""
+"""Columns of a table of windows: position and size; start of the pixels in the packed array; first guess of the star;
+sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
 
 LARGEST_HALF_WIDTH: Final = 40
 """Largest half-width of a window, pixels."""

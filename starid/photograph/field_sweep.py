@@ -106,12 +106,7 @@ def solve_any_field(
 ) -> ImageSolution:
     """Solve one image with a `FieldSweep`.
 
-    Parameters
-    ----------
-    image, settings, observer_velocity
-        See `FieldSweep.solve`.
-    catalog, model
-        See `FieldSweep`.
+    The parameters are those of `FieldSweep` and of its `solve`.
     """
     height, width = image.shape
     return FieldSweep(width, height, catalog, model=model).solve(image, settings, observer_velocity)

@@ -42,10 +42,7 @@ MODELS: Final[tuple[tuple[str, ...], ...]] = (
 """Sets of free parameters, from which the default calibration chooses the one that the images justify."""
 
 IMAGE_MODELS: Final[tuple[tuple[str, ...], ...]] = (("focal",), ("focal", "k1"), ("focal", "k1", "k2"))
-"""Sets of free parameters for a single image by an unknown camera.
-
-The centre is fixed: in a narrow field it is degenerate with the attitude.
-"""
+"""Sets of free parameters for one image, where the centre may be degenerate with the attitude."""
 
 _ROUNDS: Final = 4
 _WINDOW_SIGMAS: Final = 5.0
@@ -157,8 +154,7 @@ def calibrate_identified(
     frames : sequence of Stars
         Detections in each frame.
     solutions : mapping of int to Solution
-        Valid solutions by frame, at least one. The adjustment starts with the camera of the first one, if it
-        has one.
+        Valid solutions by frame, at least one. The adjustment starts with the first one's camera, if any.
     camera : Camera
         The camera with which the frames were identified.
     sky : StarCatalog

@@ -22,8 +22,7 @@ def typical_camera(camera: Camera) -> Camera | None:
     """Camera with a square image of a rounded size to share an index with; None for the widest fields.
 
     Its pixels are no finer than the pixels of the given camera, so that the index covers that camera's
-    matching windows. They are finer only for images smaller than about 590 pixels, whose windows are then
-    limited to those of the index.
+    matching windows. They are finer only below about 590 pixels, where the index then limits the windows.
     """
     area = field_solid_angle(camera)
     if not area < WIDEST_SR:

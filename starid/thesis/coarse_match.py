@@ -2,8 +2,7 @@
 
 A cell of the database gives the boresight to within half a cell, and no reliable roll. The distance of a star
 from the centre does not depend on roll, so every pair of an observed and a catalogue star with similar
-distance and brightness votes for the roll between them. The true cell has a peak that chance does not
-produce.
+distance and brightness votes for the roll between them. The true cell has a peak.
 """
 
 from __future__ import annotations

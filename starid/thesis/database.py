@@ -247,8 +247,8 @@ def build_database(
     """Compute the features of every frame of the grid.
 
     There are two passes over the grid, first the extremes and then the codes, so that full-precision features
-    are never stored and memory is limited to the database itself. Threads share the rows; the result does not
-    depend on their number.
+    are never stored and memory is limited to the database itself. The number of threads does not change the
+    result.
 
     Parameters
     ----------

@@ -50,8 +50,7 @@ def save_database(database: FeatureDatabase, path: Path) -> int:
     """Write a database atomically; return the size of the file in bytes.
 
     Layout: 16 bytes "starhil features", header length (uint32, little-endian), header (JSON), padding to 64
-    bytes, features (N, 5) uint8, polar angles (N,) uint8, stars (n, 3) float64 little-endian (magnitude, α, δ
-    in degrees).
+    bytes, features (N, 5) uint8, polar angles (N,) uint8, stars (n, 3) float64 (magnitude, α, δ in degrees).
 
     Raises
     ------
@@ -135,8 +134,7 @@ def load_database(path: Path, *, verify: bool = True) -> FeatureDatabase:
     Raises
     ------
     DatabaseError
-        The file is missing, truncated, damaged, of another version, or not a database; the message names the
-        file.
+        The file is missing, truncated, damaged, of another version, or not a database.
     """
     header = read_header(path)
     start = int(header.pop("payload_start"))

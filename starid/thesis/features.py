@@ -142,8 +142,7 @@ def extract_features(
     brightness
         Magnitudes of the stars, (n,).
     offsets
-        Positions relative to the centre of the frame, (n, 2), in degrees of the flat (α, δ) plane or in
-        pixels.
+        Positions relative to the centre of the frame, (n, 2), in degrees (flat plane) or pixels.
     half_width
         Half-width of the frame in the unit of the offsets; stars outside are ignored. None uses all stars.
     full_field

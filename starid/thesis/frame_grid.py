@@ -57,8 +57,7 @@ class FrameGrid:
     ----------
     geometry
         "planar": the flat (α, δ) plane of the thesis, with the same number of columns in every row.
-        "spherical": the rows start half a step off the poles, and the number of columns, at least three,
-        keeps the cells similar in area.
+        "spherical": the rows start half a step off the poles, and cells have similar areas.
     step_deg
         Distance between two cells, φ·(1 − p), degrees.
     first_ra_deg
@@ -105,8 +104,7 @@ class FrameGrid:
         """Cells of the 3×3 neighbourhood, (9,), row by row: the dictionary T of eq. 2.30 in terms of cells.
 
         Right ascension wraps. At the first and last row the block is moved inwards as a whole, so that it
-        always has nine different cells; on the sphere the three columns of a row are the nearest in right
-        ascension.
+        always has nine different cells; on the sphere the nearest three columns of a row.
         """
         cells = np.empty(DICTIONARY_SIZE, dtype=np.int64)
         turns = np.empty(DICTIONARY_SIZE)

@@ -34,11 +34,7 @@ BRIGHTNESS, RIGHT_ASCENSION, DECLINATION, UX, UY, UZ = range(6)
 """Columns of the star table: magnitude, degrees, degrees, unit vector."""
 
 SPHERICAL, HALF_WIDTH, FULL_FIELD, FOCAL, REACH, PIVOT = range(6)
-"""Indices into `SkyArrays.frame`.
-
-1 on the sphere; half-width (degrees or pixels); 1 for the whole square; focal length in pixels; largest angle
-of a star from the centre in degrees; brightness to sum about.
-"""
+"""Indices into `SkyArrays.frame`: two are flags, lengths are in degrees or pixels, REACH is in degrees."""
 
 
 class SkyError(StaridError):
@@ -91,7 +87,7 @@ def position_cosines(ra_deg: float, dec_deg: float) -> tuple[float, float, float
 def gnomonic(
     ux: float, uy: float, uz: float, turn: tuple[float, float, float, float], focal: float
 ) -> tuple[float, float]:
-    """Offset of a star in a frame (`position_cosines`), north up, +x right, +y down; infinite behind the camera."""
+    """Offset of a star in a frame with north up, +x right, +y down; infinite behind the camera."""
     cos_a, sin_a, cos_d, sin_d = turn
     level = cos_a * ux + sin_a * uy
     depth = cos_d * level + sin_d * uz
@@ -141,8 +137,7 @@ def stars_near(
 ) -> int:
     """List the stars of a circular frame with north up, and a margin around it; return their number.
 
-    `found` (n, 3) receives x, y in the unit of the frame and the magnitude, `rows` (n,) the rows in the table
-    of stars.
+    `found` (n, 3) receives x, y in the unit of the frame and the magnitude, `rows` (n,) their rows.
     """
     stars, bin_start, frame = sky
     spherical = frame[SPHERICAL] > 0.5

@@ -110,8 +110,7 @@ def _neighbours(
 ) -> int:
     """List all points within ε of a point, including itself; return their number.
 
-    The points are sorted by bin; bins (shape, bin of each point, first point of each bin) are at least ε
-    wide.
+    The points are sorted by bin; `bins` (shape, bin of each point, first of each bin) are at least ε wide.
     """
     shape, where, start = bins
     count = 0
@@ -275,8 +274,7 @@ class ClusterFilter:
     epsilon
         Radius ε of the neighbourhood.
     min_samples
-        Smallest number of points in the neighbourhood of a core point; by default `MIN_SAMPLES_SHARE` of the
-        objects in the later frame.
+        Smallest number of points in the neighbourhood of a core point; default `MIN_SAMPLES_SHARE`.
     """
 
     epsilon: float = EPSILON

@@ -229,8 +229,7 @@ def optimality_gap(gram: Array, correlation: Array, penalty: float, omega: Array
 def lasso_path(dictionary: Array, observation: Array, lambdas: Array, weights: Array) -> bool:
     """Solve the LASSO for all λ; return False if coordinate descent was needed.
 
-    This is the least-squares problem of eq. 2.31 with the elastic-net penalty of eq. 2.32, P_a of eq. 2.33,
-    at a = 1.
+    This is the least-squares problem of eq. 2.31 with the penalty of eq. 2.32, P_a of eq. 2.33 at a = 1.
 
     Parameters
     ----------
@@ -284,8 +283,7 @@ def choose_lambdas(dictionary: Array, observation: Array, weights: Array, error:
     """Choose the λ of the least mean squared error, and the largest λ within one standard error of it.
 
     The error is the mean over the M features of the squared residual ψ̂ − Tω; its standard error is their
-    standard deviation (over M − 1) divided by √M, at the least error. `error` (k,) is filled with the mean
-    squared errors.
+    standard deviation (over M − 1) divided by √M, at the least error. `error` (k,) receives the errors.
     """
     features, n = dictionary.shape
     squared = np.empty(features)

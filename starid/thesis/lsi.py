@@ -271,8 +271,8 @@ def estimate_from_path(
     """Compute the estimates from the weights at two λ of a LASSO path.
 
     The boresight is F·ω (eq. 2.15, printed again as eq. 2.36) and the angle Θ·ω (eq. 2.37), with weights
-    normalised to a sum of one; the reconstruction is T·ω (eq. 2.35). If the weights cancel, the cell itself
-    is the estimate.
+    normalised to a sum of one; the reconstruction is T·ω (eq. 2.35). If the weights cancel, the cell is
+    taken.
     """
     for row in range(2):
         omega = work.weights[row]
@@ -357,11 +357,9 @@ def region_nearest(
     Parameters
     ----------
     ra_deg, dec_deg, side_deg
-        Centre and side Γ of the square, degrees; it wraps in right ascension and is cut off at the edges of
-        the grid.
+        Centre and side Γ of the square, degrees; wraps in right ascension, clipped to the grid.
     theta
-        Polar angle of the frame object, radians, as a sixth feature with 100 for a full turn; NaN to ignore
-        it.
+        Polar angle of the frame object, radians, as a sixth feature (full turn: 100); NaN to ignore it.
     found
         Output (2,): distance on the normalised scale, and number of cells in the region.
     """
@@ -421,8 +419,7 @@ class LostInSpace:
     """The LSI algorithm on one database.
 
     The nearest neighbour t₅ is the cell of least distance ‖ψ̂ − t̂‖ (eq. 2.12) of all d_i (eq. 2.28),
-    eq. 2.29. Its 3×3 neighbourhood is the dictionary, and the boresight is the mean of its cells with the weights
-    from the LASSO.
+    eq. 2.29. Its 3×3 neighbourhood is the dictionary, and the LASSO weights its cells.
 
     Parameters
     ----------
@@ -534,9 +531,7 @@ class LostInSpace:
 
     def _check(self, observation: Array) -> None:
         if observation.shape != (5,) or not np.isfinite(observation).all():
-            raise DatabaseError(
-                "LSI: an observation must be five finite numbers; check the stars of the frame"
-            )
+            raise DatabaseError("LSI: an observation must be five finite numbers; check the stars")
 
 
 def _solution(observation: Array, nearest: int, distance: float, work: LsiWork) -> LsiSolution:

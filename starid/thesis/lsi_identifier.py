@@ -3,8 +3,7 @@
 Outside the plane of the thesis its nearest neighbour is right in only a third of the frames, because stars
 near the brightness limit come and go with the noise of their magnitudes. The nearest neighbours are therefore
 tried one after the other: the stars of each vote for a roll (`starid.thesis.coarse_match`), a clear peak is
-paired star by star, and the resulting attitude is refined and verified by the tracking stage of the geometric
-identifier. What fails is invalid.
+paired star by star, and the resulting attitude is refined and verified by the geometric identifier.
 """
 
 from __future__ import annotations
@@ -82,8 +81,7 @@ class LsiReport:
     Attributes
     ----------
     coarse
-        Attitude as in the thesis: one nearest neighbour, LASSO, roll from the polar angle. None if there is
-        none.
+        Attitude as in the thesis: one nearest neighbour, LASSO, roll from the polar angle; or None.
     tried
         Number of candidates for which the stars voted.
     verified
@@ -105,16 +103,14 @@ class LsiOptions:
     Attributes
     ----------
     feature_limit
-        Faintest V of the stars in the features; by default for about 60 stars per field. The sensor must see
-        deeper.
+        Faintest V of the stars in the features; default: for about 60 per field. The sensor must see deeper.
     overlap
         Overlap ratio of the database.
     neighbours
         Largest number of neighbours tried, nearest first.
     zero_point
         V magnitude of unit flux, if it is known. Otherwise it is learned: each answer determines it, and for
-        the next frame that value is tried first, and then values suggested by the brightness of the frame's
-        stars.
+        the next frame that value is tried first, and then guesses from the frame.
     limiting_magnitude
         Faintest V of the verification (see `Identifier`).
     database

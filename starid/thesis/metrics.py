@@ -27,9 +27,9 @@ def rotation_error(angle_deg: ArrayLike, true_angle_deg: ArrayLike) -> Array:
     return np.asarray(np.abs(turn), dtype=np.float64)
 
 
-def error_colours(error: ArrayLike, greatest: float) -> Array:
-    """Colours of an error map, eq. 6.1: from green at 0 to red from `greatest` on, RGB 0 … 1, (…, 3)."""
-    share = np.clip(np.asarray(error, dtype=np.float64) / greatest, 0.0, 1.0)
+def error_colours(error: ArrayLike, largest: float) -> Array:
+    """Colours of an error map, eq. 6.1: from green at 0 to red from `largest` on, RGB 0 … 1, (…, 3)."""
+    share = np.clip(np.asarray(error, dtype=np.float64) / largest, 0.0, 1.0)
     return np.stack([share, 1.0 - share, np.zeros_like(share)], axis=-1)
 
 

@@ -4,8 +4,7 @@ The thesis suggests both as future work; this is our implementation. A single mi
 features of a frame. A star of the previous frame that the camera motion carries to a position in the field
 where nothing is detected is missing, and is restored there. Lost in space there is no previous frame. The
 field is then divided into smaller overlapping circles, each with a database of that width, and the answer is
-the boresight of the whole field on which several circles agree: circles with missing stars agree with no
-other.
+the boresight of the whole field on which several circles agree: those with missing stars do not agree.
 """
 
 from __future__ import annotations

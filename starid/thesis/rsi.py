@@ -48,8 +48,7 @@ class RsiSettings:
     memory, agreement_deg
         0: the thesis's algorithm, in which each answer is the centre of the next search region. Otherwise our
         addition: this many previous answers, carried forward with the motion, vote; two agree if they are
-        within `agreement_deg`. The answer on which most agree is the result and the centre of the next
-        region.
+        within `agreement_deg`. The answer with most votes is the result and the next centre.
     """
 
     tau: float = 0.5

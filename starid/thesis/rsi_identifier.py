@@ -1,8 +1,7 @@
 """The RSI algorithm for a real sensor: filter, motion, a search region on the sphere, and LSI if that fails.
 
 It is the thesis's recursion with one difference: whether the answer from the region is good enough is decided
-not by ε_ψ, which says little on the sphere and with stars near the brightness limit, but by the verification
-of every answer.
+not by ε_ψ, which says little on the sphere and with stars near the brightness limit, but by verification.
 """
 
 from __future__ import annotations

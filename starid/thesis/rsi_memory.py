@@ -70,8 +70,7 @@ class AnswerMemory:
     def prediction(self) -> Prediction | None:
         """Return the prediction on which most answers agree (the latest of equal ones); None without answers.
 
-        The roll comes first, because the motion in the sky depends on it: the median relative to the most
-        central roll.
+        The roll comes first, because the motion in the sky depends on it: a circular median.
         """
         answers = self._answers
         if answers.shape[0] == 0:

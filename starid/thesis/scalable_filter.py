@@ -4,8 +4,7 @@ Objects are followed from frame to frame in coordinates that move with the stars
 hits, glints) are not seen again; stationary ones (hot pixels) stay behind when the stars move on; drifting
 ones (debris, other satellites) leave the gate. If the motion is so slow that stationary and drifting objects
 stay within the gate, they are recognised by their scatter about their position among the stars. The cost is a
-few operations per pair of objects, while the thesis's list of disparities grows with the fourth power of
-their number.
+few operations per pair of objects, not the fourth power of their number.
 """
 
 from __future__ import annotations
@@ -88,8 +87,7 @@ class TrackResult:
     track
         Track number of each object, (n,), the same for a star in every frame.
     motion
-        Motion of the stars since the previous frame: cosine, sine, shift x, shift y (degrees); None if
-        unknown.
+        Motion of the stars since the previous frame: cosine, sine, shift x, shift y (degrees); or None.
     """
 
     true_now: Mask
@@ -307,8 +305,7 @@ class TrackFilter:
         """Whether each track is better explained as fixed on the sensor or drifting than as a star.
 
         Each of the three explanations has a sum of squared residuals; their differences, in units of the
-        usual variance, are tested. An error of the motion is common to all tracks and is removed by
-        subtracting the median.
+        usual variance, are tested. Subtracting the median removes an error of the motion.
         """
         tracks = self._tracks
         result = np.zeros(len(tracks), dtype=np.bool_)

@@ -44,8 +44,7 @@ class NoiseModel:
     brightness_sigma, brightness_mean
         Normal noise of the brightness, in units of the 8-bit intensity.
     false_stars, missing_stars
-        Number of false stars added, uniform over the circular field and the range of magnitudes; number of
-        true stars removed.
+        Number of false stars, uniform in the circular field and in magnitude; number of stars removed.
     magnitude_range
         Magnitudes that the 255 steps of intensity span, and from which false stars are drawn.
     mean_spread
@@ -237,8 +236,7 @@ def sky_sequence(
     count
         Number of frames.
     margin_deg
-        Width of the rim around the field of the features in which objects are visible too, so that a star is
-        known before it enters the field.
+        Width of the rim around the field of the features in which objects are visible too, degrees.
     wander
         Move from the previous frame; otherwise, as in the published experiments, from the first one. At a
         declination of `WANDER_LIMIT_DEG` the boresight is reflected, so that frames stay on the grid.

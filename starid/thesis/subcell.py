@@ -4,8 +4,7 @@ While no star enters or leaves the frame, n, A and σ_A do not change with the b
 smooth functions of it: two equations for two unknowns. Newton's method from each of the k nearest cells
 therefore converges either to the frame itself or to a position whose features, computed from the stars, do
 not fit; the residual of all five features decides. This removes the error of the thesis's algorithm off the
-grid, where the cell with the nearest features often has another star at its rim, which no combination of
-cells can correct.
+grid, where the cell with the nearest features often has another star at its rim.
 """
 
 from __future__ import annotations
@@ -229,8 +228,7 @@ class FineEstimate:
     theta_rad
         Polar angle of the frame object at the boresight, for a camera with north up.
     residual
-        Length of the difference of all five normalised features; near zero if the observed stars are the
-        stars of the answer.
+        Length of the residual of the normalised features; near zero if the stars are the same.
     starts
         Number of cells tried.
     seen
@@ -274,8 +272,8 @@ class SubcellSearch:
             Features of the frame.
         positions
             Offsets of the same stars from the centre, in the unit of the frame, (n, 2). If given, the stars
-            themselves are compared with the catalogue at every boresight tried, because five features can
-            agree at more than one.
+            themselves are compared with the catalogue at every boresight tried, since features can be
+            ambiguous.
 
         Raises
         ------
@@ -284,9 +282,7 @@ class SubcellSearch:
         """
         observation = self._lsi.database.normalise(features)
         if not np.isfinite(observation).all():
-            raise DatabaseError(
-                "LSI: an observation must be five finite numbers; check the stars of the frame"
-            )
+            raise DatabaseError("LSI: an observation must be five finite numbers; check the stars")
         answer = np.empty(5)
         starts = subcell_kernel(
             self._lsi.index,

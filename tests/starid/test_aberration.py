@@ -40,7 +40,7 @@ def seen(
 def predicted_error(
     camera: Camera, truth: Attitude, directions: np.ndarray, velocity: np.ndarray
 ) -> np.ndarray:
-    """Rotation vector (sensor) of a camera that takes aberrated directions for true ones, by v/c to first order."""
+    """Attitude error (rotation vector, sensor frame) from uncorrected aberration, to first order in v/c."""
     beta = velocity / SPEED_OF_LIGHT_M_S
     displaced = directions + beta - directions * (directions @ beta)[:, None]
     place = camera.project(truth.to_sensor(directions))[0]

@@ -1,4 +1,4 @@
-"""Calibration on simulated skies: the truth is recovered to the noise floor, and the covariance is calibrated."""
+"""Calibration on simulated skies: errors at the noise floor, and a calibrated covariance."""
 
 from __future__ import annotations
 
@@ -205,7 +205,7 @@ def test_a_frame_of_false_matches_among_good_ones_is_reported(sky: StarCatalog) 
 
 @pytest.mark.parametrize("seed", [4, 5])
 def test_a_precise_frame_counts_in_the_choice_of_the_model(sky: StarCatalog, seed: int) -> None:
-    """Only one of six frames determines the distortion, but clearly, and the others are consistent with it."""
+    """Only one of six frames determines the distortion; the others are consistent with it."""
     bent = dataclasses.replace(DEFAULT_CAMERA, distortion=(-1e-3, 0.0, 0.0, 0.0, 0.0))
     frames = []
     for sigma, count in ((0.05, 1), (1.0, 5)):

@@ -84,26 +84,23 @@ _SKY_LABELS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars
 _SENSOR: Final = (12.0, 1024, 6.0)
 """Sensor that most of the papers simulate: field in degrees, pixels, faintest star."""
 
-_NOTE: Final = """The thesis takes the competitors' figures from two papers, each with its own simulator,
-sensor and catalogue; it never ran them. Here every algorithm is run, as published and without this project's
-verification, on the frames with which the thesis tests its own algorithm: its centres, its stars (Hp ≥ 11.5),
-its noise. A frame counts as identified if the boresight is within {limit}° of the truth, as in the thesis;
-answers farther off are "wrong", and the remaining frames have no answer. Each algorithm is given the σ of the
-position noise, as its paper assumes. There are two skies: the flat (α, δ) plane of the thesis, and the same
-stars on the true sphere, which the thesis's LSI cannot use.
+_NOTE: Final = """The thesis takes the competitors' figures from two papers with different simulators, sensors
+and catalogues. Here every algorithm is run, as published and unverified, on the frames of the thesis: its
+centres, stars (Hp ≥ 11.5) and noise. A frame counts as identified if the boresight is within {limit}° of the
+truth, as in the thesis; answers farther off are "wrong". Each algorithm is given the σ of the position noise.
+There are two skies: the flat (α, δ) plane of the thesis, and the same stars on the sphere, which its LSI
+cannot use.
 
-**What differs, and why.** (1) False stars break the thesis's algorithm, as figure 6.11 shows, because its
-features depend on every star in a frame. The classic algorithms hardly suffer from up to three of them. (2)
-One unit of brightness noise is {unit:.4f} mag, which hardly affects algorithms that use positions. The curves
-in the papers fall with σ in *magnitudes*, where stars cross the detection threshold: the two axes of figure
-6.10 are not the same quantity. (3) Pair distances alone (GV, IA and, to a lesser degree, PA and SGS) cease to
-be unique when the tolerance grows with the noise. How soon depends on the ratio of tolerance to field width
-and on the number of guide stars, which the papers choose and the thesis does not state. (4) Sizes and times:
-ours are for up to {stars} faint stars and compiled code; the remark "12° sensor" gives the size for the
-sensor of most of the papers, 12° and stars to V 6. Times are the wall time of one solution on the machine
-that made this report. (5) The papers' guide stars are evenly spread. On the flat sky their density falls with
-distance from its equator, so that one frame in sixty has only two of the 15 stars per field that PA is given:
-without noise PA fails there and nowhere else."""
+**What differs, and why.** (1) False stars break the thesis's algorithm (figure 6.11), because its features
+depend on every star. Up to three hardly affect the classic algorithms. (2) One unit of brightness noise is
+{unit:.4f} mag, which hardly affects algorithms that use positions. The papers have σ in *magnitudes*, with
+stars crossing the detection threshold: not the same quantity. (3) Pair distances alone (GV, IA and, to a
+lesser degree, PA and SGS) cease to be unique when the tolerance grows with the noise. How soon depends on the
+tolerance and the number of guide stars, which the thesis does not state. (4) Sizes and times: ours are for up
+to {stars} faint stars and compiled code; the remark "12° sensor" gives the size for the sensor of most
+papers, 12° and stars to V 6. Times are wall time on the machine that made this report. (5) The papers' guide
+stars are evenly spread. On the flat sky their density falls with distance from its equator, so that PA has
+only two stars in one frame in sixty, and fails there."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:

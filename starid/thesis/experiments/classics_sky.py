@@ -2,8 +2,7 @@
 
 On the flat sky distances are those in the (α, δ) plane, which no rotation of a sphere preserves. The
 published algorithms use unit vectors, so the plane is mapped to a tiny patch of the sphere and imaged by a
-lens of such long focal length that a frame fills the same pixels. Curvature is then negligible, and the
-algorithms need no change.
+lens of such long focal length that a frame fills the same pixels. Curvature is then negligible.
 """
 
 from __future__ import annotations

@@ -85,8 +85,7 @@ def agreement(
 ) -> Row:
     """Make a check for agreement with a published number.
 
-    The value checked is from the author's version of the algorithm, or else from the printed one, or else
-    ours.
+    The value checked is the author's version, or else the printed one, or else ours.
 
     Raises
     ------
@@ -98,10 +97,10 @@ def agreement(
         raise ReproduceError(
             f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
         )
-    greatest, origin = tolerance
+    largest, origin = tolerance
     readings = {"published": published, "author": author, "printed": printed, "ours": ours}
     informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
-    return _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= greatest])
+    return _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
 
 
 def same(

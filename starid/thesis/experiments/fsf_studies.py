@@ -52,9 +52,9 @@ _CASE_TABLE: Final[dict[tuple[int, str], tuple[float, float, float, float, float
 }
 """Tables 6.3 and 6.4: accuracy, precision (percent; recall is 100 %), ε_γ, σ_γ, ε_ρ, σ_ρ (degrees)."""
 
-_CASE_NOTE: Final = """Ten moved frames, noise factor 1. The thesis has rotation errors of 0.7° in most rows
-of table 6.4, even without noise: its sign or reference must have been different. Figure 6.13 shows the stars
-of a frame, and the stars of the earlier frame moved by the estimated motion, without and with noise."""
+_CASE_NOTE: Final = """Ten moved frames, noise factor 1. The thesis has rotation errors of 0.7° in most
+rows of table 6.4, even without noise: its sign or reference must have been different. Figure 6.13 shows a
+frame and the earlier one after the estimated motion, without and with noise."""
 
 _CASE_FRAMES: Final = 10
 _CASE_STARS: Final = 70
@@ -64,9 +64,9 @@ _ROUNDING_ERROR_DEG: Final = 1e-12
 _PUBLISHED_CORRELATION: Final = (0.427, 0.680, 0.635, 0.999, 0.997, 0.901)
 _KINDS: Final = ("transient", "stationary", "drifting")
 _CROWD_NOTE: Final = """Counted are all false stars, and the true stars that were in the field in both frames
-before as well, since the filter needs three sightings. Drifting stars that move by less than the gate from
-frame to frame need a few more frames before the filter recognises them. The time is taken from the fastest
-tenth of the frames, since other work on the machine slows the rest."""
+before as well, since the filter needs three sightings. Slowly drifting stars need a few more frames to be
+recognised. The time is taken from the fastest tenth of the frames, since other work on the machine slows the
+rest."""
 
 
 def _choice_parts(parameters: Parameters) -> list[Part]:

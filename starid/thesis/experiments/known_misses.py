@@ -1,8 +1,7 @@
 """Published numbers that the reproduction is known to miss, each with the reason.
 
 A failed check that is listed here is a known miss: the report shows it, and the exit status stays 0. A failed
-check that is not listed is a regression. A row with several numbers is listed with how many of them agree;
-fewer are a regression.
+check that is not listed is a regression. A row of several numbers is listed with how many agree.
 """
 
 from __future__ import annotations

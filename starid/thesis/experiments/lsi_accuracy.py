@@ -53,12 +53,12 @@ _NOTE: Final = """The thesis's frames have their lower-left corner at α = 2° +
 the observation itself, at distance zero, and the only error is what the LASSO penalty adds by mixing in
 neighbours. How large it is depends on the solver: MATLAB's `lasso` stops its descent long before the minimum
 and mixes in far more than the exact solution of the LASSO of eq. 2.34. The published accuracy is MATLAB's, to
-a percentage point. Off the grid the same algorithm is less accurate: the nearest cell often differs from the
-frame by a star at the rim, which no mixture of cells can correct. The third line, "sub-cell", is ours:
-starting from the nearest cell and up to 16 more, it solves for the boresight at which the features, computed
-from the stars, agree, and keeps the first that does, or the best. "Stars compared" goes one step further: for
-up to 256 cells the observed stars are rotated by the roll found there and compared with the catalogue; the
-first position at which nine in ten are found wins (databases from 99 % on)."""
+a percentage point. Off the grid it is less accurate: the nearest cell often differs from the frame by a star
+at the rim. The third line, "sub-cell", is ours: starting from the nearest cell and up to 16 more, it solves
+for the boresight at which the features, computed from the stars, agree, and keeps the first that does, or the
+best. "Stars compared" goes one step further: for up to 256 cells the observed stars are rotated by the roll
+found there and compared with the catalogue; the first position at which nine in ten are found wins (databases
+from 99 % on)."""
 
 _LIMIT_NOTE: Final = """What limits the sub-cell search: while no star crosses the rim, n, A and σ_A are
 constant, and only r and σ_r determine where in the cell the frame is — two equations for two unknowns, in

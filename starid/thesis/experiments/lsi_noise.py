@@ -62,9 +62,9 @@ _RIVALS: Final = {
 _NOTE: Final = """p = 99.5 %, the MSE solution. Position noise is normal with σ in pixels of 42°/937 per axis,
 brightness noise with σ in units of an 8-bit intensity, of which 255 span the magnitudes 11.5 … 15; "μ drawn"
 adds a mean, drawn for each frame from N(0, 1). False stars are uniform in the circular field and in
-magnitude, 11.5 … 15; missing stars are drawn from the true ones. The features are computed from the noisy
-list: a star stays in the list even if noise moves it across the rim, as it must have in the thesis (otherwise
-n changes, and the shares are as low as with false and missing stars).
+magnitude, 11.5 … 15; missing stars are drawn from the true ones. A star stays in the list even if noise moves
+it across the rim, as it must have in the thesis (otherwise n changes, and the shares are as low as with false
+stars).
 
 **The published figures under noise can be interpreted in two ways, and neither is complete.** With the
 printed noise, σ pixels and σ intensity units, the thesis's algorithm has only about half of the frames within
@@ -75,19 +75,17 @@ example of section 5.1, and a brightness unit of 1/255 mag, the nearest cell alo
 shares within 0.3° at the printed noise, but not those within 0.1° and 0.013°; and a search with the polar
 angle is not invariant to roll, as figure 6.3 is. (ii) *As the author ran it*: with MATLAB's `lasso` and a
 noise of 0.25·√σ, as if a fraction of σ had been passed as a variance, all twelve published shares for both
-noises are reproduced to within about two percentage points. Nothing in the text supports the 0.25; the
-published μ_d of at most 0.0419° (figure 6.18), less than one pixel at "5 px", requires a similar reduction.
-The percentages 99.99 and 97.99 of section 6.1.2.3 are not multiples of 1/1701 and cannot be shares of the 1
-701 frames."""
+noises are reproduced to within about two percentage points. Nothing in the text supports the 0.25, but the
+published μ_d (figure 6.18) requires a similar reduction. The percentages 99.99 and 97.99 of section 6.1.2.3
+cannot be shares of 1 701 frames."""
 
-_TEXT_NOTE: Final = """The thesis's sentence on 0.2°, 0.1° and 0.013° with noise is taken to mean, for each of
-these limits, the shares at σ = 1, 2, 3. Taken literally (one σ for each triple), the share at σ = 3 would
-fall from 99.2 % within 0.3° to 36 % within 0.2°, and rise as the limit becomes smaller."""
+_TEXT_NOTE: Final = """The thesis's sentence on 0.2°, 0.1° and 0.013° with noise is taken to mean, for each
+limit, the shares at σ = 1, 2, 3. Taken literally, the share at σ = 3 would rise as the limit becomes
+smaller."""
 
 _FALSE_NOTE: Final = """A false or missing star changes n by one, which is {step:.2f} on the normalised scale,
-and also A and σ_A; the nearest neighbour is then in another region of the sky. One star among the median of
-{stars:.0f} per frame is enough: this, not noise, is why the LSI algorithm fails, on the grid and off it, and
-why the thesis puts a filter before it."""
+and also A and σ_A; the nearest neighbour is then elsewhere in the sky. One star of the median {stars:.0f} per
+frame is enough: this, not noise, is why the thesis puts a filter before LSI."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:

@@ -47,11 +47,9 @@ _LARGEST: Final = 99.75
 
 _NOTE: Final = """Median over the test frames of the shortest of three passes, in milliseconds,
 single-threaded, including calls from Python. The thesis gives means measured in MATLAB on a Core i5 at 2.7
-GHz. Its search scans all frames, ours descends a tree of the 8-bit codes and computes the few cells that
-could be nearer from their stars; its LASSO solves for 100 values of λ one by one, ours follows the piecewise
-linear path. The thesis quotes the rivals of table 6.2 from their papers, measured on other machines. Times
-depend on the machine, so the ratios matter. Off the grid the search must compute more cells, since none is at
-distance zero."""
+GHz. Its search scans all frames, ours descends a tree; its LASSO solves for 100 values of λ one by one, ours
+follows the piecewise linear path. The rivals of table 6.2 are quoted from their papers, measured on other
+machines: only ratios matter. Off the grid the search must compute more cells, since none is at distance zero."""
 
 
 def _parts(parameters: Parameters) -> list[Part]:

@@ -100,8 +100,8 @@ def solve_frames(
         `frames` (n, 2) degrees; `f_…` (n,): ε_f in degrees of the estimates `mse` and `1se` with the exact
         LASSO, `author_mse` and `author_1se` with MATLAB's, `fine` of the sub-cell search, and, if requested,
         `stars` of the search that compares the stars and `six` of the nearest cell in six features;
-        `theta_…`: ε_θ in degrees of the same; `psi_mse`, `psi_author`, `residual`: ε_ψ of the two kinds of
-        LSI and of the sub-cell search.
+        `theta_…`: ε_θ in degrees of the same; `psi_mse`, `psi_author`, `residual`: ε_ψ of both kinds of LSI
+        and the sub-cell search.
     """
     lsi = context.lost_in_space(overlap)
     author = context.lost_in_space(overlap, "matlab")

@@ -21,10 +21,8 @@ Using a Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University)
 Hipparcos catalogue (new reduction) and compared with the published values. There are four columns, of which a
 row fills those that apply:
 
-* **published**: the value printed in the thesis; a curve or a phrase is quoted, "—" means that nothing is
-  printed.
-* **as the author ran it**: the author's version of the algorithm, as inferred from the published numbers;
-  above all, with MATLAB's `lasso`.
+* **published**: the value printed in the thesis; a curve or a phrase is quoted, "—" means none.
+* **as the author ran it**: the author's version, inferred from the published numbers, with MATLAB's `lasso`.
 * **as printed**: the equations and parameters of the thesis's text, solved exactly.
 * **ours**: this project's own solution of the task.
 
@@ -36,17 +34,15 @@ A check belongs to one of three classes, which are counted separately:
 * **better**: ours is better than the published number; the row says by how much.
 * **ours**: nothing was published; the bound is a requirement of this project.
 
-A failed check is shown as a miss. A known miss states its reason; any other is a *regression*, and only a
-regression gives the exit status 1.
+A known miss states its reason; any other failed check is a *regression* and gives the exit status 1.
 
 How to read the accuracy figures of the LSI algorithm:
 
 * **On the grid**: the thesis tests on 1 701 frames, and with p = 99.5 % every one of them *is* a frame of the
   database. The nearest neighbour is then the frame itself, and the figure says little about frames in
   between.
-* **Off the grid**: the same frames, each moved by an irrational fraction of the grid step (drawn from a
-  seeded generator), which is what a real sensor sees. Every accuracy figure of the LSI algorithm is given for
-  both.
+* **Off the grid**: the same frames, each moved by a random fraction of the grid step, which is what a real
+  sensor sees. Every accuracy figure is given for both.
 """
 
 CLASSES: Final[dict[Kind, str]] = {

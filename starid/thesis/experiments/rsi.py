@@ -1,7 +1,4 @@
-"""Recursive identification: figures 6.33–6.43, E, F and G, tables 6.7–6.9 and H.
-
-Sequences: 6.33–6.36 and E; precision: 6.37–6.41 and F; run time: 6.42, 6.43 and G.
-"""
+"""Recursive identification: figures 6.33–6.43, E, F and G, tables 6.7–6.9 and H."""
 
 from __future__ import annotations
 

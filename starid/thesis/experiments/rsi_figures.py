@@ -1,7 +1,4 @@
-"""Figures of the recursive algorithm.
-
-Sequences: 6.33–6.36 and E; precision: 6.37–6.41 and F; run time: 6.42, 6.43 and G.
-"""
+"""Figures of the recursive algorithm: sequences, precision and run time (6.33–6.43, E, F, G)."""
 
 from __future__ import annotations
 

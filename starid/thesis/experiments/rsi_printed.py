@@ -1,7 +1,4 @@
-"""The recursive algorithm with the thesis's own filter and affine motion: tables 6.7, 6.8, H.1 and H.2.
-
-Equation 6.5 is interpreted in three ways.
-"""
+"""The recursive algorithm with the thesis's own filter and affine motion: tables 6.7, 6.8, H.1, H.2."""
 
 from __future__ import annotations
 
@@ -51,19 +48,19 @@ contained is not known. *As the author ran it* is MATLAB's `lasso` on five featu
 polar angle as a sixth; *as printed* is the search in five features and eq. 2.34, solved exactly. The
 tolerance is one published standard deviation, because the published means are for other frames.
 
-The sequences run with the thesis's own filter (density-based clustering of the disparities of all pairs, ε =
-0.4, min_samples = 0.5·n) and an affine motion. Frames move from the first one by U(−25, 25) px and U(−2.5°,
-2.5°), as in the experiments on the filter, and objects are visible 1.6° beyond the field of the features.
-With 25 to 30 objects in a frame there are half a million disparities, and with every object in the main
-cluster taken for a star about half of the false stars pass. *As the author ran it*, two objects must name
-each other most often, which stops nearly all of them. The noise is {equivalent:g} of the printed noise in the
-first case and the printed noise in the second. A rigid motion instead of the affine one is also shown."""
+The sequences run with the thesis's own filter (ε = 0.4, min_samples = 0.5·n) and an affine motion. Frames
+move from the first one by U(−25, 25) px and U(−2.5°, 2.5°), as in the experiments on the filter, and objects
+are visible 1.6° beyond the field of the features. With 25 to 30 objects in a frame there are half a million
+disparities, and with every object in the main cluster taken for a star about half of the false stars pass.
+*As the author ran it*, two objects must name each other most often, which stops nearly all of them. The noise
+is {equivalent:g} of the printed noise in the first case and as printed in the second. A rigid motion is also
+shown."""
 
 _GAMMA_NOTE: Final = """**Table 6.8 with three interpretations of eq. 6.5.** (a) With the printed "110" the
 side falls as noise grows. (b) With "1·10" it is Γ_min + √(μ_d·σ_d), and exact matches give 2.00°. (c) With
 μ_d and σ_d of the distances between *all* survivors of the filter and their nearest neighbours, which the
 "min" of eq. 3.11 allows, the side grows with noise, but does not start at 3.96°. None reproduces the table,
-whose sides are 2° + √(1.96² + 0.54·μ²) to 0.06°, as if noise were added in quadrature to a constant of 1.96°."""
+whose sides are 2° + √(1.96² + 0.54·μ²) to 0.06°."""
 
 
 class _Replayed:

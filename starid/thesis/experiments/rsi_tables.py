@@ -197,23 +197,19 @@ before it enters. The first {SETTLING} frames, in which false stars cannot be re
 the statistics. "Noise × {EQUIVALENT:g}" is the noise to which the published μ_d corresponds. All methods
 process the same frames."""
 
-_MEMORY_NOTE: Final = """**Why the mean is large, and what helps.** Half of the answers of the algorithm as
-printed are within a few hundredths of a degree; the mean is dominated by rare gross errors, which have two
-causes. In frames with few stars a neighbouring cell of the region fits better than the true one (1 to 2°
-off), and the next region is then centred on a wrong position. And where the answer from the region exceeds τ,
-the rule takes the answer with the smaller ε_ψ: among millions of cells a distant one often has a smaller one.
-The published means cannot be compared here: a standard deviation of 0.18° over a thousand frames leaves no
-room for a single gross error, but a search of the whole database, as in the thesis's LSI, produces them in a
-few per cent of the frames off the grid. "With memory" is our addition, not part of the algorithm as printed:
-the last 15 answers, carried forward with the measured camera motion, vote, and two agree if they are within
-half a degree. The answer is the one on which most agree, and their median is the centre of the next region.
-The camera motion is known to hundredths of a degree, so that errors which vary from frame to frame are
-outvoted."""
+_MEMORY_NOTE: Final = """**Why the mean is large, and what helps.** Half of the answers as printed are within
+a few hundredths of a degree; the mean is dominated by rare gross errors. In frames with few stars a
+neighbouring cell of the region fits better than the true one, and the next region is then off centre. And if
+the answer from the region exceeds τ, a distant one of millions of cells often has a smaller ε_ψ. The
+published means cannot be compared: a standard deviation of 0.18° over a thousand frames leaves no room for a
+gross error, but off the grid the whole-database search makes them in a few per cent of the frames. "With
+memory" is our addition, not part of the algorithm as printed: the last 15 answers, carried forward with the
+measured camera motion, vote, and two agree within half a degree. The answer with most votes is taken, and the
+median is the centre of the next region."""
 
 _TRIGGER_NOTE: Final = """**Fewer triggers.** The exact LASSO has a much smaller ε_ψ than the published one
 (0.05 to 0.1 instead of 0.4 to 0.5), so the same τ is exceeded less often, and the search takes less time. The
-tables give medians of our times, because other work on the machine makes single frames slow; the experiment
-`lsi-run-time` measures the search alone."""
+tables give medians of our times; the experiment `lsi-run-time` measures the search alone."""
 
 
 def rsi_notes(context: Context, results: Mapping[str, Results]) -> list[str]:
@@ -246,9 +242,7 @@ def rsi_notes(context: Context, results: Mapping[str, Results]) -> list[str]:
 _REGION_NOTE: Final = """**Table 6.8 cannot come from eq. 6.5.** As printed, with 110, the equation is Γ_min +
 (μ_d·σ_d)^−0.02: about 6° without noise, falling as noise grows, while the table has 3.96° growing to 4.95°.
 With "1·10" for "110" it is Γ_min + √(μ_d·σ_d), and the table would need residuals of 2 to 3 degrees, a
-hundred times the thesis's own μ_d (figure 6.18: at most 0.0419°), and of 2° in the set without noise, where
-its μ_d is 1e-15. The published sides are 2° + √(1.96² + 0.54·μ²) to 0.06°, as if noise were added in
-quadrature to a constant of 1.96°; the text mentions no such term. The region here therefore follows the
-second interpretation, about 2°; the runs "Γ of table 6.8" repeat the sets with the published sides to show
-the difference. The printed sizes in kB are a tenth of what the sides imply: 6 300 kB (25 200 kB) times Γ²
-over the 360° × 180° of the sky."""
+hundred times the thesis's own μ_d. The published sides are 2° + √(1.96² + 0.54·μ²) to 0.06°; the text
+mentions no such term. The region here follows the second interpretation, about 2°; the runs "Γ of table 6.8"
+repeat the sets with the published sides to show the difference. The printed sizes in kB are a tenth of what
+the sides imply: 6 300 kB (25 200 kB) times Γ² over the 360° × 180° of the sky."""

@@ -1,4 +1,4 @@
-"""The identifier on the scenes of the published comparison: right or rejected, with a calibrated covariance."""
+"""The identifier on the scenes of the published comparison: right or rejected, calibrated covariance."""
 
 from __future__ import annotations
 

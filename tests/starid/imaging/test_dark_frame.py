@@ -19,7 +19,7 @@ def hot_detector(dtype=np.uint16):
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_the_dark_frame_s_signal_is_removed_and_the_star_stays(dtype):
+def test_dark_signal_is_removed_and_the_star_stays(dtype):
     dark = hot_detector(dtype)
     image = dark.copy()
     image[20:23, 20:23] += 50
@@ -30,7 +30,7 @@ def test_the_dark_frame_s_signal_is_removed_and_the_star_stays(dtype):
     assert cleaned.dtype == dtype
 
 
-def test_a_pixel_that_its_dark_signal_fills_takes_the_median_of_its_neighbours():
+def test_a_pixel_filled_by_dark_signal_takes_the_median_of_its_neighbours():
     dark = np.full((SIDE, SIDE), 10, np.uint8)
     dark[7, 9] = 255
     image = np.full((SIDE, SIDE), 30, np.uint8)

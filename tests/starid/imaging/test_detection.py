@@ -1,4 +1,4 @@
-"""Detection finds what is there, where it is, as well as the noise lets it, and says how well."""
+"""Detection: stars are found to the accuracy that the noise allows, with calibrated errors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def photograph(
 
 
 def scattered(count: int, shape: tuple[int, int], seed: int, gap: float = 14.0) -> np.ndarray:
-    """Random places, no two closer than `gap`, none within 10 pixels of the edge."""
+    """Random positions, no two closer than `gap`, none within 10 pixels of the edge."""
     rng = np.random.default_rng(seed)
     places: list[np.ndarray] = []
     while len(places) < count:
@@ -56,7 +56,7 @@ def scattered(count: int, shape: tuple[int, int], seed: int, gap: float = 14.0) 
 
 
 def matched(found: Detections, places: np.ndarray, reach: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
-    """For each place the number of its detection (−1 if none), and which detections are of nothing."""
+    """For each position the index of its detection (−1 if none); a mask of spurious detections."""
     gaps = np.linalg.norm(places[:, None] - found.xy_px[None], axis=2)
     nearest = np.where(gaps.min(axis=1) < reach, gaps.argmin(axis=1), -1)
     return nearest, np.setdiff1d(np.arange(len(found)), nearest)
@@ -86,7 +86,7 @@ def test_stars_are_found_where_they_are(top: int) -> None:
 
 @pytest.mark.parametrize("flux", [250.0, 1000.0, 8000.0, 60000.0])
 def test_errors_are_calibrated_and_reach_the_bound(flux: float) -> None:
-    """Mean squared error over its own estimate is 1, and the estimate is the Cramér–Rao bound."""
+    """The mean ratio of squared error to estimated variance is 1; the estimate is the Cramér–Rao bound."""
     shape = (400, 400)
     squares, stated = [], []
     for seed in range(4):
@@ -107,7 +107,7 @@ def test_errors_are_calibrated_and_reach_the_bound(flux: float) -> None:
 
 
 def test_no_pixel_phase_error() -> None:
-    """Bright stars on a grid of sub-pixel places: the error has no systematic part."""
+    """Bright stars on a grid of sub-pixel positions: the error has no systematic part."""
     shape = (420, 420)
     places = np.array(
         [(20.0 * i + i / 20.0, 20.0 * j + j / 20.0) for i in range(1, 20) for j in range(1, 20)]
@@ -122,7 +122,7 @@ def test_no_pixel_phase_error() -> None:
         assert abs(error[chosen, 0].mean()) < 0.004
 
 
-def test_faint_noise_makes_no_stars() -> None:
+def test_noise_is_not_detected_as_stars() -> None:
     image = photograph(np.zeros((900, 900)), 5)
     found = detect(image)
     assert len(found) <= 1
@@ -178,7 +178,7 @@ def test_saturated_hot_pixels_are_rejected() -> None:
 
 
 @pytest.mark.parametrize("separation", [2.5, 3.5, 5.0])
-def test_pairs_are_taken_apart(separation: float) -> None:
+def test_pairs_are_deblended(separation: float) -> None:
     shape = (400, 400)
     places = scattered(40, shape, 8, gap=25.0)
     angles = np.random.default_rng(3).uniform(0.0, 2.0 * math.pi, 40)
@@ -206,10 +206,8 @@ def test_a_close_pair_is_one_star_at_its_centre_of_light(separation: float) -> N
 
 @pytest.mark.parametrize("ratio", [0.05, 0.15])
 @pytest.mark.parametrize("separation", [0.8, 1.3, 1.9])
-def test_a_faint_companion_draws_a_star_as_a_blended_catalogue_expects(
-    ratio: float, separation: float
-) -> None:
-    """Whether the pair is seen to be one or not: the light of the brighter star decides that here."""
+def test_a_faint_companion_shifts_a_star_as_in_a_merged_catalogue(ratio: float, separation: float) -> None:
+    """Whether or not the pair is resolved, which depends here on the flux of the brighter star."""
     shape = (60, 60)
     share = float(fitted_share(np.array([separation / 2.0]), np.array([ratio]))[0])
     shift = share * separation * ratio / (1.0 + ratio)
@@ -239,7 +237,7 @@ def test_a_close_pair_is_resolved() -> None:
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(2.0, 1.0), (6.0, 0.0), (-5.0, 8.0), (15.0, 10.0)])
-def test_trails_of_a_turning_sensor_are_followed(dx: float, dy: float) -> None:
+def test_trails_of_a_rotating_sensor_are_followed(dx: float, dy: float) -> None:
     shape = (400, 500)
     places = scattered(40, shape, 9, gap=45.0)
     places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
@@ -255,7 +253,7 @@ def test_trails_of_a_turning_sensor_are_followed(dx: float, dy: float) -> None:
 
 
 def test_trails_are_followed_among_more_and_brighter_round_points() -> None:
-    """Particles and reflections are round while the sensor turns; stars are what agrees on a motion."""
+    """Particles and reflections are round while the sensor rotates; stars agree on a motion."""
     shape = (400, 500)
     places = scattered(60, shape, 9, gap=30.0)
     places = places[np.all((places > 20.0) & (places < np.array([479.0, 379.0])), axis=1)]
@@ -267,12 +265,12 @@ def test_trails_are_followed_among_more_and_brighter_round_points() -> None:
     assert found.trail_px == pytest.approx(math.hypot(6.0, 2.0), rel=0.1)
     number, spurious = matched(found, stars)
     assert np.all(number >= 0)
-    assert len(spurious) == 0  # what stays at rest while the stars move is no star
+    assert len(spurious) == 0  # an object at rest while the stars move is not a star
     error = (found.xy_px[number] - stars) / found.xy_sigma_px[number]
     assert np.mean(error**2) == pytest.approx(1.0, abs=0.6)
 
 
-def test_a_few_streaks_among_still_stars_make_no_trails() -> None:
+def test_a_few_streaks_among_round_stars_are_not_trails() -> None:
     shape = (400, 500)
     places = scattered(60, shape, 9, gap=30.0)
     light = sum(spot(shape, *place, 3000.0) for place in places[:40])
@@ -308,7 +306,7 @@ def test_round_stars_have_no_trail() -> None:
 
 
 def test_uneven_sky_does_not_move_stars() -> None:
-    """A vignetted sky with a gradient, as under the open sky: no false stars, and no bias of the true ones."""
+    """A vignetted sky with a gradient causes no false stars and no bias."""
     shape = (500, 600)
     rows, columns = np.mgrid[0 : shape[0], 0 : shape[1]]
     radius2 = ((columns - 300.0) ** 2 + (rows - 250.0) ** 2) / 390.0**2
@@ -337,7 +335,7 @@ def test_a_bright_limb_hides_only_itself() -> None:
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.7, 1.5, 2.5])
-def test_other_widths_are_found_out(sigma: float) -> None:
+def test_other_spot_widths_are_estimated(sigma: float) -> None:
     shape = (400, 400)
     places = scattered(60, shape, 14, gap=22.0)
     light = sum(spot(shape, *place, 6000.0, sigma) for place in places)
@@ -373,7 +371,7 @@ def test_at_most_max_stars() -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("shape", [(16, 16), (17, 400), (400, 17), (33, 31), (937, 937)])
-def test_black_and_white_and_flat_have_a_reason(dtype: type, shape: tuple[int, int]) -> None:
+def test_black_white_and_flat_images_have_a_reason(dtype: type, shape: tuple[int, int]) -> None:
     top = int(np.iinfo(dtype).max)
     for level, word in ((0, "flat"), (7, "flat"), (top, "saturated")):
         found = detect(np.full(shape, level, dtype=dtype))

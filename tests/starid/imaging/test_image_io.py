@@ -1,4 +1,4 @@
-"""Image files: what is read is what was written, and everything else is rejected in one line."""
+"""Image files: written and read back unchanged; anything else is rejected in one line."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def written(folder: Path, name: str, pixels: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "tiff"])
 @pytest.mark.parametrize(("pixels", "bits"), [(GREY8, 8), (GREY16, 16)])
-def test_lossless_formats_come_back_exactly(
+def test_lossless_formats_are_read_back_exactly(
     tmp_path: Path, suffix: str, pixels: np.ndarray, bits: int
 ) -> None:
     image = read_image(written(tmp_path, f"a.{suffix}", pixels))
@@ -33,13 +33,13 @@ def test_lossless_formats_come_back_exactly(
     assert image.dtype == pixels.dtype
 
 
-def test_jpeg_comes_back_nearly(tmp_path: Path) -> None:
+def test_jpeg_is_read_back_approximately(tmp_path: Path) -> None:
     smooth = cv2.GaussianBlur(GREY8, (0, 0), 3)
     image = read_image(written(tmp_path, "a.jpg", smooth))
     assert np.abs(image.astype(int) - smooth).max() <= 8
 
 
-def test_jpeg_with_a_tail_is_whole(tmp_path: Path) -> None:
+def test_jpeg_with_trailing_bytes_is_accepted(tmp_path: Path) -> None:
     path = written(tmp_path, "a.jpg", GREY8)
     path.write_bytes(path.read_bytes() + b"appended by a camera")
     assert read_image(path).shape == (60, 80)
@@ -55,7 +55,7 @@ def test_truncated_files_are_rejected(
     path.write_bytes(content[: int(share * len(content))])
     with pytest.raises(StaridError, match=rf"a\.{suffix}: truncated or damaged"):
         read_image(path)
-    assert capfd.readouterr().err == "", "the decoder's own complaints stay out of the way"
+    assert capfd.readouterr().err == "", "messages of the decoder are suppressed"
 
 
 def test_png_with_a_flipped_bit_is_rejected(tmp_path: Path) -> None:
@@ -80,9 +80,7 @@ def test_png_with_a_flipped_bit_is_rejected(tmp_path: Path) -> None:
         ("g.png", np.full((9, 9), 7, np.uint8), "without any contrast"),
     ],
 )
-def test_images_that_are_no_frames_are_rejected(
-    tmp_path: Path, name: str, pixels: np.ndarray, message: str
-) -> None:
+def test_unsuitable_images_are_rejected(tmp_path: Path, name: str, pixels: np.ndarray, message: str) -> None:
     with pytest.raises(StaridError, match=message) as caught:
         read_image(written(tmp_path, name, pixels))
     assert name in str(caught.value)
@@ -130,7 +128,7 @@ def test_images_that_cannot_be_written_are_rejected(tmp_path: Path) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
 
 
-def test_public_names_are_reached_from_the_package() -> None:
+def test_public_names_are_available_from_the_package() -> None:
     assert starid.Camera.__module__ == "starid.camera"
     assert "load_catalog" in dir(starid)
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):

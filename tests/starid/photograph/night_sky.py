@@ -1,4 +1,4 @@
-"""Simulated photographs of the sky: more stars than the catalogue has, and the defects of ordinary cameras."""
+"""Simulated photographs: more stars than the catalogue has, and the defects of ordinary cameras."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""LSI: search and LASSO against scipy and scikit-learn, the published accuracy, and the improvement off the grid."""
+"""LSI: search and LASSO against scipy and scikit-learn; published accuracy; improvement off the grid."""
 
 from __future__ import annotations
 
