@@ -331,7 +331,7 @@ def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
     return files
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines = []
     for part in _parts(context.parameters):
         result = results[part.key]
@@ -353,7 +353,7 @@ EXPERIMENTS: Final = (
         "The published algorithms on the thesis's frames: figures 6.9–6.11, table 6.2",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={
             "algorithms": [*CLASSICS, "lsi", "geometric"],
             "skies": ["flat", "sphere"],

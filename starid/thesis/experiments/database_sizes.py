@@ -113,7 +113,7 @@ def _size_row(percent: float, kilobytes: float) -> Row:
     )
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     from starid.thesis.frame_grid import minimum_overlap, nominal_cells
 
     least = minimum_overlap()
@@ -167,7 +167,7 @@ EXPERIMENTS: Final = (
         "Overlap, number of frames, sizes: eqs 2.23–2.27, section 6.1.1, table 6.1",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"percent": _PERCENT, "build": True},
         quick={"percent": _PERCENT, "build": False},
         alone=True,

@@ -135,7 +135,7 @@ class Experiment:
         Function that lists the parts for given parameters.
     work
         Function that computes a part, in a separate process; it must be defined at module level.
-    finish
+    evaluate
         Function that makes tables, figures and rows from the results of all parts, by key.
     full, quick
         Parameters of the full run and of the quick one; None leaves the experiment out of the quick run.
@@ -152,7 +152,7 @@ class Experiment:
     title: str
     parts: Callable[[Parameters], Sequence[Part]]
     work: Callable[[Context, Part], Results]
-    finish: Callable[[Context, Mapping[str, Results]], Outcome]
+    evaluate: Callable[[Context, Mapping[str, Results]], Outcome]
     full: Parameters
     quick: Parameters | None
     alone: bool = False

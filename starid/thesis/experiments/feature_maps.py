@@ -179,7 +179,7 @@ def _rows(whole: Results) -> list[Row]:
     ]
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     percents, limits = context.parameters["percent"], context.parameters["kappa"]
     files = _maps(context, results["map"])
     for number, axis in ((9, "ra"), (10, "dec")):
@@ -215,7 +215,7 @@ EXPERIMENTS: Final = (
         "Features over the sky: figures 2.3–2.12",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full=_FULL,
         quick=_FULL,
     ),

@@ -175,7 +175,7 @@ def _pair_figure(context: Context, result: Results) -> str:
     return save(fig, context.folder / "figure_5_4.png")
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     result = results["example"]
     rows: list[Any] = [
         same(
@@ -217,7 +217,7 @@ EXPERIMENTS: Final = (
         "The filter by example: figures 3.2, 5.3, 5.4",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={},
         quick={},
         turn=0,

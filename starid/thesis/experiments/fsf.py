@@ -385,7 +385,7 @@ sets are therefore run with the printed noise and with a fifth of it. All 108 co
 `confusion_matrices.csv`; the tables here list the recall."""
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     files = [_table(context, results)]
     if not context.quick:
         files += _indicator_figures(context, results) + _motion_figures(context, results)
@@ -400,7 +400,7 @@ EXPERIMENTS: Final = (
         "False-star filter and camera motion: figures 6.14–6.19, tables A.1–A.18",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={
             "kinds": list(KINDS),
             "false_stars": [0, 1, 2, 3, 4, 5],

@@ -54,7 +54,7 @@ def _work(context: Context, part: Part) -> Results:
     return {"spread": np.array(spread), "fullest": np.array(fullest)}
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows, lines = [], []
     for part in _parts(context.parameters):
         spread, fullest = results[part.key]["spread"], results[part.key]["fullest"]
@@ -83,7 +83,7 @@ EXPERIMENTS: Final = (
         "What noise leaves of the cluster: the recall of the filter",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"scales": [1.0, EQUIVALENT], "factors": [1, 2, 3, 4, 5], "frames": 1500},
         quick=None,
     ),

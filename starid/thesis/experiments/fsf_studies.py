@@ -90,7 +90,7 @@ def _choice_work(context: Context, part: Part) -> Results:
     return {"lost": np.array(lost, dtype=np.float64), "shift": np.array(shift_errors)}
 
 
-def _choice_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate_choice(context: Context, results: Mapping[str, Results]) -> Outcome:
     means = {
         part.key: (
             float(results[part.key]["lost"].mean()),
@@ -146,7 +146,7 @@ def _case_work(context: Context, part: Part) -> Results:
     return {"counts": counts, "errors": np.array(errors)}
 
 
-def _case_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate_case(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines = []
     rows: list[Row] = []
     for part in _case_parts(context.parameters):
@@ -241,7 +241,7 @@ def _of_correlation(published: float, trials: int) -> Tolerance:
     return error, f"3 standard errors of two coefficients of {trials}, {error:.2g}"
 
 
-def _correlation_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate_correlation(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows, lines = [], []
     parts = _correlation_parts(context.parameters)
     fig, axes = figure(len(parts), 1, height=1.6 * len(parts), squeeze=False)
@@ -310,7 +310,7 @@ def _crowd_work(context: Context, part: Part) -> Results:
     return {"counts": counts, "ms": np.array(times[1:])}
 
 
-def _crowd_finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate_crowd(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows = []
     for part in _crowd_parts(context.parameters):
         c = Confusion(*results[part.key]["counts"].tolist())
@@ -337,7 +337,7 @@ EXPERIMENTS: Final = (
         "Choice of ε and min_samples: figure 6.12",
         _choice_parts,
         _choice_work,
-        _choice_finish,
+        _evaluate_choice,
         full={"epsilons": list(_EPSILONS), "shares": list(_SHARES), "frames": 1000},
         quick=None,
     ),
@@ -346,7 +346,7 @@ EXPERIMENTS: Final = (
         "Case study of the filter and the motion: tables 6.3 and 6.4, figure 6.13",
         _case_parts,
         _case_work,
-        _case_finish,
+        _evaluate_case,
         full={"false_stars": [0, 1, 2]},
         quick={"false_stars": [0, 1, 2]},
         revision=2,
@@ -356,7 +356,7 @@ EXPERIMENTS: Final = (
         "Mean and deviation of the distances: table 6.5, figures 6.31, 6.32 and D",
         _correlation_parts,
         _correlation_work,
-        _correlation_finish,
+        _evaluate_correlation,
         full={"factors": [0, 1, 2, 3, 4, 5], "frames": 1000},
         quick=None,
         revision=2,
@@ -366,7 +366,7 @@ EXPERIMENTS: Final = (
         "The filter for hundreds of objects",
         _crowd_parts,
         _crowd_work,
-        _crowd_finish,
+        _evaluate_crowd,
         full={"true_stars": [150, 225], "frames": 200},
         quick={"true_stars": [150], "frames": 40},
         alone=True,

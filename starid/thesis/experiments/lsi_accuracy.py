@@ -340,7 +340,7 @@ def _roll_rows(results: Mapping[str, Results], percent: float, rolls: list[float
     return rows
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     percents = [float(percent) for percent in context.parameters["percent"]]
     rolls = [float(roll) for roll in context.parameters["rolls"]]
     roll_percent = float(context.parameters["roll_percent"])
@@ -397,7 +397,7 @@ EXPERIMENTS: Final = (
         "LSI without noise: figures 6.1–6.5",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={
             "percent": [96.0, 97.0, 98.0, 99.0, 99.1, 99.2, 99.3, 99.4, 99.5, 99.6],
             "roll_percent": 98.0,

@@ -329,7 +329,7 @@ def _object_rows(results: Mapping[str, Results], grid: str) -> list[Row]:
     return rows
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows = _noise_rows(results) + _object_rows(results, ON) + _object_rows(results, OFF)
     drawn = (
         _noise_figure(context, results, grid, quantity, author=author)
@@ -369,7 +369,7 @@ EXPERIMENTS: Final = (
         "LSI with noise, false and missing stars: figures 6.6–6.11, 6.20–6.30, B, C",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"cases": [], "every": 1},
         quick={
             "cases": ["none", "root-both-1", "root-both-3", "both-3", "false-1", "missing-1"],

@@ -154,7 +154,7 @@ def _rows(results: Mapping[str, Results], percents: list[float], *, checked: boo
     ]
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines: list[dict[str, Any]] = []
     for part in _parts(context.parameters):
         published = (*_PUBLISHED[part.values["percent"]], "")
@@ -175,7 +175,7 @@ EXPERIMENTS: Final = (
         "Run time of LSI by stage: table 6.1; table 6.2",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"percent": list(_PUBLISHED), "every": 9, "checked": True},
         quick={"percent": [96.0, 99.5], "every": 27, "checked": False},
         alone=True,

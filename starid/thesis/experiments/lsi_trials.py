@@ -160,7 +160,7 @@ def share(errors: Array, limit: float) -> float:
 def shares(
     result: Results, limit: float, quantity: str = "f", ours: str = "fine", *, beyond: bool = False
 ) -> Readings:
-    """Share of errors within or beyond a limit, %, for both variants of LSI (MSE) and a search of ours."""
+    """Share of errors within or beyond a limit, %, for both variants of LSI (MSE) and a search of this project."""
     author, printed, best = (
         100.0 - within if beyond else within
         for within in (share(result[f"{quantity}_{kind}"], limit) for kind in ("author_mse", "mse", ours))

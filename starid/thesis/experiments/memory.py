@@ -49,7 +49,7 @@ def _work(context: Context, part: Part) -> Results:
     return {name: np.asarray(value) for name, value in figures.items()}
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines = []
     for percent in context.parameters["percent"]:
         sizes = results[f"p{percent:g}"]
@@ -76,7 +76,7 @@ EXPERIMENTS: Final = (
         "Memory of the process at run time",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"percent": [99.5, 99.75]},
         quick=None,
         alone=True,

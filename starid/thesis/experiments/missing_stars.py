@@ -160,7 +160,7 @@ def _work(context: Context, part: Part) -> Results:
     return _put_back(context) if part.key == "put-back" else _case(context, part)
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows: list[Row] = []
     lines = []
     for part in _parts(context.parameters):
@@ -200,7 +200,7 @@ EXPERIMENTS: Final = (
         "Missing stars and a covered field: what section 7.2 asks for (ours)",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"cases": list(_CASES), "every": 4, "frames": 120},
         quick={"cases": ["missing-1", "covered"], "every": 40, "frames": 8},
     ),

@@ -83,7 +83,7 @@ def measured_step(step: RsiStep, frame: SimulatedFrame) -> tuple[float, ...]:
     )
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     files = rsi_tables(context, results)
     if not context.quick:
         files += rsi_figures(context, results)
@@ -99,7 +99,7 @@ EXPERIMENTS: Final = (
         "Recursive identification with the scalable filter (ours): figures 6.33–6.43, E, F, G, tables 6.6–6.9",
         rsi_parts,
         _work,
-        _finish,
+        _evaluate,
         full={
             "overlaps": [0.995, 0.9975],
             "sets": _SETS,

@@ -314,7 +314,7 @@ def _table(context: Context, results: Mapping[str, Results]) -> str:
     return write_lines(context.folder / "rsi_as_printed.csv", lines)
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     rows = [makes(context, results) for makes in (_clean_rows, _sequence_rows, _gamma_rows)]
     notes = (_NOTE.format(equivalent=EQUIVALENT), _GAMMA_NOTE)
     return Outcome(tuple(itertools.chain(*rows)), (_table(context, results),), notes)
@@ -326,7 +326,7 @@ EXPERIMENTS: Final = (
         "Recursive identification with the thesis's own filter: tables 6.7, 6.8, H.1, H.2",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={
             "clean": [0.995, 0.9975],
             "every": 3,

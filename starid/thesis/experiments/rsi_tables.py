@@ -40,7 +40,7 @@ _UPDATE_COLUMNS: Final = (
     ("search_ms", "search_ms_median", 3),
     ("lasso_ms", "lasso_ms_median", 3),
 )
-"""Columns of tables 6.7 to 6.9: name of the published number and of ours, and decimals."""
+"""Columns of tables 6.7 to 6.9: name of the published value, name of the computed one, decimals."""
 _FILE: Final = "tables_6_7_6_8_6_9_h_1_h_2.csv"
 
 

@@ -132,7 +132,7 @@ def _read_outcome(folder: Path) -> Mapping[str, Any] | None:
     return stored
 
 
-def _finish(plan: _Plan, computed: int) -> FinishedExperiment:
+def _evaluate_plan(plan: _Plan, computed: int) -> FinishedExperiment:
     start = _processor_time()
     results: dict[str, Results] = {}
     seconds = 0.0
@@ -142,7 +142,7 @@ def _finish(plan: _Plan, computed: int) -> FinishedExperiment:
     plan.context.folder.mkdir(parents=True, exist_ok=True)
     # tables and figures are overwritten, so an outcome for other parameters is no longer valid
     (plan.context.folder / OUTCOME_FILE).unlink(missing_ok=True)
-    outcome = plan.experiment.finish(plan.context, results)
+    outcome = plan.experiment.evaluate(plan.context, results)
     seconds += _processor_time() - start
     text = json.dumps(
         {
@@ -201,7 +201,7 @@ def run(
     left, done = dict(missing), 0
 
     def end(plan: _Plan) -> None:
-        finished[plan.experiment.name] = _finish(plan, missing[plan.experiment.name])
+        finished[plan.experiment.name] = _evaluate_plan(plan, missing[plan.experiment.name])
 
     for plan in open_plans:
         if missing[plan.experiment.name] == 0:

@@ -163,7 +163,7 @@ def _line(
     )
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines: list[tuple[str, float, str, float, float]] = []
     rows: list[Row] = []
     for kappa in context.parameters["kappa"]:
@@ -232,7 +232,7 @@ EXPERIMENTS: Final = (
         "Sensitivity to κ, λ, Γ_min, K, ε and min_samples: what chapter 7 asks for",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={
             "kappa": [10.0, 10.5, 11.0, 11.5, 12.0],
             "gamma": [1.0, 2.0, 3.0, 3.96, 4.95, 8.0, 16.0],

@@ -160,7 +160,7 @@ the cells: for the best candidates the stars themselves vote for a roll and are 
 verified. An attitude that is not verified is invalid; none may be wrong."""
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     lines = [
         {
             "algorithm": part.values["algorithm"],
@@ -188,7 +188,7 @@ EXPERIMENTS: Final = (
         "LSI and RSI on the sphere, on what a real sensor sees",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"noises": _NOISES, "frames": 1000},
         quick={"noises": _NOISES[1:2], "frames": 60},
         revision=2,

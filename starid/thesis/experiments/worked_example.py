@@ -243,7 +243,7 @@ def _estimate_rows(result: Results, kind: str) -> list[Row]:
     ]
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     result = results["example"]
     vectors = result["dictionary"]
     author = result["author_dictionary"]
@@ -342,7 +342,7 @@ EXPERIMENTS: Final = (
         "The worked example of section 5.1",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"percent": 96.0},
         quick={"percent": 96.0},
         turn=0,

@@ -50,7 +50,7 @@ def _work(context: Context, part: Part) -> Results:
     return {"value": context.rng(part.key).normal(size=3) + part.values["number"]}
 
 
-def _finish(context: Context, results: Mapping[str, Results]) -> Outcome:
+def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     total = float(sum(result["value"].sum() for result in results.values()))
     write_csv(
         context.folder / "values.csv",
@@ -69,7 +69,7 @@ def _experiment(name: str = "toy", least: float = -1e9) -> Experiment:
         "A toy",
         _parts,
         _work,
-        _finish,
+        _evaluate,
         full={"numbers": [1, 2, 3], "least": least},
         quick={"numbers": [1], "least": least},
     )
@@ -152,16 +152,16 @@ def test_a_part_with_damaged_contents_is_rejected_by_name(tmp_path):
         runner.run([_experiment()], tmp_path, jobs=1)
 
 
-def test_an_interrupted_finish_leaves_no_outcome_of_other_parameters(tmp_path):
+def test_an_interrupted_evaluation_leaves_no_outcome_of_other_parameters(tmp_path):
     runner.run([_experiment()], tmp_path, jobs=1)
     values = (tmp_path / "toy" / "values.csv").read_text()
 
     def interrupted(context: Context, results: Mapping[str, Results]) -> Outcome:
-        _finish(context, results)
+        _evaluate(context, results)
         raise KeyboardInterrupt
 
     longer = dataclasses.replace(
-        _experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9}, finish=interrupted
+        _experiment(), full={"numbers": [1, 2, 3, 4], "least": -1e9}, evaluate=interrupted
     )
     with pytest.raises(KeyboardInterrupt):
         runner.run([longer], tmp_path, jobs=1)
