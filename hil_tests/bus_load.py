@@ -35,7 +35,7 @@ ECHO: Final = 0x22
 ECHO_ROW: Final = 133
 """Row ID of the other traffic."""
 
-ASKED: Final = (
+REQUESTED_ROWS: Final = (
     "identification",
     "quaternion",
     "precise_attitude",
@@ -59,12 +59,12 @@ SETTLE_S: Final = 5.0
 # --- the other traffic ---
 
 
-def _talk(spec: str, rate: float, pipe: Connection) -> None:
+def _send_traffic(spec: str, rate: float, pipe: Connection) -> None:
     """Send numbered frames at a rate until stopped; report how many arrived at a second port."""
-    asyncio.run(_talk_until_stopped(spec, rate, pipe))
+    asyncio.run(_send_traffic_until_stopped(spec, rate, pipe))
 
 
-async def _talk_until_stopped(spec: str, rate: float, pipe: Connection) -> None:
+async def _send_traffic_until_stopped(spec: str, rate: float, pipe: Connection) -> None:
     can_id = CanId(MessageType.TELEMETRY, ECHO_ROW, TALKER, LISTENER).pack()
     ping = CanId(MessageType.TELEMETRY_REQUEST, ECHO_ROW, HOST, ECHO).pack()
     pong = CanId(MessageType.TELEMETRY, ECHO_ROW, ECHO, HOST).pack()
@@ -106,7 +106,9 @@ class OtherTraffic:
 
     def __init__(self, spec: str, rate: float, *, realtime: bool = False) -> None:
         self._pipe, far = mp.Pipe()
-        self._process = mp.get_context("spawn").Process(target=_talk, args=(spec, rate, far), daemon=True)
+        self._process = mp.get_context("spawn").Process(
+            target=_send_traffic, args=(spec, rate, far), daemon=True
+        )
         self._process.start()
         far.close()
         self._receive_report()
@@ -220,7 +222,7 @@ async def load_can(
     end = time.monotonic() + seconds
     wrong = 0
     while time.monotonic() < end:
-        row = icd.telemetry[ASKED[asker.requests % len(ASKED)]]
+        row = icd.telemetry[REQUESTED_ROWS[asker.requests % len(REQUESTED_ROWS)]]
         reply = await asker.ask(row.id)
         wrong += reply is not None and not _is_right(icd, reply, row.id)
         await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))

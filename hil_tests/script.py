@@ -284,7 +284,7 @@ class _Checker:
             reader.fail(f"unknown parameter '{name}'{near_matches(name, self._icd.parameters) or LISTED}")
         return self._icd.parameters[name]
 
-    def _refused(self, reader: TableReader) -> str | None:
+    def _refusal_code(self, reader: TableReader) -> str | None:
         if not reader.has("refused"):
             return None
         return reader.choice("refused", self._icd.enums["error_code"].values)
@@ -294,7 +294,7 @@ class _Checker:
     def command(self, reader: TableReader) -> tuple[Action, str]:
         """Read a telecommand and check its parameters."""
         row = self._row(reader, "command", telecommand=True)
-        refused = self._refused(reader)
+        refused = self._refusal_code(reader)
         raw = reader.hex_bytes("with_hex") if reader.has("with_hex") else None
         given = reader.value("with", {})
         if not isinstance(given, dict) or (given and raw is not None):
@@ -314,7 +314,7 @@ class _Checker:
     def read(self, reader: TableReader) -> tuple[Action, str]:
         """Read a request for telemetry."""
         row = self._row(reader, "read", telecommand=False)
-        return Read(row, self._refused(reader)), f"read {row.name}"
+        return Read(row, self._refusal_code(reader)), f"read {row.name}"
 
     def listen(self, reader: TableReader) -> tuple[Action, str]:
         """Read a wait for unsolicited telemetry."""
@@ -347,7 +347,7 @@ class _Checker:
     def set_parameter(self, reader: TableReader) -> tuple[Action, str]:
         """Read a parameter to be set."""
         parameter = self._parameter(reader, "set_parameter")
-        refused = self._refused(reader)
+        refused = self._refusal_code(reader)
         value = operand(reader.value("value"), reader, "value", frozenset(self._captured))
         if refused is None and not isinstance(value, Variable):
             try:

@@ -37,7 +37,7 @@ class _SerialPipeline:
             self._cycle += [(Request.of(stars.id), stars.size), *maps[:count]]
         self._next = 0
         self._under_way: deque[tuple[Request, int]] = deque()
-        self._came = asyncio.Event()
+        self._reply_arrived = asyncio.Event()
         self.exchanges = 0
         self.wrong = 0
         self.received = 0
@@ -70,21 +70,21 @@ class _SerialPipeline:
             end = data.find(b"\xff", start)
             end = len(data) if end < 0 else end + 1
             for event in self._receiver.feed(data[start:end], time.monotonic()):
-                self._judge(event)
+                self._check_reply(event)
             start = end
-        self._came.set()
+        self._reply_arrived.set()
 
     async def drain(self, left: int) -> bool:
         """Wait until at most `left` requests are active; return False after `REPLY_WITHIN_S` of silence."""
         while self.under_way > left:
-            self._came.clear()
+            self._reply_arrived.clear()
             try:
-                await asyncio.wait_for(self._came.wait(), REPLY_WITHIN_S)
+                await asyncio.wait_for(self._reply_arrived.wait(), REPLY_WITHIN_S)
             except TimeoutError:
                 return False
         return True
 
-    def _judge(self, event: Reply | LinkFault) -> None:
+    def _check_reply(self, event: Reply | LinkFault) -> None:
         if isinstance(event, LinkFault) or not self._under_way:
             self.wrong += 1
             return

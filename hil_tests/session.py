@@ -222,7 +222,7 @@ class SessionRunner:
             case SetParameter():
                 return self._set_parameter(step, action, client)
             case GetParameter():
-                return self._judge(step, client.read_parameter(action.parameter.name))
+                return self._compare(step, client.read_parameter(action.parameter.name))
             case DownloadImage():
                 return self._download(action, client)
             case Send():
@@ -295,7 +295,7 @@ class SessionRunner:
         outcome = self._expect_acceptance_or_refusal(ask, action.refused)
         if outcome.problem is not None or not readings:
             return outcome
-        return self._judge(step, readings[0])
+        return self._compare(step, readings[0])
 
     def _listen(self, step: Step, action: Listen, client: ObcClient) -> Outcome:
         outcome = Outcome()
@@ -305,11 +305,11 @@ class SessionRunner:
                 action.row.name, timeout_s=step.timeout_s or self._script.timeout_s, since_s=times[0]
             )
             times.append(reading.received_s)
-            outcome = self._judge(step, reading)
+            outcome = self._compare(step, reading)
             if outcome.problem is not None:
                 return outcome
         outcome.latency_s = None
-        if action.count > 1:  # between the readings themselves; the wait for the first one is of no meaning
+        if action.count > 1:  # without the wait for the first reading
             outcome.figures["rate_hz"] = (action.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
         return outcome
 
@@ -333,7 +333,7 @@ class SessionRunner:
                 )
                 count += 1
                 latencies.append(reading.latency_s)
-                last = self._judge(step, reading)
+                last = self._compare(step, reading)
                 if last.problem is not None:
                     problems.append(last.problem)
                 crosses += [last.figures[key] for key in ("cross_boresight_arcsec",) if key in last.figures]
@@ -386,7 +386,7 @@ class SessionRunner:
 
     # --- judging ---
 
-    def _judge(self, step: Step, reading: Reading) -> Outcome:
+    def _compare(self, step: Step, reading: Reading) -> Outcome:
         outcome = Outcome(
             detail=summarize(reading.values), values=reading.values, latency_s=reading.latency_s or None
         )

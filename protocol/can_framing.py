@@ -141,7 +141,8 @@ def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
 
     Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is sent as first,
     body and last frames, each with the counter. Burst packets are segmented telemetry with the burst's ID.
-    Public sources confirm the three types, but not the layout of these messages or of bursts; both are ours.
+    Public sources confirm the three types, but not the layout of these messages or of bursts,
+    which is our own choice.
     """
     if reply.kind is ReplyKind.ECHO:
         raise ProtocolError("CAN has no echo messages")

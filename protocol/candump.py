@@ -24,7 +24,7 @@ def format_candump(frame: CanFrame, channel: str) -> str:
 
 
 def bus_name(channel: str) -> str:
-    """Return the bus of a channel, for a candump log: `vcan0` of `socketcand:127.0.0.1:29536/vcan0`."""
+    """Return the bus name in a channel, as in a candump log: `vcan0` for `socketcand:127.0.0.1:29536/vcan0`."""
     return re.split("[/:]", channel)[-1]
 
 

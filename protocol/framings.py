@@ -177,7 +177,7 @@ class _SlipDeframer(_Collector[_Message]):
         *whole, rest = data.split(self._framing.end)
         for piece in whole:
             self._collect(piece)
-            self._finish()
+            self._decode_frame()
         self._collect(rest)
 
     def _collect(self, piece: bytes) -> None:
@@ -189,7 +189,7 @@ class _SlipDeframer(_Collector[_Message]):
             self._frame.clear()
             self._skipping = True
 
-    def _finish(self) -> None:
+    def _decode_frame(self) -> None:
         frame = bytes(self._frame)
         self._frame.clear()
         self._skipping = False
@@ -288,7 +288,7 @@ class _CountedDeframer(_Collector[_Message]):
         if self._in_junk and not self._start:
             return
         self._buffer += data
-        while self._buffer and self._at_start() and self._take_message():
+        while self._buffer and self._at_start() and self._read_message():
             pass
 
     def _at_start(self) -> bool:
@@ -307,7 +307,7 @@ class _CountedDeframer(_Collector[_Message]):
                 return len(self._buffer) - size
         return len(self._buffer)
 
-    def _take_message(self) -> bool:
+    def _read_message(self) -> bool:
         """Take the message at the start of the buffer; return whether to continue."""
         head = len(self._start)
         try:
@@ -413,7 +413,7 @@ class _DelimitedDeframer(_Collector[_Message]):
         self._text = bytearray(rest)
         for line in whole:
             if not self._skipping:
-                self._take(line)
+                self._decode_text(line)
             self._skipping = False
         if len(rest) > self._max_text:
             if not self._skipping:
@@ -421,7 +421,7 @@ class _DelimitedDeframer(_Collector[_Message]):
             self._skipping = True
             self._text = bytearray(rest[len(rest) - len(self._framing.end) + 1 :])
 
-    def _take(self, line: bytes) -> None:
+    def _decode_text(self, line: bytes) -> None:
         if len(line) > self._max_text:
             self._add(self._overlong())
             return

@@ -35,7 +35,7 @@ def check_row(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
 
 
 def unbound(icd: InterfaceDefinition) -> list[str]:
-    """Return an error for each row or field without a binding, which the device cannot serve."""
+    """Return an error message for each row or field that the device cannot serve, because it has no binding."""
     missing = [
         f"unit {icd.name}: telecommand {row.name}: no `action`; use `nothing` to accept the telecommand without effect"
         for row in icd.telecommands.values()
@@ -54,9 +54,9 @@ def unbound(icd: InterfaceDefinition) -> list[str]:
 
 def quantity_of(name: str, model: DeviceModel, plugin: Plugin) -> QuantityModel | None:
     """Return the declaration of a quantity of the device model or of the unit's plugin, or None."""
-    own = plugin.quantities.get(name)
-    if own is not None:
-        return QuantityModel(name=name, type="float", unit=own.unit or ANY_UNIT, doc=own.doc)
+    custom = plugin.quantities.get(name)
+    if custom is not None:
+        return QuantityModel(name=name, type="float", unit=custom.unit or ANY_UNIT, doc=custom.doc)
     return model.quantity(name)
 
 
@@ -91,7 +91,7 @@ def _check_argument(
     if row.action is None:
         raise IcdError(f"{where}: argument {name}: the row has no `action`")
     if action is None:
-        return  # the plugin's
+        return  # an action of the plugin, which checks its arguments itself
     found = model.argument(action, name)
     if found is None:
         known = [item.name for item in action.arguments]
@@ -142,7 +142,7 @@ def _check_members(field: Field, found: QuantityModel, model: DeviceModel, where
     missing = [name for name in wanted if name not in field.enum.values and name not in field.aliases]
     if missing:
         raise IcdError(
-            f"{where}: quantity {field.value} may be {', '.join(missing)}, which has no number; add one, or a `default`"
+            f"{where}: quantity {field.value} has no number for {', '.join(missing)}; add one, or a `default`"
         )
 
 

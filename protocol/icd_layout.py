@@ -65,15 +65,15 @@ class Layout:
         where = f"{self._where}: field {model.name or 'unused'}"
         if model.text is not None:
             for item in self._of_text(model):
-                self._place(item, f"{self._where}: field {item.name or 'unused'}", "", self._number)
+                self._add_single(item, f"{self._where}: field {item.name or 'unused'}", "", self._number)
             return
         if model.repeat is not None:
             self._add_repeat(model, model.repeat, where)
             return
         if model.count is None:
-            self._place(model, where, "", self._number)
+            self._add_single(model, where, "", self._number)
         for number in range(1, (model.count or 0) + 1):
-            self._place(model, where, f"_{number}", number)
+            self._add_single(model, where, f"_{number}", number)
 
     def _add_repeat(self, model: FieldModel, repeat: RepeatModel, where: str) -> None:
         if model.model_fields_set - {"repeat", "doc"}:
@@ -83,7 +83,7 @@ class Layout:
             raise IcdError(f"{where}: a repeated group cannot contain `repeat` or `count`")
         for number in range(repeat.first, repeat.first + repeat.count):
             for item in group:
-                self._place(item, where, f"_{number}", number)
+                self._add_single(item, where, f"_{number}", number)
 
     def _of_text(self, model: FieldModel) -> list[FieldModel]:
         """Expand the text of a field to fields; return any other field itself."""
@@ -97,7 +97,7 @@ class Layout:
         except IcdError as error:
             raise IcdError(f"{where}: {error}") from None
 
-    def _place(self, model: FieldModel, where: str, suffix: str, number: int | None) -> None:
+    def _add_single(self, model: FieldModel, where: str, suffix: str, number: int | None) -> None:
         if model.type is None:
             raise IcdError(f"{where}: needs `type`, or `repeat`")
         if model.type.startswith("bits"):

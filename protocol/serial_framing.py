@@ -78,8 +78,8 @@ class Deframer:
     """Finds packets in a stream of bytes; each run of junk yields one fault.
 
     A run of junk ends at the next start of a message or after a silence of the timeout. An ID of 0x1F is
-    ambiguous in practice: some senders double it, others do not. Both forms are read as ID 0x1F, unless they
-    are a start or an end.
+    ambiguous in practice: some senders double it, others do not. Both forms are read as ID 0x1F, unless the
+    bytes are a start or an end.
     """
 
     def __init__(
@@ -249,7 +249,7 @@ def encode_reply(reply: Reply, dialect: Dialect) -> bytes:
     """Frame a reply of a device in a dialect.
 
     In dialects a and b, the NACK of a telemetry request has the error code instead of the telemetry; this is
-    ours, as no public source shows it. Burst packets are the same in all dialects.
+    our own choice, because no public source shows this case. Burst packets are the same in all dialects.
 
     Raises
     ------
@@ -354,18 +354,18 @@ class HostReceiver(_Receiver[Reply]):
 
     def _interpret(self, packet: Packet) -> Reply | LinkFault:
         if self._dialect is Dialect.C:
-            return self._generation_2(packet)
+            return self._interpret_generation_2(packet)
         body = packet.body
         if self._is_burst(body):
             return Reply(ReplyKind.BURST, BURST_ID, body[1:])
         if self._dialect is Dialect.A:
             expected = self._expected
             size = expected[1] if expected is not None and expected[0].id == body[0] else None
-            return self._generation_1(body[0], body[1:], size)
+            return self._interpret_generation_1(body[0], body[1:], size)
         if self._expected is None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
         request, size = self._expected
-        return self._generation_1(request.id, body, size)
+        return self._interpret_generation_1(request.id, body, size)
 
     def _is_burst(self, body: bytes) -> bool:
         if len(body) != BURST_SIZE + 1 or body[0] != BURST_ID:
@@ -375,7 +375,7 @@ class HostReceiver(_Receiver[Reply]):
         request, size = self._expected
         return request.kind is RequestKind.TELECOMMAND or size != len(body)
 
-    def _generation_1(self, row_id: int, data: bytes, size: int | None) -> Reply | LinkFault:
+    def _interpret_generation_1(self, row_id: int, data: bytes, size: int | None) -> Reply | LinkFault:
         """Interpret a reply of generation 1; `size` is the size of the telemetry row, if known."""
         if row_id >= FIRST_TELEMETRY_ID:
             self._expected = None
@@ -390,7 +390,7 @@ class HostReceiver(_Receiver[Reply]):
         code = error_code(data[0])
         return Reply(ReplyKind.NACK if code else ReplyKind.ACK, row_id, code=code)
 
-    def _generation_2(self, packet: Packet) -> Reply | LinkFault:
+    def _interpret_generation_2(self, packet: Packet) -> Reply | LinkFault:
         row_id, data = packet.body[0], packet.body[1:]
         match packet.start:
             case 0x07:

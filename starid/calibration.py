@@ -2,7 +2,7 @@
 
 All frames are adjusted together (bundle adjustment): one camera, one attitude per frame. The residual of a
 star is its measured minus its projected position, divided by the standard deviation. Levenberg–Marquardt
-steps eliminate the 3 × 3 blocks of the attitudes by their Schur complement; Huber weights and a final
+steps eliminate the 3 × 3 blocks of the attitudes with the Schur complement; Huber weights and a final
 rejection exclude false matches. Weak priors at the start values bound parameters that the frames do not
 determine, such as the centre in a narrow field, where a shift is degenerate with a rotation.
 
@@ -66,7 +66,7 @@ class CalibrationFrame:
     reference : ndarray (n, 3)
         Catalogue directions of the same stars, unit vectors, ICRS.
     sigma_px : ndarray (n,) or (n, 2), optional
-        Standard deviation of each position, one for both axes or one each for x and y; by default all are
+        Standard deviation of each position, for both axes or for x and y separately; by default all are
         equal, and the noise is estimated from the residuals.
     attitude : Attitude, optional
         Start value; by default from Wahba's problem with the start camera.
@@ -180,10 +180,10 @@ def calibrate(
         raise StaridError("calibration: no frames; at least one with matched stars is needed")
     bundle = _Bundle(frames, camera, estimate)
     stars = sum(len(frame.xy_px) for frame in frames)
-    if 2 * stars <= bundle.freedom.shape[1] + 3 * len(frames):
+    if 2 * stars <= bundle.free_to_all.shape[1] + 3 * len(frames):
         raise StaridError(
             f"calibration: {stars} matched stars in {len(frames)} frames do not determine "
-            f"{', '.join(estimate)}; give more frames or estimate less"
+            f"{', '.join(estimate)}; give more frames or estimate fewer parameters"
         )
     state = bundle.start()
     for _ in range(_ROUNDS):
@@ -200,7 +200,9 @@ def check_estimate(estimate: Sequence[str]) -> None:
     unknown = sorted(set(estimate) - set(GROUPS))
     if unknown or not estimate:
         what = f"{unknown[0]!r}" if unknown else "nothing"
-        raise StaridError(f"calibration: what to estimate must be of {', '.join(GROUPS)}, not {what}")
+        raise StaridError(
+            f"calibration: parameters to estimate must be among {', '.join(GROUPS)}, not {what}"
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,7 +223,7 @@ class _Bundle:
         self.has_sigmas = all(f.sigma_px is not None for f in frames)
         self.used: tuple[Mask, ...] = tuple(np.ones(len(f.xy_px), dtype=np.bool_) for f in frames)
         self.initial = camera.params[list(_SLOTS)]
-        self.freedom = _freedom(estimate, self.initial)
+        self.free_to_all = _free_to_all(estimate, self.initial)
         prior = np.array(
             [
                 *(_PRIOR_FOCAL * self.initial[:2]),
@@ -229,7 +231,7 @@ class _Bundle:
                 *(_PRIOR_DISTORTION[name] for name in NAMES[4:]),
             ]
         )
-        self.prior = (self.freedom.T * prior**-2.0) @ self.freedom
+        self.prior = (self.free_to_all.T * prior**-2.0) @ self.free_to_all
 
     def start(self) -> _State:
         """The start values."""
@@ -248,7 +250,7 @@ class _Bundle:
         return params
 
     def residuals(self, state: _State) -> list[Array]:
-        """Residuals (n, 2) of each frame, pixels."""
+        """Return the residuals (n, 2) of each frame, pixels."""
         params = self.params(state.values)
         return [
             frame.xy_px - project_kernel(params, attitude.to_sensor(frame.reference))[0]
@@ -282,8 +284,8 @@ class _Bundle:
         t = [d[u] / scale for d, u in zip(self.distances(self.residuals(state)), self.used, strict=True)]
         lengths = np.concatenate(t)
         huber = np.where(lengths <= _HUBER, 0.5 * lengths**2, _HUBER * (lengths - 0.5 * _HUBER))
-        move = np.linalg.lstsq(self.freedom, state.values - self.initial, rcond=None)[0]
-        total = float(huber.sum() + 0.5 * move @ self.prior @ move)
+        change = np.linalg.lstsq(self.free_to_all, state.values - self.initial, rcond=None)[0]
+        total = float(huber.sum() + 0.5 * change @ self.prior @ change)
         return total if math.isfinite(total) else math.inf
 
     def adjusted(self, state: _State) -> _State:
@@ -316,11 +318,11 @@ class _Bundle:
         residuals = self.residuals(state)
         distances = [d[u] for d, u in zip(self.distances(residuals), self.used, strict=True)]
         squares = np.concatenate(distances) ** 2
-        freedom = max(2 * squares.size - self.freedom.shape[1] - 3 * len(self.frames), 1)
-        variance = float(squares.sum()) / freedom
+        degrees_of_freedom = max(2 * squares.size - self.free_to_all.shape[1] - 3 * len(self.frames), 1)
+        variance = float(squares.sum()) / degrees_of_freedom
         system = _System(self, state, 1.0, robust=False)
         factor = max(variance, 1.0) if self.has_sigmas else variance
-        covariance = self.freedom @ system.camera_covariance(factor) @ self.freedom.T
+        covariance = self.free_to_all @ system.camera_covariance(factor) @ self.free_to_all.T
         fx, fy, cx, cy, *distortion = state.values.tolist()
         camera = dataclasses.replace(
             self.camera,
@@ -349,11 +351,11 @@ class _System:
         self.bundle = bundle
         self.state = state
         self.scale2 = scale * scale
-        p = bundle.freedom.shape[1]
+        p = bundle.free_to_all.shape[1]
         params = bundle.params(state.values)
-        move = np.linalg.lstsq(bundle.freedom, state.values - bundle.initial, rcond=None)[0]
+        change = np.linalg.lstsq(bundle.free_to_all, state.values - bundle.initial, rcond=None)[0]
         self.cc = self.scale2 * bundle.prior
-        self.gc = -self.scale2 * bundle.prior @ move
+        self.gc = -self.scale2 * bundle.prior @ change
         self.ca, self.aa, self.ga = [], [], []
         frames = zip(bundle.frames, state.attitudes, bundle.used, bundle.sigmas, strict=True)
         for frame, attitude, used, sigma in frames:
@@ -363,18 +365,18 @@ class _System:
             weight = sigma[used] ** -2.0
             if robust:
                 weight = weight * np.minimum(1.0, _HUBER / np.maximum(lengths, _HUBER))[:, None]
-            by_camera = _camera_jacobian(params, vectors) @ bundle.freedom
-            by_turn = _rotation_jacobian(params, vectors)
-            weighted = by_turn * weight[:, :, None]
-            pulled = by_camera * weight[:, :, None]
-            self.cc = self.cc + np.einsum("nij,nik->jk", pulled, by_camera)
-            self.gc = self.gc + np.einsum("nij,ni->j", pulled, residual)
-            self.ca.append(np.einsum("nij,nik->jk", by_camera, weighted).reshape(p, 3))
-            self.aa.append(np.einsum("nij,nik->jk", weighted, by_turn))
-            self.ga.append(np.einsum("nij,ni->j", weighted, residual))
+            by_camera = _camera_jacobian(params, vectors) @ bundle.free_to_all
+            by_rotation = _rotation_jacobian(params, vectors)
+            weighted_by_rotation = by_rotation * weight[:, :, None]
+            weighted_by_camera = by_camera * weight[:, :, None]
+            self.cc = self.cc + np.einsum("nij,nik->jk", weighted_by_camera, by_camera)
+            self.gc = self.gc + np.einsum("nij,ni->j", weighted_by_camera, residual)
+            self.ca.append(np.einsum("nij,nik->jk", by_camera, weighted_by_rotation).reshape(p, 3))
+            self.aa.append(np.einsum("nij,nik->jk", weighted_by_rotation, by_rotation))
+            self.ga.append(np.einsum("nij,ni->j", weighted_by_rotation, residual))
 
     def stepped(self, damping: float) -> _State:
-        """State after one damped step."""
+        """Return the state after one damped step."""
         blocks = [np.linalg.inv(a + damping * np.diag(np.diag(a))) for a in self.aa]
         schur = self.cc + damping * np.diag(np.diag(self.cc))
         right = self.gc.copy()
@@ -384,20 +386,20 @@ class _System:
         step = np.linalg.solve(schur, right)
         turns = [b @ (ga - ca.T @ step) for ca, b, ga in zip(self.ca, blocks, self.ga, strict=True)]
         return _State(
-            self.state.values + self.bundle.freedom @ step,
+            self.state.values + self.bundle.free_to_all @ step,
             tuple(a.rotated(turn) for a, turn in zip(self.state.attitudes, turns, strict=True)),
         )
 
     def camera_covariance(self, variance: float) -> Array:
         """Covariance of the free parameters, scaled by a variance factor; the prior is not scaled."""
-        taken = [ca @ np.linalg.solve(aa, ca.T) for ca, aa in zip(self.ca, self.aa, strict=True)]
-        data = self.cc - self.scale2 * self.bundle.prior - np.sum(taken, axis=0)
+        eliminated = [ca @ np.linalg.solve(aa, ca.T) for ca, aa in zip(self.ca, self.aa, strict=True)]
+        data = self.cc - self.scale2 * self.bundle.prior - np.sum(eliminated, axis=0)
         inverse = np.linalg.inv(data / max(variance, _SMALLEST_SCALE**2) + self.bundle.prior)
         symmetric: Array = 0.5 * (inverse + inverse.T)
         return symmetric
 
 
-def _freedom(estimate: Sequence[str], values: Array) -> Array:
+def _free_to_all(estimate: Sequence[str], values: Array) -> Array:
     """Matrix (9, p) that maps the p free parameters to all nine."""
     columns = []
     for name in dict.fromkeys(estimate):

@@ -8,8 +8,8 @@ and several frames for each position, so that the error is
 
 with a random term for each level. A nested analysis of variance gives unbiased estimates of the variances
 (Henderson's method 1; Searle, Casella and McCulloch, Variance Components, section 3.6), and F tests show whether
-they are significant: a term that is not is reported as zero, with the smallest value that would have been
-significant. Thermo-elastic error and aberration residual come from separate series, in which fields are repeated
+they are significant: a term that is not significant is reported as zero, with the smallest value that
+would have been significant. Thermo-elastic error and aberration residual come from separate series, in which fields are repeated
 at other temperatures and dates.
 """
 
@@ -160,7 +160,7 @@ class _Nested:
     def condition_variance(
         self, known: Vectors | float = 0.0, known_dof: float = math.inf
     ) -> tuple[Vectors, Vectors]:
-        """Return the variance of the conditions above a known one, and the smallest significant value."""
+        """Return the variance of the conditions beyond a known variance, and the smallest significant value."""
         dof = (self.cells - self.fields, min(self.total - self.cells, known_dof))
         return _level(self.condition_ms, self.noise_ms + self.k1 * known, self.k1, dof)
 
@@ -216,9 +216,9 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
     if dated is None:
         return ErrorLine(ABERRATION, None, np.zeros(3))
     factor = coverage_factor(confidence)
-    still = _Nested.of(static)
-    pixel = np.maximum(still.condition_ms - still.noise_ms, 0.0) / still.k1
-    variance, least = _Nested.of(dated).condition_variance(pixel, still.cells - still.fields)
+    at_rest = _Nested.of(static)
+    pixel = np.maximum(at_rest.condition_ms - at_rest.noise_ms, 0.0) / at_rest.k1
+    variance, least = _Nested.of(dated).condition_variance(pixel, at_rest.cells - at_rest.fields)
     return ErrorLine(ABERRATION, factor * np.sqrt(variance), factor * np.sqrt(least))
 
 
@@ -264,5 +264,5 @@ def _by_field_and_condition(series: ErrorSeries) -> Vectors:
     fields, row = np.unique(series.field, return_inverse=True)
     table: Vectors = np.full((len(fields), len(conditions), 3), np.nan)
     table[row, column] = series.error_arcsec
-    whole: Vectors = table[~np.isnan(table).any(axis=(1, 2))]
-    return whole
+    complete: Vectors = table[~np.isnan(table).any(axis=(1, 2))]
+    return complete

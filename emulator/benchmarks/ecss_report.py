@@ -302,10 +302,10 @@ def _plot_errors(report: EcssReport, folder: Path) -> Path:
 
     shown = [line for line in (*report.lines, report.total, report.measured) if line.arcsec is not None]
     fig, axes = figure(height=3.6)
-    places = np.arange(len(shown))
-    axes.barh(places - 0.2, [line.across_arcsec for line in shown], 0.38, label="across the boresight")
-    axes.barh(places + 0.2, [line.about_arcsec for line in shown], 0.38, label="about the boresight")
-    axes.set_yticks(places, [line.name for line in shown])
+    heights = np.arange(len(shown))
+    axes.barh(heights - 0.2, [line.across_arcsec for line in shown], 0.38, label="across the boresight")
+    axes.barh(heights + 0.2, [line.about_arcsec for line in shown], 0.38, label="about the boresight")
+    axes.set_yticks(heights, [line.name for line in shown])
     axes.invert_yaxis()
     axes.set_xlabel(f"arcseconds at {100 * report.confidence:g} %")
     axes.set_title(f"Attitude errors of {report.plan.profile}")

@@ -70,20 +70,20 @@ ROWS: Final[dict[str, SceneSettings]] = {
     "8°, V ≤ 7.5, 1, 0.4 mag": SceneSettings(7.5, 1.0, magnitude_noise=0.4, field_deg=8.0, side_px=512),
     "12°, V ≤ 6, 3 of 2048 px": SceneSettings(6.0, 3.0, magnitude_noise=0.0, field_deg=12.0, side_px=2048),
 }
-"""Row of the table → scene: "σ px, false, missing" of stars to V 5.5 in 42° where nothing else is said."""
+"""Row of the report → scene. The name gives "σ px, false, missing"; stars are to V 5.5 in 42° unless it says otherwise."""
 
 PAPERS: Final = tuple(ROWS)[-9:]
-"""Scenes of the sensors that the papers of the published algorithms simulate; with 12 stars at least, for the
-sparse fields' share."""
+"""Scenes of the sensors that the papers of the published algorithms simulate; those with at least 12
+stars leave out sparse fields."""
 
 WINDOW_SIGMAS: Final = 20.0 / 3.0
-"""Largest distance of a star from its predicted position that a solver that tracks is given, in errors of the prediction."""
+"""Largest distance of a star from its predicted position, as given to solvers that track, in standard deviations."""
 
 STANDARD: Final = tuple(ROWS)[:9]
 """Rows of the published comparison."""
 
 LEADERBOARD: Final = (*STANDARD, *tuple(ROWS)[13:22])
-"""Those, and other fields, a dense one, and a few stars in tracking."""
+"""Rows of the published comparison, other fields, a dense one, and a few stars in tracking."""
 
 WRONG_ARCSEC: Final = 360.0
 WRONG_ROLL_ARCSEC: Final = 3600.0
@@ -92,8 +92,8 @@ ill-conditioned if the least-squares attitude of the true matches is within thes
 close together determine no attitude better."""
 
 PEER_LIMIT_V: Final = 5.5
-"""Lowest magnitude limit of the databases of third-party solvers and published algorithms; otherwise the
-scenes'."""
+"""Lowest magnitude limit of the databases of third-party solvers and published algorithms; scenes with fainter
+stars have their own limit."""
 
 _BLEND_PX: Final = 2.0
 _DEEPER_V: Final = 0.5
@@ -102,7 +102,7 @@ _FLOOR_STEPS: Final = 3
 
 @dataclass
 class Tally:
-    """Results of one solver in one row, frame by frame; of the wrong answers some are ill-conditioned."""
+    """Results of one solver in one row, frame by frame; ill-conditioned answers are counted as wrong too."""
 
     row: str
     solver: str

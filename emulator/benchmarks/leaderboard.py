@@ -14,16 +14,16 @@ Answer = Mapping[str, Any]
 
 _HEAD: Final = """# Leaderboard of star identification
 
-`{command}`: the same scenes for all solvers. A row is named by σ of the positions in px, false stars and missing stars of a sensor of 42°
-and stars to V 5.5 where nothing else is said. *Right* counts answers whose boresight is within 0.1° and whose roll within 1° of the truth (where there is no sky to
-identify: none), *wrong* the other answers; the rest gave none. *Ill-conditioned* are those of the wrong answers that are within the same
-limits of the least-squares attitude of the true matches, so that no solver could do better with these stars.
-A solver that had spent its budget answered fewer scenes.
+`{command}`: all solvers are given the same scenes. A heading gives σ of the positions in px, and the numbers of false and of missing stars;
+unless it says otherwise, the field is 42° wide and shows stars to V 5.5. *Right* answers are within 0.1° of the true boresight and 1° of the
+true roll; in scenes without a sky, it is right not to answer. All other answers are *wrong*. *Ill-conditioned* answers are wrong answers
+within the same limits of the least-squares attitude of the true matches: no solver could do better with these stars.
+A solver that used up its time budget was given fewer scenes.
 """
 
 
 def markdown(answer: Answer, command: str) -> str:
-    """Report of what `starhil.emulator.benchmarks.identify.run` returned: one table a row, best first, and one of what the solvers take."""
+    """Return the report of `starhil.emulator.benchmarks.identify.run`: a table per row, best solver first, and one of resources."""
     lines = [_HEAD.format(command=command)]
     for row in dict.fromkeys(entry["row"] for entry in answer["rows"]):
         lines += [
@@ -35,10 +35,10 @@ def markdown(answer: Answer, command: str) -> str:
         lines += [_line(entry) for entry in ranked(answer, row)]
         lines.append("")
     lines += [
-        "## What they take",
+        "## Database, build time and memory",
         "",
-        "Database in kB, time to build or (geometric, lsi, rsi) load it, growth of the process's memory until the first answer. The published",
-        "algorithms' memory holds the index of the verification, which whoever is first pays for.",
+        "Size of the database; time to build it or, for geometric, lsi and rsi, to load it; growth of the process's memory until the first answer.",
+        "The published algorithms share the index for verification; its memory is counted for the first of them that runs.",
         "",
         "| solver | field | stars to V | database kB | build s | memory MB |",
         "|---|---:|---:|---:|---:|---:|",
@@ -55,18 +55,18 @@ def markdown(answer: Answer, command: str) -> str:
 
 
 def ranked(answer: Answer, row: str) -> list[Mapping[str, Any]]:
-    """Entries of a row: fewest wrong first, then most right, then least processor time."""
+    """Return the entries of a row: fewest wrong answers first, then most right ones, then least processor time."""
     entries = [entry for entry in answer["rows"] if entry["row"] == row]
     return sorted(entries, key=lambda entry: (_wrong(entry), -right(entry), entry["cpu_median_ms"] or 0.0))
 
 
 def right(entry: Mapping[str, Any]) -> float:
-    """Share of scenes answered rightly, %; where there is no sky behind the points, no answer is the right one."""
+    """Return the share of right answers, %; in scenes without a sky, it is right not to answer."""
     return (float(entry["valid_pct"]) if entry["sky"] else 100.0) - _wrong(entry)
 
 
 def _wrong(entry: Mapping[str, Any]) -> float:
-    """Share of scenes answered wrongly, %."""
+    """Return the share of wrong answers, %."""
     return 100.0 * float(entry["wrong"]) / max(int(entry["frames"]), 1)
 
 
@@ -106,18 +106,18 @@ def _names(answer: Answer, key: str) -> Sequence[str]:
 
 
 def _table(answer: Answer, value: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Values of solvers (rows) over rows of the comparison (columns), NaN where there are none."""
+    """Return a value of each solver (first axis) in each row of the report (second axis); NaN if not measured."""
     solvers, rows = _names(answer, "solver"), _names(answer, "row")
     table = np.full((len(solvers), len(rows)), np.nan)
     for entry in answer["rows"]:
-        place = solvers.index(entry["solver"]), rows.index(entry["row"])
+        cell = solvers.index(entry["solver"]), rows.index(entry["row"])
         found = right(entry) if value == "right" else entry[value]
-        table[place] = np.nan if found is None else found
+        table[cell] = np.nan if found is None else found
     return table
 
 
 def _plot_rates(answer: Answer, path: Path) -> None:
-    """Draw the share answered rightly as colour, and the number of wrong answers in the cells."""
+    """Draw the share of right answers as colour, and the number of wrong ones in the cells."""
     from starid.thesis.experiments.plots import figure, save
 
     solvers, rows = _names(answer, "solver"), _names(answer, "row")
@@ -136,17 +136,17 @@ def _plot_rates(answer: Answer, path: Path) -> None:
 
 
 def _plot_times(answer: Answer, path: Path) -> None:
-    """Draw median and 99 % of the processor time of a solve, each for the row in the middle of a solver's."""
+    """Draw median and 99th percentile of the processor time of a solve, each as the median over the rows."""
     from starid.thesis.experiments.plots import figure, save
 
     solvers = _names(answer, "solver")
     fig, axis = figure(width=7.0, height=1.2 + 0.28 * len(solvers))
-    places = np.arange(len(solvers))
-    for value, word, marker in (("cpu_median_ms", "median", "o"), ("cpu_p99_ms", "99 %", "x")):
+    heights = np.arange(len(solvers))
+    for value, label, marker in (("cpu_median_ms", "median", "o"), ("cpu_p99_ms", "99 %", "x")):
         table = _table(answer, value)
-        axis.plot(np.nanmedian(table, axis=1), places, marker, label=word)
-    axis.set(xscale="log", xlabel="processor time of a solve / ms", yticks=places)
-    axis.set_yticks(places, solvers, fontsize=7)
+        axis.plot(np.nanmedian(table, axis=1), heights, marker, label=label)
+    axis.set(xscale="log", xlabel="processor time of a solve / ms", yticks=heights)
+    axis.set_yticks(heights, solvers, fontsize=7)
     axis.invert_yaxis()
     axis.legend()
     save(fig, path)

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from starhil.hil_tests.bus_load import ASKED, DEVICE, load_can
+from starhil.hil_tests.bus_load import DEVICE, REQUESTED_ROWS, load_can
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
@@ -29,8 +29,8 @@ EVENT_TIMER_MS = 50
 SYNC_S = 0.05
 WARM_UP_S = 60.0
 """Timeout for the emulator to reach tracking."""
-NEEDED = (
-    *ASKED,
+REQUIRED_ROWS = (
+    *REQUESTED_ROWS,
     "identified_stars",
     "communication_status",
     "set_hole_map_1",
@@ -49,7 +49,7 @@ def check_rows(icd: InterfaceDefinition) -> None:
     BenchError
         The unit lacks some of them.
     """
-    missing = [name for name in NEEDED if name not in icd.telemetry and name not in icd.telecommands]
+    missing = [name for name in REQUIRED_ROWS if name not in icd.telemetry and name not in icd.telecommands]
     if missing:
         raise BenchError(
             f"bench bus: unit {icd.name} lacks the CubeStar rows that are used to load the links ({', '.join(missing)}); "

@@ -32,7 +32,7 @@ def frame_parameters(
     full_field: bool,
     overlap_percent: float = 99.0,
 ) -> DatabaseParameters:
-    """Make frame parameters from command-line options."""
+    """Return frame parameters from command-line options."""
     from starid.camera import Camera
     from starid.thesis.database import DatabaseParameters
 

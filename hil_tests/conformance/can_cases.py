@@ -157,7 +157,7 @@ INTRUSIVE_EXCHANGES: Final = (
 
 
 def _frame_cases(icd: InterfaceDefinition) -> list[Case[CanWire]]:
-    """Return the cases from the tables of frames for whose rows the unit has."""
+    """Return the cases of the tables of frames whose rows the unit has."""
     texts = CanRows(icd).texts(icd)
     area = CaseArea[CanWire]("frames", FRAME_RULE)
     add_exchange_cases(area, _filled(EXCHANGES, texts))

@@ -146,7 +146,7 @@ def heartbeat_stopped(probe: CanopenProbe) -> None:
 # Node guarding
 
 
-def _guard(probe: CanopenProbe) -> int:
+def _request_guarding(probe: CanopenProbe) -> int:
     probe.send(0x700 + probe.node, remote=True)
     return probe.expect(0x700 + probe.node, "answer to node guarding")[0]
 
@@ -160,17 +160,17 @@ def _prepare_guarding(probe: CanopenProbe) -> None:
 @ERROR_CONTROL.case("guarding", "node guarding with toggle bit", "CiA 301 7.2.8.3.1")
 def guarding(probe: CanopenProbe) -> None:
     _prepare_guarding(probe)
-    check_equal([_guard(probe) for _ in range(3)], [0x7F, 0xFF, 0x7F], "answers")
+    check_equal([_request_guarding(probe) for _ in range(3)], [0x7F, 0xFF, 0x7F], "answers")
     probe.command(START)
-    check_equal(_guard(probe), 0x85, "answer in OPERATIONAL")
+    check_equal(_request_guarding(probe), 0x85, "answer in OPERATIONAL")
     probe.command(STOP)
-    check_equal(_guard(probe), 0x04, "answer in STOPPED")
+    check_equal(_request_guarding(probe), 0x04, "answer in STOPPED")
     probe.command(PRE_OPERATIONAL)
-    check_equal([_guard(probe) for _ in range(2)], [0xFF, 0x7F], "answers in PRE-OPERATIONAL")
+    check_equal([_request_guarding(probe) for _ in range(2)], [0xFF, 0x7F], "answers in PRE-OPERATIONAL")
     probe.reset_communication()
     _prepare(probe, 0)
     probe.drain()
-    check_equal(_guard(probe), 0x7F, "first answer after the reset")
+    check_equal(_request_guarding(probe), 0x7F, "first answer after the reset")
 
 
 @ERROR_CONTROL.case(
@@ -194,11 +194,11 @@ def life_guarding(probe: CanopenProbe) -> None:
     emergency = _emergency(probe)
     probe.expect_silence(emergency, "EMCY before the first request", 0.4)
     for _ in range(3):
-        _guard(probe)
+        _request_guarding(probe)
         probe.expect_silence(emergency, "EMCY while it is guarded", 0.15)
     data = probe.expect(emergency, "EMCY 8130h", 0.3)
     check_equal(data[:2], b"\x30\x81", "error code")
-    check_equal(_guard(probe) & 0x7F, 0x7F, "state")
+    check_equal(_request_guarding(probe) & 0x7F, 0x7F, "state")
 
 
 # Heartbeat consumer

@@ -22,7 +22,7 @@ SDO_BLOCK: Final = CaseArea[CanopenProbe]("canopen.sdo-block", "CiA 301 7.2.4.3.
 SEGMENT: Final = 7
 
 
-def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
+def _longest_object(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
     """Return the longest readable text or domain of at most 200 kB, preferably of many blocks."""
     best: tuple[ODVariable, bytes] | None = None
     for item in probe.variables():
@@ -44,7 +44,7 @@ def _big(probe: CanopenProbe) -> tuple[ODVariable, bytes]:
     return item, b""
 
 
-def _begin(
+def _initiate_upload(
     probe: CanopenProbe, item: ODVariable, size: int = 127, *, crc: bool = True, threshold: int = 0
 ) -> bytes:
     command = 0xA4 if crc else 0xA0
@@ -69,7 +69,7 @@ def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
 
 def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: bool = True) -> bytes:
     """Upload an object in blocks, checking every part of the protocol."""
-    answer = _begin(probe, item, block, crc=crc)
+    answer = _initiate_upload(probe, item, block, crc=crc)
     check(answer[0] & 0xF9 == 0xC0, "answer C0h to C6h", answer)
     check_equal(answer[1:4], multiplexer(item.index, item.subindex), "multiplexer")
     total = int.from_bytes(answer[4:], "little") if answer[0] & 0x02 else None
@@ -117,7 +117,7 @@ def upload_without_crc(probe: CanopenProbe) -> None:
 
 @SDO_BLOCK.case("upload-big", "block upload of many blocks", "CiA 301 7.2.4.3.13")
 def upload_big(probe: CanopenProbe) -> None:
-    item, _ = _big(probe)
+    item, _ = _longest_object(probe)
     if len(upload_blocks(probe, item, 100)) <= SEGMENT * 100:
         raise CaseSkipped(f"the longest object, {item.qualname}, fits into one block")
 
@@ -125,7 +125,7 @@ def upload_big(probe: CanopenProbe) -> None:
 @SDO_BLOCK.case("upload-repeat", "unconfirmed segments are sent again", "CiA 301 7.2.4.3.14")
 def upload_repeat(probe: CanopenProbe) -> None:
     item, value = long_text(probe)
-    _begin(probe, item, 3)
+    _initiate_upload(probe, item, 3)
     first = _segments(probe, b"\xa3", 3)
     again = _segments(probe, bytes([0xA2, 1, 2]), 2)
     check_equal([frame[1:] for frame in again][:1], [first[1][1:]], "second segment again")
@@ -139,9 +139,9 @@ def upload_repeat(probe: CanopenProbe) -> None:
 def upload_block_size(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     for size in (0, 128):
-        probe.check_abort(_begin(probe, item, size), Abort.BLOCK_SIZE, multiplexer=mux(item))
+        probe.check_abort(_initiate_upload(probe, item, size), Abort.BLOCK_SIZE, multiplexer=mux(item))
     for size in (0, 128):
-        _begin(probe, item, 1)
+        _initiate_upload(probe, item, 1)
         _segments(probe, b"\xa3", 1)
         probe.check_abort(probe.ask(bytes([0xA2, 1, size])), Abort.BLOCK_SIZE, multiplexer=mux(item))
 
@@ -149,7 +149,7 @@ def upload_block_size(probe: CanopenProbe) -> None:
 @SDO_BLOCK.case("upload-sequence", "more segments confirmed than were sent")
 def upload_sequence(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
-    _begin(probe, item, 2)
+    _initiate_upload(probe, item, 2)
     _segments(probe, b"\xa3", 2)
     probe.check_abort(probe.ask("a2 03 02"), Abort.SEQUENCE, multiplexer=mux(item))
 
@@ -158,9 +158,9 @@ def upload_sequence(probe: CanopenProbe) -> None:
 def upload_order(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
     for request in ("a2 01 01", "a1", "60"):
-        _begin(probe, item, 1)
+        _initiate_upload(probe, item, 1)
         probe.check_abort(probe.ask(request), Abort.COMMAND)
-    _begin(probe, item, 1)
+    _initiate_upload(probe, item, 1)
     _segments(probe, b"\xa3", 1)
     probe.check_abort(probe.ask("a1"), Abort.COMMAND)
 
@@ -168,10 +168,10 @@ def upload_order(probe: CanopenProbe) -> None:
 @SDO_BLOCK.case("threshold", "protocol switch threshold", "CiA 301 7.2.4.3.13")
 def threshold(probe: CanopenProbe) -> None:
     item, value = long_text(probe)
-    answer = _begin(probe, item, 127, threshold=min(255, len(value)))
+    answer = _initiate_upload(probe, item, 127, threshold=min(255, len(value)))
     check(answer[0] in {0x41, 0xC6, 0xC4, 0xC2, 0xC0}, "answer 41h or C6h", answer)
     probe.abandon_transfer()
-    answer = _begin(probe, item, 127, threshold=7)
+    answer = _initiate_upload(probe, item, 127, threshold=7)
     check(answer[0] & 0xF9 == 0xC0, "answer C6h", answer)
     probe.abandon_transfer()
 
@@ -186,7 +186,7 @@ def upload_refused(probe: CanopenProbe) -> None:
 @SDO_BLOCK.case("upload-time-out", "a block upload whose client stops sending times out")
 def upload_time_out(probe: CanopenProbe) -> None:
     item, _ = long_text(probe)
-    _begin(probe, item, 2)
+    _initiate_upload(probe, item, 2)
     _segments(probe, b"\xa3", 2)
     probe.check_abort(
         probe.wait_for(0x580 + probe.node, LONGEST_TIMEOUT_S), Abort.TIMEOUT, multiplexer=mux(item)
@@ -204,7 +204,7 @@ def _begin_download(probe: CanopenProbe, item: ODVariable, size: int | None, *, 
     return answer[4]
 
 
-def _end(probe: CanopenProbe, unused: int, crc: int) -> bytes | None:
+def _end_download(probe: CanopenProbe, unused: int, crc: int) -> bytes | None:
     return probe.ask(bytes([0xC1 | unused << 2]) + crc.to_bytes(2, "little"))
 
 
@@ -215,7 +215,7 @@ def download(probe: CanopenProbe) -> None:
         _begin_download(probe, item, size, crc=crc)
         answer = probe.ask(b"\x81" + value)
         check(answer is not None and answer[:2] == b"\xa2\x01", "confirmation A2h 01h", answer)
-        answer = _end(probe, 5, crc_hqx(value, 0) if crc else 0)
+        answer = _end_download(probe, 5, crc_hqx(value, 0) if crc else 0)
         check_equal(answer, b"\xa1" + bytes(7), "end")
         check_equal(probe.read(item.index, item.subindex), value, "value")
     expect_no_transfer(probe)
@@ -228,7 +228,7 @@ def download_crc(probe: CanopenProbe) -> None:
     value = bytes([before[0] ^ 1, before[1]])
     _begin_download(probe, item, 2)
     probe.ask(b"\x81" + value)
-    probe.check_abort(_end(probe, 5, crc_hqx(value, 0) ^ 0x0100), Abort.CRC, multiplexer=mux(item))
+    probe.check_abort(_end_download(probe, 5, crc_hqx(value, 0) ^ 0x0100), Abort.CRC, multiplexer=mux(item))
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
 
@@ -240,7 +240,7 @@ def download_gap(probe: CanopenProbe) -> None:
     check(answer is not None and answer[:2] == b"\xa2\x00", "confirmation A2h 00h", answer)
     answer = probe.ask(b"\x81\x39\x30")
     check(answer is not None and answer[:2] == b"\xa2\x01", "confirmation A2h 01h", answer)
-    answer = _end(probe, 5, crc_hqx(b"\x39\x30", 0))
+    answer = _end_download(probe, 5, crc_hqx(b"\x39\x30", 0))
     check_equal(answer, b"\xa1" + bytes(7), "end")
 
 
@@ -264,7 +264,11 @@ def download_length(probe: CanopenProbe) -> None:
         _begin_download(probe, item, size, crc=False)
         probe.ask(b"\x81\x39\x30\x01")
         probe.check_abort(
-            _end(probe, unused, 0), Abort.LENGTH, Abort.LENGTH_HIGH, Abort.LENGTH_LOW, multiplexer=mux(item)
+            _end_download(probe, unused, 0),
+            Abort.LENGTH,
+            Abort.LENGTH_HIGH,
+            Abort.LENGTH_LOW,
+            multiplexer=mux(item),
         )
     check_equal(probe.read(item.index, item.subindex), before, "value as before")
 
@@ -277,7 +281,7 @@ def download_announced(probe: CanopenProbe) -> None:
     answer = probe.ask(transfer(0xC2, item, b"\x03\0\0\0"))
     if answer is not None and answer[0] != 0x80:
         probe.ask(b"\x81\x39\x30\x01")
-        answer = _end(probe, 4, 0)
+        answer = _end_download(probe, 4, 0)
     probe.check_abort(answer, Abort.LENGTH, Abort.LENGTH_HIGH, multiplexer=mux(item))
 
 

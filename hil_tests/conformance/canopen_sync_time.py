@@ -18,7 +18,7 @@ SYNC: Final = CaseArea[CanopenProbe]("canopen.sync", "CiA 301 7.5.2.5", intrusiv
 TIME: Final = CaseArea[CanopenProbe]("canopen.time", "CiA 301 7.5.2.13", intrusive=True)
 
 
-def _quiet(probe: CanopenProbe) -> None:
+def _quiet_and_drain(probe: CanopenProbe) -> None:
     probe.quiet()
     probe.drain()
 
@@ -58,7 +58,7 @@ def sync_counter_fixed(probe: CanopenProbe) -> None:
 @SYNC.case("length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3")
 def sync_length(probe: CanopenProbe) -> None:
     probe.require(0x1014)
-    _quiet(probe)
+    _quiet_and_drain(probe)
     emergency = probe.number(0x1014) & 0x7FF
     probe.send(0x080, b"\x01")
     check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
@@ -73,7 +73,7 @@ def sync_length(probe: CanopenProbe) -> None:
 @SYNC.case("producer", "SYNC producer")
 def sync_producer(probe: CanopenProbe) -> None:
     probe.require(0x1006)
-    _quiet(probe)
+    _quiet_and_drain(probe)
     if 0x1019 in probe.od:
         probe.set(0x1019, 0, 3, 1)
     probe.set(0x1006, 0, 20_000)

@@ -140,7 +140,7 @@ def _case(
 # --- reading and writing ---
 
 
-def _turned(slot: Slot | None, data: bytes) -> bytes:
+def _with_byte_order(slot: Slot | None, data: bytes) -> bytes:
     """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
     return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
 
@@ -151,7 +151,7 @@ def _read(probe: CanopenProbe, entry: Entry) -> bytes:
     if entry.slot is not None and not entry.size:
         return data.ljust(entry.slot.size, b"\0")
     check_equal(len(data), entry.size, f"bytes of {entry.name}h")
-    return _turned(entry.slot, data)
+    return _with_byte_order(entry.slot, data)
 
 
 def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
@@ -180,11 +180,11 @@ def _written(entry: Entry, command: Row, data: bytes) -> bytes:
         return b"\x01"
     if _is_text(command):
         return data.rstrip(b"\0") or b"\0"
-    return data if part is None else _turned(part, data[part.offset : part.offset + part.size])
+    return data if part is None else _with_byte_order(part, data[part.offset : part.offset + part.size])
 
 
 @contextmanager
-def _seeing(probe: CanopenProbe, found: list[Entry]) -> Iterator[None]:
+def _identifying_stars(probe: CanopenProbe, found: list[Entry]) -> Iterator[None]:
     """Have the unit identify stars, if an entry can start this; restore the mode afterwards."""
     for entry in found:
         command, field = entry.command, _argument(entry, "mode")
@@ -233,7 +233,7 @@ def _values(row: Row, found: list[Entry]) -> Run:
 
 def _unit_length(row: Row, bound: dict[str, str], found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
-        with _seeing(probe, found):
+        with _identifying_stars(probe, found):
             end = probe.port.now() + ATTITUDE_S
             while True:
                 seen = checked_values(row, _read_row(probe, row, found))
@@ -336,10 +336,10 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
-        yield _case("records", command.name, title, _kept(command, members), clause_of_row(command))
+        yield _case("records", command.name, title, _keeps_values(command, members), clause_of_row(command))
 
 
-def _kept(command: Row, members: list[Entry]) -> Run:
+def _keeps_values(command: Row, members: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         before = [probe.read(entry.index, entry.subindex) for entry in members]
         for end in (1, 0):
@@ -403,7 +403,7 @@ def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProb
                 continue
             if first == 0x1800:
                 title = f"{label} carries the values of its objects"
-                yield _case(kind, f"{number + 1}.data", title, _carries(index, mapped))
+                yield _case(kind, f"{number + 1}.data", title, _carries_values(index, mapped))
             if (
                 first == 0x1800
                 and model.enabled
@@ -441,7 +441,7 @@ def _default(index: int, model: PdoModel, mapped: list[Entry]) -> Run:
     return run
 
 
-def _carries(index: int, mapped: list[Entry]) -> Run:
+def _carries_values(index: int, mapped: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         probe.quiet()
         can_id = probe.number(index, 1) & 0x7FF
@@ -466,7 +466,7 @@ def _carries(index: int, mapped: list[Entry]) -> Run:
 
 def _sent_with_frames(index: int, model: PdoModel, found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
-        with _seeing(probe, found):
+        with _identifying_stars(probe, found):
             probe.command(START)
             can_id = _can_id(probe, index, model)
             times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]

@@ -121,7 +121,7 @@ def run_conformance(
     try:
         with ExitStack() as stack:
             serial, can = request.serial, request.can
-            emulator = _start(request, stack) if request.start else None
+            emulator = _start_emulator(request, stack) if request.start else None
             if emulator is not None:
                 serial, can = emulator.ready.get("serial"), emulator.ready.get("can")
             shown: Callable[[Outcome], None] = record
@@ -133,7 +133,7 @@ def run_conformance(
     except EmulatorProcessError as error:
         if not complete:
             raise
-        record(_fallen(error))
+        record(_outcome_of_early_end(error))
     except Interrupted as interruption:
         done = {outcome.id for outcome in outcomes}
         for item in cases:
@@ -210,13 +210,13 @@ def _serial_probe(
     return SerialUnitProbe(port, icd, style=style, times=request.times)
 
 
-def _fallen(error: EmulatorProcessError) -> Outcome:
+def _outcome_of_early_end(error: EmulatorProcessError) -> Outcome:
     """Return the outcome for an emulator that ended early; earlier outcomes are kept."""
     case = case_of_run("emulator.end", "the emulator runs until it is ended, and ends cleanly", "starhil run")
     return Outcome.of(case, Verdict(FAILED, "exit with status 0 on request", str(error)))
 
 
-def _start(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
+def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
     """Start an emulator with the requested links."""
     folder = stack.enter_context(temporary_folder("starhil-conformance-"))
     needs_bus = request.can is not None or request.canopen_node is not None

@@ -30,7 +30,7 @@ FIRST_TELEMETRY: Final = 128
 BURST_ID: Final = 119
 
 LONG_PAUSE_S: Final = 0.8
-"""Longer than the device waits for the end of a message (0.5 s)."""
+"""Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, in which time-outs of the device pass."""
 
@@ -38,7 +38,7 @@ SHOWN_BYTES: Final = 48
 """Number of serial bytes shown in a line of the log."""
 
 LIVELY: Final = ("identification", "device_status", "acknowledge")
-"""Rows at least one of which every unit answers."""
+"""Rows of which every unit answers at least one."""
 
 AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malformed", "none"]
 

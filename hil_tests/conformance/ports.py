@@ -74,22 +74,22 @@ class LivePort(Generic[Item]):
         """Time, s, from any origin."""
         return time.monotonic() * self._speed
 
-    def _fail(self, error: ProtocolError) -> None:
+    def _record_loss(self, error: ProtocolError) -> None:
         self._lost = error
 
     def __enter__(self) -> Self:
         try:
-            self._loop.run(self._transport.start(self._arrived.put, self._fail))
+            self._loop.run(self._transport.start(self._arrived.put, self._record_loss))
         except BaseException:
             self._loop.close()
             raise
         return self
 
     def __exit__(self, *_error: object) -> None:
-        self._loop.run(self._end())
+        self._loop.run(self._close_transport())
         self._loop.close()
 
-    async def _end(self) -> None:
+    async def _close_transport(self) -> None:
         await asyncio.sleep(0)
         await self._transport.close()
 

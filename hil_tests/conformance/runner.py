@@ -189,7 +189,7 @@ def run_cases(
         return outcomes
     link = waiting[0].id.partition(".")[0]
     probe.log.clear()
-    mute = _mute(probe, port, booting=False)
+    mute = _verdict_if_silent(probe, port, booting=False)
     intrusive = mute is None and any(item.intrusive for item in waiting)
     if intrusive:
         report_trouble("settings.found", "the settings can be read before the first case", probe.prepare)
@@ -198,7 +198,7 @@ def run_cases(
             outcome = run_case(probe, waiting.pop(0))
             record(outcome)
             if outcome.status == FAILED and waiting:
-                mute = _mute(probe, port, booting=intrusive)
+                mute = _verdict_if_silent(probe, port, booting=intrusive)
     finally:
         if intrusive:
             probe.log.clear()
@@ -220,7 +220,7 @@ def case_of_run(case_id: str, title: str, clause: str = "starhil conformance") -
     return Case(case_id, case_id.rpartition(".")[0], title, clause, lambda _probe: None)
 
 
-def _mute(probe: Probe, port: str, *, booting: bool) -> Verdict | None:
+def _verdict_if_silent(probe: Probe, port: str, *, booting: bool) -> Verdict | None:
     """Return the verdict on a device that does not answer; None if it answers or the link was lost."""
     seen: str | None = None
 

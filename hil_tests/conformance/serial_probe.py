@@ -171,17 +171,17 @@ class SerialProbe(SerialWire, LinkProbe):
         if self.dialect == "b":
             if not self._asked:
                 return Answer("malformed", data=body)
-            return self._plain(self._asked.pop(0), body, None)
+            return self._answer_generation_1(self._asked.pop(0), body, None)
         if self._asked and self._asked[0] == body[0]:
             self._asked.pop(0)
-        return self._plain(body[0], body[1:], body[0])
+        return self._answer_generation_1(body[0], body[1:], body[0])
 
     def _expects(self, size: int) -> bool:
         """Return whether the requested row has the size of a burst packet, in dialect b."""
         row = self.icd.telemetry_by_id.get(self._asked[0]) if self._asked and self.dialect == "b" else None
         return row is not None and row.size == size
 
-    def _plain(self, row_id: int, data: bytes, seen: int | None) -> Answer:
+    def _answer_generation_1(self, row_id: int, data: bytes, seen: int | None) -> Answer:
         """Interpret an answer of generation 1: telemetry, or one byte for an acknowledge or refusal."""
         row = self.icd.telemetry_by_id.get(row_id)
         if row is not None and len(data) == row.size:

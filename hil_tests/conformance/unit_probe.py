@@ -209,10 +209,10 @@ class SerialUnitProbe(SerialWire, UnitProbe):
         self.raw += data
         self._received += data
         while self._received:  # byte by byte, because each reply determines what is expected next
-            self._take(self._received.pop(0))
+            self._receive_byte(self._received.pop(0))
         return True
 
-    def _take(self, byte: int) -> None:
+    def _receive_byte(self, byte: int) -> None:
         for event in self._receiver.feed(bytes((byte,)), self.now()):
             if isinstance(event, Reply) and event.kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT):
                 self._unsolicited.append(event)

@@ -51,9 +51,9 @@ def check_can_id(cob_id: int) -> None:
         raise SdoAbortError(AbortCode.VALUE_RANGE, f"CAN ID 0x{can_id:03X} is restricted")
 
 
-def check_replacement(old: int, new: int, *, lives_before: bool, lives_after: bool) -> None:
+def check_replacement(old: int, new: int, *, enabled_before: bool, enabled_after: bool) -> None:
     """Reject a change of the CAN ID of a communication object that stays enabled."""
-    if lives_before and lives_after and (old ^ new) & (ID_MASK | EXTENDED):
+    if enabled_before and enabled_after and (old ^ new) & (ID_MASK | EXTENDED):
         raise SdoAbortError(
             AbortCode.VALUE_RANGE, "disable the communication object before changing its CAN ID"
         )

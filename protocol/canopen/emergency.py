@@ -166,6 +166,6 @@ class EmergencyProducer:
 
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_replacement(old, new, lives_before=not old & INVALID, lives_after=not new & INVALID)
+        check_replacement(old, new, enabled_before=not old & INVALID, enabled_after=not new & INVALID)
         if not new & INVALID:
             check_can_id(new)

@@ -168,7 +168,7 @@ class PdoRecords:
 
     def _write_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_replacement(old, new, lives_before=not old & INVALID, lives_after=not new & INVALID)
+        check_replacement(old, new, enabled_before=not old & INVALID, enabled_after=not new & INVALID)
         if self.direction is Direction.TRANSMIT and not new & BIT_30:
             raise SdoAbortError(
                 AbortCode.VALUE_RANGE, "remote requests are not supported: bit 30 must be set"

@@ -100,11 +100,11 @@ class SdoServer:
         if len(data) != LENGTH:
             return []
         index, subindex = int.from_bytes(data[1:3], "little"), data[3]
-        if not self._begins(data):
+        if not self._initiates_transfer(data):
             active = self._transfer or self._waiting
             index, subindex = (0, 0) if active is None else (active.index, active.subindex)
         try:
-            answers = self._handle(data, index, subindex)
+            answers = self._execute_command(data, index, subindex)
         except SdoAbortError as abort:
             return [self._abort(abort.code, index, subindex)]
         except ProtocolError as error:
@@ -123,7 +123,7 @@ class SdoServer:
     def _streaming(self) -> bool:
         return isinstance(self._transfer, BlockDownload) and self._transfer.streaming
 
-    def _begins(self, data: bytes) -> bool:
+    def _initiates_transfer(self, data: bytes) -> bool:
         """Return whether a request initiates a transfer, which replaces the active one."""
         if self._streaming():
             return False
@@ -131,12 +131,12 @@ class SdoServer:
         kind = command >> 5
         return kind in {1, 2} or (kind == 5 and command & 0x03 == 0) or (kind == 6 and command & 0x01 == 0)
 
-    def _handle(self, data: bytes, index: int, subindex: int) -> list[bytes]:
+    def _execute_command(self, data: bytes, index: int, subindex: int) -> list[bytes]:
         command = data[0]
         if command == ABORT or (command >> 5 == 4 and not self._streaming()):
             self._transfer = self._waiting = None
             return []
-        if not self._begins(data):
+        if not self._initiates_transfer(data):
             if self._transfer is None:
                 raise SdoAbortError(AbortCode.COMMAND, f"0x{command:02X} without a transfer")
             return self._transfer.request(data)

@@ -145,7 +145,7 @@ class BlockDownload(Transfer):
 
     def request(self, data: bytes) -> list[bytes]:
         """Process a segment, or the end request after the last segment."""
-        return self._end(data) if self._ending else self._segment(data)
+        return self._complete(data) if self._ending else self._segment(data)
 
     def _segment(self, data: bytes) -> list[bytes]:
         number = data[0] & 0x7F
@@ -165,7 +165,7 @@ class BlockDownload(Transfer):
         self._ending = last and expected
         return [answer]
 
-    def _end(self, data: bytes) -> list[bytes]:
+    def _complete(self, data: bytes) -> list[bytes]:
         command = data[0]
         if command >> 5 != 6 or command & 0x01 != 1:
             return super().request(data)

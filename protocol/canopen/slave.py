@@ -109,7 +109,7 @@ class CanopenSlave:
 
     def start(self, now: float) -> list[CanFrame]:
         """Power on: load the parameters, boot up and enter PRE-OPERATIONAL."""
-        self._begin(now)
+        self._begin_instant(now)
         self._initialise(application=True)
         return self._collect_frames()
 
@@ -118,7 +118,7 @@ class CanopenSlave:
         handlers = self._routes.get(frame.id)
         if frame.extended or handlers is None:
             return []
-        self._begin(now)
+        self._begin_instant(now)
         if self._silence is None:
             for handler in tuple(handlers):
                 handler(frame)
@@ -126,7 +126,7 @@ class CanopenSlave:
 
     def tick(self, now: float) -> list[CanFrame]:
         """Act on the timers that have expired."""
-        self._begin(now)
+        self._begin_instant(now)
         if self._context.state is not NmtState.INITIALISING and self._silence is None:
             for data in self.sdo.tick(now):
                 self._context.send(SDO_TRANSMIT + self.node_id, data)
@@ -155,7 +155,7 @@ class CanopenSlave:
 
     def notify(self, keys: frozenset[tuple[int, int]] | set[tuple[int, int]], now: float) -> list[CanFrame]:
         """Report new values of objects: event-driven TPDOs are sent, acyclic ones wait for SYNC."""
-        self._begin(now)
+        self._begin_instant(now)
         self.pdos.trigger(keys)
         self.pdos.tick()
         return self._collect_frames()
@@ -164,7 +164,7 @@ class CanopenSlave:
         self, deferred: Deferred, now: float, refusal: SdoAbortError | None = None
     ) -> list[CanFrame]:
         """Report the result of a deferred write: success, or a refusal."""
-        self._begin(now)
+        self._begin_instant(now)
         for data in self.sdo.finish(deferred, refusal):
             self._context.send(SDO_TRANSMIT + self.node_id, data)
         return self._collect_frames()
@@ -173,13 +173,13 @@ class CanopenSlave:
         self, code: int, register_bits: int, data: bytes = b"", *, now: float, key: bytes = b""
     ) -> list[CanFrame]:
         """Report an error of the application; see `EmergencyProducer.raise_error`."""
-        self._begin(now)
+        self._begin_instant(now)
         self.emergency.raise_error(code, register_bits, data, key=key)
         return self._collect_frames()
 
     def clear_emergency(self, code: int, *, now: float, key: bytes = b"") -> list[CanFrame]:
         """Report that an error of the application is cleared."""
-        self._begin(now)
+        self._begin_instant(now)
         self.emergency.clear_error(code, key=key)
         return self._collect_frames()
 
@@ -188,7 +188,7 @@ class CanopenSlave:
 
         A `node_id` applies from now on, unless LSS has stored one.
         """
-        self._begin(now)
+        self._begin_instant(now)
         self._prepare_node_id(node_id)
         self._initialise(application=True)
         return self._collect_frames()
@@ -227,7 +227,7 @@ class CanopenSlave:
     def _set_clock(self, data: bytes) -> None:
         self._clock_offset_us = int.from_bytes(data, "little") - self._clock_us()
 
-    def _begin(self, now: float) -> None:
+    def _begin_instant(self, now: float) -> None:
         self._context.now = now
         self._end_silence()
         self.dictionary.new_instant()

@@ -81,7 +81,7 @@ class SyncService:
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
         check_can_id(new)
-        check_replacement(old, new, lives_before=bool(old & BIT_30), lives_after=bool(new & BIT_30))
+        check_replacement(old, new, enabled_before=bool(old & BIT_30), enabled_after=bool(new & BIT_30))
         self._counter = 0
         self._schedule(new, self._period.number())
 

@@ -17,7 +17,7 @@ DAY_MS: Final = 86_400_000
 
 
 def decode_time_of_day(data: bytes) -> float | None:
-    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of ms, 16 of days), or None."""
+    """Return the Unix time, s, of a TIME_OF_DAY (28 bits of milliseconds, 16 bits of days), or None."""
     if len(data) != 6:
         return None
     milliseconds = int.from_bytes(data[:4], "little") & 0x0FFFFFFF
@@ -57,4 +57,4 @@ class TimeConsumer:
         check_can_id(new)
         if new & BIT_30:
             raise SdoAbortError(AbortCode.VALUE_RANGE, "this node does not produce TIME messages")
-        check_replacement(old, new, lives_before=bool(old & CONSUMES), lives_after=bool(new & CONSUMES))
+        check_replacement(old, new, enabled_before=bool(old & CONSUMES), enabled_after=bool(new & CONSUMES))

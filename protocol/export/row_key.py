@@ -1,4 +1,4 @@
-"""Keys of rows in exports: the row ID, with the code of the class above it if the link carries a class."""
+"""Keys of rows in exports: the row ID and, if the link carries a class, the class code in the bits above."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion between two frames of unmatched objects: pairs vote, and the best candidates are scored."""
+"""Motion between two frames whose objects are not yet matched: pairs of objects propose motions, which are scored."""
 
 from __future__ import annotations
 

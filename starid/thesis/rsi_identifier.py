@@ -139,7 +139,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         self.statistics = RsiStatistics()
 
     def _identify(self, measured: CheckedDetections) -> Solution:
-        self._follow(measured.xy, measured.flux)
+        self._stars_and_region_side(measured.xy, measured.flux)
         return self._whole_sky(measured)
 
     def _whole_sky(self, measured: CheckedDetections) -> Solution:
@@ -157,7 +157,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         The prediction only defines the region; its roll, and its error within the region, do not matter. If
         the window is wider than the region, the region is widened to it, up to the field of view.
         """
-        true_stars, side = self._follow(measured.xy, measured.flux)
+        true_stars, side = self._stars_and_region_side(measured.xy, measured.flux)
         if window_px is not None:
             side = max(side, math.degrees(2.0 * window_px / self.camera.focal_px[0]))
         side = min(side, self.lsi.database.parameters.fov_deg)
@@ -175,7 +175,7 @@ class RsiIdentifier(SingleCameraIdentifier):
         )
         return solution
 
-    def _follow(self, xy: Array, flux: Array) -> tuple[Mask, float]:
+    def _stars_and_region_side(self, xy: Array, flux: Array) -> tuple[Mask, float]:
         """Return which detections are stars, by previous frames, and the side of the search region."""
         everything = np.ones(flux.size, dtype=np.bool_)
         if self._filter is None:

@@ -188,8 +188,8 @@ class TrackFilter:
         partner = self._associate(positions, brightness, motion)
         self._last_motion = motion
         self._anchor = _composed(motion, self._anchor)
-        self._follow(positions, brightness, partner, motion)
-        wandering = self._wandering()
+        self._update_tracks(positions, brightness, partner, motion)
+        wandering = self._fixed_or_drifting()
         genuine = (self._tracks.seen >= min(self.settings.confirm, self._frame)) & ~wandering
         true_now = np.zeros(len(frame), dtype=np.bool_)
         number = np.full(len(frame), -1, dtype=np.int64)
@@ -282,7 +282,7 @@ class TrackFilter:
                 error = settings.position_sigma_deg**2 * np.minimum(share, 1.0)
         return partner
 
-    def _follow(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
+    def _update_tracks(self, positions: Array, brightness: Array, partner: Indices, motion: Array) -> None:
         """Move all tracks with the stars and update the matched ones."""
         old, sigma2 = self._tracks, self.settings.position_sigma_deg**2
         which = np.flatnonzero(partner >= 0)
@@ -301,7 +301,7 @@ class TrackFilter:
         self._add_to_sums(sums, which, positions[objects])
         self._tracks = _Tracks(old.number, position, variance, magnitude, seen, missed, sums)
 
-    def _wandering(self) -> Mask:
+    def _fixed_or_drifting(self) -> Mask:
         """Whether each track is better explained as fixed on the sensor or drifting than as a star.
 
         Each of the three explanations has a sum of squared residuals; their differences, in units of the

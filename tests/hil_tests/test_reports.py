@@ -34,7 +34,7 @@ def test_a_report_that_cannot_be_written_is_rejected_before_the_run(words, tmp_p
     def never(*_arguments, **_options):
         raise AssertionError("the run began")
 
-    monkeypatch.setattr(conformance_run, "_start", never)
+    monkeypatch.setattr(conformance_run, "_start_emulator", never)
     monkeypatch.setattr(session_run, "Bench", never)
     monkeypatch.chdir(tmp_path)
     outcome = run_command(*words, ".", "--start")

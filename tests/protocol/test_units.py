@@ -131,7 +131,7 @@ INVALID = [
     ("no number", telemetry('{ name = "a", type = "f32", unit = "px", value = "stars[n].x" }'), r"\[n\] is only allowed with count, repeat or last_id"),
     ("unit of measure", telemetry('{ name = "a", type = "f32", unit = "m", value = "rate.x" }'), "unit 'm', but quantity rate.x is in 'rad/s'; use one of 'rad/s', 'deg/s'"),
     ("names without numbers", telemetry('{ name = "a", type = "u8", value = "mode" }'), "quantity mode has named values: boot, standby.*assign numbers"),
-    ("name without a number", telemetry('{ name = "a", type = "u8", value = "mode", map = { "0" = "standby" } }'), "quantity mode may be boot, lost_in_space, tracking, error, which has no number"),
+    ("name without a number", telemetry('{ name = "a", type = "u8", value = "mode", map = { "0" = "standby" } }'), "quantity mode has no number for boot, lost_in_space, tracking, error"),
     ("float in bytes", telemetry('{ name = "a", type = "bytes", size = 4, value = "attitude.w" }'), "of type float, which a field of kind bytes cannot hold"),
     ("two sources", telemetry('{ name = "a", type = "f32", value = "attitude.w", const = 1 }'), "has value and const; keep one"),
     ("value without a name", telemetry('{ type = "f32", value = "attitude.w" }'), "needs a name"),

@@ -51,7 +51,7 @@ def link_parts(stack: ComposedStack) -> tuple[str, str, str]:
     )  # fmt: skip
     helpers = "\n\n".join((_OUTPUT, *functions))
     source = "\n".join(
-        (_part("composed_reply.c"), _snippet("framings", framing), _part("composed.c"), _RECEIVE)
+        (_template("composed_reply.c"), _snippet("framings", framing), _template("composed.c"), _RECEIVE)
     )
     constants = [
         text for name, text in writer.constants().items() if re.search(rf"\b{name}\b", helpers + source)
@@ -61,7 +61,7 @@ def link_parts(stack: ComposedStack) -> tuple[str, str, str]:
     def sized(text: str) -> str:
         return re.sub(r"@(\w+)@", lambda match: str(sizes[match[1]]), text)
 
-    return sized(_part("composed.h")), helpers, sized(f"{head}\0{source}")
+    return sized(_template("composed.h")), helpers, sized(f"{head}\0{source}")
 
 
 class _Writer:
@@ -295,13 +295,13 @@ def _bytes(data: bytes) -> str:
     return ", ".join(f"{byte:#04x}" for byte in data or b"\0")
 
 
-def _part(name: str) -> str:
+def _template(name: str) -> str:
     return (Path(__file__).parent / name).read_text(encoding="utf-8")
 
 
 def _snippet(name: str, kind: str) -> str:
     """Return the part of a file under a heading."""
-    found = re.search(rf"^// {kind}\n(.*?)(?=^// \w+$|\Z)", _part(f"{name}.c"), re.MULTILINE | re.DOTALL)
+    found = re.search(rf"^// {kind}\n(.*?)(?=^// \w+$|\Z)", _template(f"{name}.c"), re.MULTILINE | re.DOTALL)
     if found is None:
         raise IcdError(
             f"link.serial: {name} of kind {kind!r} is Python code in the unit's plugin and cannot be exported"

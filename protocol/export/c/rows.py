@@ -256,7 +256,7 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
         return
     if fields[0].width:
         bits = " | ".join(f"(uint64_t)values->{member_name(field)} << {field.shift}" for field in fields)
-        yield f"    {_put(slot, bits)}"
+        yield f"    {_put_statement(slot, bits)}"
         return
     (field,) = fields
     value = f"values->{member_name(field)}"
@@ -269,14 +269,14 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
         case "float":
             raw = _unscaled(field, value) if field.scaled else value
             convert = "float_bits((float)({}))" if field.type == "f32" else "double_bits({})"
-            yield f"    {_put(slot, convert.format(raw))}"
+            yield f"    {_put_statement(slot, convert.format(raw))}"
         case _ if field.scaled:
-            yield f"    (void){_to_raw(field, value)};\n    {_put(slot, 'raw')}"
+            yield f"    (void){_to_raw(field, value)};\n    {_put_statement(slot, 'raw')}"
         case _:
-            yield f"    {_put(slot, f'(uint64_t){value}')}"
+            yield f"    {_put_statement(slot, f'(uint64_t){value}')}"
 
 
-def _put(slot: Slot, value: str) -> str:
+def _put_statement(slot: Slot, value: str) -> str:
     return f"put_{_suffix(slot)}(data + {slot.offset}, {slot.size}u, {value});"
 
 

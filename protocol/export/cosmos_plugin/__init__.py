@@ -80,15 +80,13 @@ def answer_id(icd: InterfaceDefinition) -> int:
 
 
 def _protocol(icd: InterfaceDefinition, stack: SerialStack, name: str) -> str:
-    imports, _, protocol = _part("protocol.py.in").partition("class ")
+    imports, _, protocol = _template("protocol.py.in").partition("class ")
     constants = f"ID_BYTES = {key_bits(icd) // 8}\nANSWER = {answer_id(icd)}\n"
     if isinstance(stack, ComposedStack):
         link = link_text(stack)
     else:
         sizes = ", ".join(f"{row.id}: {row.size}" for row in icd.telemetry.values())
-        link = (
-            f"# Bytes of data of each telemetry row\nSIZES = {{{sizes}}}\n\n\n{_part('cubespace_link.py.in')}"
-        )
+        link = f"# Bytes of data of each telemetry row\nSIZES = {{{sizes}}}\n\n\n{_template('cubespace_link.py.in')}"
     return f"{imports}{constants}{link}\n\nclass " + protocol.replace("@CLASS@", _class_name(name))
 
 
@@ -97,7 +95,7 @@ def _class_name(name: str) -> str:
     return "".join(word.capitalize() for word in f"{name}_protocol".split("_"))
 
 
-def _part(name: str) -> str:
+def _template(name: str) -> str:
     return (Path(__file__).parent / name).read_text(encoding="utf-8")
 
 

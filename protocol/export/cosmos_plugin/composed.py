@@ -43,7 +43,7 @@ def link_text(stack: ComposedStack) -> str:
         **_framing(stack), **_check(stack), **_headers(stack), "ROWS": dict(_rows(stack)),
         "LONGEST": 2 * stack.max_size + 16,
     }  # fmt: skip
-    functions = (_snippet("checks", check.kind), _snippet("framings", kind), _part("composed_link"))
+    functions = (_snippet("checks", check.kind), _snippet("framings", kind), _template("composed_link"))
     used = {
         name: value
         for name, value in constants.items()
@@ -142,13 +142,13 @@ def _rows(stack: ComposedStack) -> Iterator[tuple[int, dict[str, Any]]]:
         )
 
 
-def _part(name: str) -> str:
+def _template(name: str) -> str:
     return (Path(__file__).parent / f"{name}.py.in").read_text(encoding="utf-8")
 
 
 def _snippet(name: str, kind: str) -> str:
     """Return the part of a file under a heading."""
-    found = re.search(rf"^# {kind}\n(.*?)(?=^# \w+$|\Z)", _part(name), re.MULTILINE | re.DOTALL)
+    found = re.search(rf"^# {kind}\n(.*?)(?=^# \w+$|\Z)", _template(name), re.MULTILINE | re.DOTALL)
     if found is None:
         raise IcdError(f"link.serial: {name} of kind {kind!r} cannot be exported")
     return found[1]

@@ -96,7 +96,7 @@ depend on every star. Up to three hardly affect the classic algorithms. (2) One 
 {unit:.4f} mag, which hardly affects algorithms that use positions. The papers have σ in *magnitudes*, with
 stars crossing the detection threshold: not the same quantity. (3) Pair distances alone (GV, IA and, to a
 lesser degree, PA and SGS) cease to be unique when the tolerance grows with the noise. How soon depends on the
-tolerance and the number of guide stars, which the thesis does not state. (4) Sizes and times: ours are for up
+tolerance and the number of guide stars, which the thesis does not state. (4) Sizes and times: here they are for up
 to {stars} faint stars and compiled code; the remark "12° sensor" gives the size for the sensor of most
 papers, 12° and stars to V 6. Times are wall time on the machine that made this report. (5) The papers' guide
 stars are evenly spread. On the flat sky their density falls with distance from its equator, so that PA has
@@ -161,10 +161,10 @@ def _lsi(
     from starid.thesis.features import extract_features
 
     lsi, sky = context.lost_in_space(0.995), context.sky()
-    brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
-    brightness, places, _ = add_noise(rng, brightness, places, noise, sky.half_width)
+    brightness, positions, _ = sky.stars_in_frame(ra % 360.0, dec)
+    brightness, positions, _ = add_noise(rng, brightness, positions, noise, sky.half_width)
     begin = time.perf_counter()
-    answer = lsi.solve(extract_features(brightness, places)).mse
+    answer = lsi.solve(extract_features(brightness, positions)).mse
     elapsed = 1e3 * (time.perf_counter() - begin)
     return _distance("flat", (answer.right_ascension_deg, answer.declination_deg), (ra, dec)), elapsed
 
@@ -192,7 +192,7 @@ def _solver(sky: ThesisSky, name: str) -> Any:
     return solver
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     sky, name = thesis_sky(part.values["sky"]), part.values["algorithm"]
     frames = centres(context.parameters["every"])
     solver = _solver(sky, name)
@@ -202,12 +202,12 @@ def _work(context: Context, part: Part) -> Results:
     for case in context.parameters["cases"] or _CASES:
         errors, times = _identify_frames(context, sky, name, solver, _noise(case), frames)
         results[f"f_{case}"], results[f"ms_{case}"] = errors, times
-    results["kb"] = np.array(_kilobytes(context, name, solver))
+    results["kb"] = np.array(_database_figures(context, name, solver))
     return results
 
 
-def _kilobytes(context: Context, name: str, solver: Any) -> tuple[float, float, float]:
-    """Size of the database, here and for the papers' sensor, kB, and build time of the latter, s; or NaN."""
+def _database_figures(context: Context, name: str, solver: Any) -> tuple[float, float, float]:
+    """Return the size of the database here and for the papers' sensor, kB, and its build time there, s; or NaN."""
     if name == "lsi":
         # five 8-bit features per cell; the coordinates follow from the number of the cell
         return 5e-3 * context.lost_in_space(0.995).database.cells, math.nan, math.nan
@@ -217,8 +217,8 @@ def _kilobytes(context: Context, name: str, solver: Any) -> tuple[float, float, 
     from starid.interface import make_identifier
 
     fov, pixels, limit = _SENSOR
-    usual: Any = make_identifier(name, Camera.from_fov(fov, pixels, pixels), limiting_magnitude=limit)
-    return 1e-3 * solver.database_bytes, 1e-3 * usual.database_bytes, usual.build_seconds
+    papers: Any = make_identifier(name, Camera.from_fov(fov, pixels, pixels), limiting_magnitude=limit)
+    return 1e-3 * solver.database_bytes, 1e-3 * papers.database_bytes, papers.build_seconds
 
 
 def _rate(results: Results, case: str) -> float:
@@ -258,8 +258,8 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         key = f"{first}-{name}"
         if key not in results:
             continue
-        here, usual, build = results[key]["kb"]
-        at_sensor = "" if math.isnan(usual) else f"12° sensor: {usual:.0f} kB, built in {build:.2f} s"
+        here, papers, build = results[key]["kb"]
+        at_sensor = "" if math.isnan(papers) else f"12° sensor: {papers:.0f} kB, built in {build:.2f} s"
         rows += [
             row(
                 f"{SHORT[name]}: database",
@@ -293,14 +293,14 @@ _FLOORS: Final = {
 
 def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
     files = []
-    axes_of = (
+    plots = (
         (9, "position", "σ of position noise / px"),
         (10, "brightness", "σ of brightness noise / intensity units"),
         (11, "false", "false stars"),
         (8, "missing", "missing stars"),
     )
     cases = context.parameters["cases"] or _CASES
-    for number, kind, label in axes_of:
+    for number, kind, label in plots:
         levels = [level for level in range(4) if (f"{kind}-{level}" if level else "none") in cases]
         if levels == [0]:
             continue
@@ -352,7 +352,7 @@ EXPERIMENTS: Final = (
         "classics",
         "The published algorithms on the thesis's frames: figures 6.9–6.11, table 6.2",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={
             "algorithms": [*CLASSICS, "lsi", "geometric"],
@@ -367,6 +367,6 @@ EXPERIMENTS: Final = (
             "every": 340,
         },
         alone=True,
-        turn=1,
+        start_order=1,
     ),
 )

@@ -68,12 +68,12 @@ class ThesisSky:
         self, rng: np.random.Generator, ra_deg: float, dec_deg: float, noise: NoiseModel
     ) -> tuple[Array, Array]:
         """Positions (n, 2), pixels, and fluxes (n,), 1 at magnitude 0, of a frame with north up."""
-        brightness, places, _ = self.frames.stars_in_frame(ra_deg % 360.0, dec_deg)
+        brightness, positions, _ = self.frames.stars_in_frame(ra_deg % 360.0, dec_deg)
         to_deg = PIXEL_DEG if self.name == "sphere" else 1.0
-        magnitudes, places, _ = add_noise(
-            rng, brightness, places * to_deg, noise, self.frames.half_width * to_deg
+        magnitudes, positions, _ = add_noise(
+            rng, brightness, positions * to_deg, noise, self.frames.half_width * to_deg
         )
-        return places / PIXEL_DEG + np.asarray(self.camera.centre_px), 10.0 ** (-0.4 * magnitudes)
+        return positions / PIXEL_DEG + np.asarray(self.camera.centre_px), 10.0 ** (-0.4 * magnitudes)
 
     def boresight_deg(self, attitude: Attitude) -> tuple[float, float]:
         """Right ascension and declination, degrees, for an attitude on this sky."""

@@ -65,7 +65,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return parts_of("p{percent:g}", percent=parameters["percent"])
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     from starid.thesis.database import DatabaseParameters, build_database
     from starid.thesis.database_file import save_database
     from starid.thesis.frame_grid import make_grid
@@ -166,7 +166,7 @@ EXPERIMENTS: Final = (
         "database-sizes",
         "Overlap, number of frames, sizes: eqs 2.23–2.27, section 6.1.1, table 6.1",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"percent": _PERCENT, "build": True},
         quick={"percent": _PERCENT, "build": False},

@@ -133,7 +133,7 @@ class Experiment:
         Name on the command line, and heading in the report.
     parts
         Function that lists the parts for given parameters.
-    work
+    compute
         Function that computes a part, in a separate process; it must be defined at module level.
     evaluate
         Function that makes tables, figures and rows from the results of all parts, by key.
@@ -141,7 +141,7 @@ class Experiment:
         Parameters of the full run and of the quick one; None leaves the experiment out of the quick run.
     alone
         The experiment measures time: in the full run nothing else runs at the same time.
-    turn
+    start_order
         Experiments with smaller numbers start first. These are experiments that compile different kernels
         which others need: two processes that work on the same experiment compile everything twice.
     revision
@@ -151,12 +151,12 @@ class Experiment:
     name: str
     title: str
     parts: Callable[[Parameters], Sequence[Part]]
-    work: Callable[[Context, Part], Results]
+    compute: Callable[[Context, Part], Results]
     evaluate: Callable[[Context, Mapping[str, Results]], Outcome]
     full: Parameters
     quick: Parameters | None
     alone: bool = False
-    turn: int = 2
+    start_order: int = 2
     revision: int = 1
 
     def fingerprint(self, parameters: Parameters, seed: int, part: Part | None = None) -> str:

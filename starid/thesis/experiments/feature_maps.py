@@ -71,7 +71,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     ]
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     del context
     step = FRAME_DEG * (1.0 - part.values["percent"] / 100.0)
     ra = np.arange(0.0, 360.0, step)
@@ -91,12 +91,12 @@ def _maps(context: Context, result: Results) -> list[str]:
     files = []
     shape = (result["dec"].size, result["ra"].size)
     for i, name in enumerate(_COLUMNS):
-        number, words, symbol = _MAPS[name]
+        number, quantity, symbol = _MAPS[name]
         fig, axis = figure(width=7.0, height=3.6)
         options: dict[str, Any] = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}
         values = result["features"][:, i].reshape(shape)
         image = axis.pcolormesh(result["ra"], result["dec"], values, shading="nearest", **options)
-        fig.colorbar(image, ax=axis, label=f"{words} {symbol}")
+        fig.colorbar(image, ax=axis, label=f"{quantity} {symbol}")
         axis.grid(visible=False)
         axis.set(xlabel="α of the centre / °", ylabel="δ of the centre / °", xlim=(0, 360), ylim=(-90, 90))
         axis.set_xticks(range(0, 361, 60))
@@ -214,7 +214,7 @@ EXPERIMENTS: Final = (
         "feature-maps",
         "Features over the sky: figures 2.3–2.12",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full=_FULL,
         quick=_FULL,

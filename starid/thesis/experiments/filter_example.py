@@ -94,7 +94,7 @@ def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[Array, Mask
     return found, labels == main_cluster(labels)
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     before, now = _frames(context.rng(part.key))
     found: Results = {}
     for name, frames in (("exact", (before, now)), ("pixels", (_to_pixels(before), _to_pixels(now)))):
@@ -111,11 +111,11 @@ def _work(context: Context, part: Part) -> Results:
 
 def _cluster_figure(context: Context, result: Results) -> str:
     fig, axes = figure(1, 2, width=10.0, height=4.4, subplot_kw={"projection": "3d"})
-    for axis, (name, words) in zip(axes, (("exact", "exact"), ("pixels", "to whole pixels")), strict=True):
+    for axis, (name, title) in zip(axes, (("exact", "exact"), ("pixels", "to whole pixels")), strict=True):
         points, chosen = result[f"disparities_{name}"], result[f"chosen_{name}"]
         axis.scatter(*points[~chosen].T, s=4, c="C0", alpha=0.4, label="outliers")
         axis.scatter(*points[chosen].T, s=14, c="gold", edgecolors="black", lw=0.3, label="the cluster")
-        axis.set(xlabel="ΔA / mag", ylabel="Δd / °", zlabel="Δm / °", title=words)
+        axis.set(xlabel="ΔA / mag", ylabel="Δd / °", zlabel="Δm / °", title=title)
         axis.legend()
     fig.suptitle("Figure 3.2: 441 disparities and the cluster of the true pairs")
     return save(fig, context.folder / "figure_3_2.png")
@@ -193,11 +193,11 @@ def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
             target="1 to 6, not 7",
         ),
     ]
-    for name, words in (("exact", "exact places"), ("pixels", "places to whole pixels")):
+    for name, label in (("exact", "exact places"), ("pixels", "places to whole pixels")):
         turns = np.abs(result[f"disparities_{name}"][result[f"chosen_{name}"], 2])
         rows.append(
             shown(
-                f"section 6.2.1: turns γ̃ of the cluster's pairs, {words}",
+                f"section 6.2.1: turns γ̃ of the cluster's pairs, {label}",
                 published=f"{_INTERVAL[0]}° … {_INTERVAL[1]}°",
                 printed=f"{turns.min():.2f}° … {turns.max():.2f}°",
                 ours=f"{abs(float(result[f'turn_{name}'])):.3f}°",
@@ -216,10 +216,10 @@ EXPERIMENTS: Final = (
         "filter-example",
         "The filter by example: figures 3.2, 5.3, 5.4",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={},
         quick={},
-        turn=0,
+        start_order=0,
     ),
 )

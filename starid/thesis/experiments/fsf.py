@@ -71,9 +71,9 @@ _NAMED: Final = (
 def first_frame() -> tuple[Any, Any]:
     """Magnitudes (7,) and offsets (7, 2), degrees, of the published stars: Hp < 3 in the square."""
     catalog = star_catalog()
-    places = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad])) - _CORNER - RADIUS_DEG
-    chosen = (catalog.hp < _BRIGHTEST) & np.all(np.abs(places) <= RADIUS_DEG, axis=1)
-    return catalog.hp[chosen].copy(), places[chosen]
+    positions = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad])) - _CORNER - RADIUS_DEG
+    chosen = (catalog.hp < _BRIGHTEST) & np.all(np.abs(positions) <= RADIUS_DEG, axis=1)
+    return catalog.hp[chosen].copy(), positions[chosen]
 
 
 def frames_of_seven(
@@ -120,7 +120,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     )
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     kind, false_stars, scale = part.values["kind"], part.values["false_stars"], part.values["scale"]
     count = int(context.parameters["frames"])
     counts = {name: np.zeros((len(FACTORS), 4), dtype=np.int64) for name in _FILTERS}
@@ -234,8 +234,8 @@ def _trials(ours: Any, published: Sequence[int], indicator: str) -> int:
 
 def _matrix(context: Context, results: Mapping[str, Results], scale: float, indicator: str) -> str:
     """Tabulate our and the published indicator: a line for each table A.1–A.18, a column for each μ."""
-    words = "noise as printed" if scale == 1.0 else f"noise × {scale:g}"
-    head = f"{indicator} / %, {words}: published / in the cluster / matched"
+    noise_label = "noise as printed" if scale == 1.0 else f"noise × {scale:g}"
+    head = f"{indicator} / %, {noise_label}: published / in the cluster / matched"
     lines = [
         "| " + " | ".join((head, *(f"μ = {factor}" for factor in FACTORS))) + " |",
         "|---" + "|---:" * len(FACTORS) + "|",
@@ -399,7 +399,7 @@ EXPERIMENTS: Final = (
         "fsf-confusion",
         "False-star filter and camera motion: figures 6.14–6.19, tables A.1–A.18",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={
             "kinds": list(KINDS),

@@ -37,7 +37,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return parts_of("m{factor}-x{scale:g}", scale=parameters["scales"], factor=parameters["factors"])
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     noise = noise_of("both", part.values["factor"] * part.values["scale"], 0)
     whole, frames = frames_of_seven(context.rng(part.key), noise, int(context.parameters["frames"]))
     first = pairs_of(whole.observed)
@@ -82,7 +82,7 @@ EXPERIMENTS: Final = (
         "fsf-limits",
         "What noise leaves of the cluster: the recall of the filter",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"scales": [1.0, EQUIVALENT], "factors": [1, 2, 3, 4, 5], "frames": 1500},
         quick=None,

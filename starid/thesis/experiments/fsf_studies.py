@@ -315,14 +315,14 @@ def _evaluate_crowd(context: Context, results: Mapping[str, Results]) -> Outcome
     for part in _crowd_parts(context.parameters):
         c = Confusion(*results[part.key]["counts"].tolist())
         true = part.values["true_stars"]
-        words = f"{true} true and {true // 3} {part.values['kind']} false stars"
+        label = f"{true} true and {true // 3} {part.values['kind']} false stars"
         rows += [
-            row(f"scalable filter, {name}, {words}", ours=c.percent(name), unit="%", at_least=least)
+            row(f"scalable filter, {name}, {label}", ours=c.percent(name), unit="%", at_least=least)
             for name, least in (("recall", 99.0), ("precision", 99.5))
         ]
         rows.append(
             row(
-                f"scalable filter, time a frame, {words}",
+                f"scalable filter, time a frame, {label}",
                 ours=float(np.percentile(results[part.key]["ms"], 10.0)),
                 unit="ms",
                 at_most=5.0 if true == 150 and not context.quick else None,

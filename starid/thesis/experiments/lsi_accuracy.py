@@ -77,7 +77,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     ]
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     values = part.values
     rng = context.rng(str(values["grid"]), str(values["percent"]))
     return solve_frames(
@@ -212,12 +212,12 @@ def _on_grid_rows(result: Results) -> list[Row]:
         *(
             shown(
                 f"{where}: share with ε_θ ≤ {limit:g}°",
-                published=words,
+                published=text,
                 **shares(result, limit, "theta"),
                 unit="%",
                 remark="Published as a curve; here the mean of the angle is circular.",
             )
-            for limit, words in ((0.2, "hardly over 60 %"), (1.0, "nearly 70 %"))
+            for limit, text in ((0.2, "hardly over 60 %"), (1.0, "nearly 70 %"))
         ),
     ]
 
@@ -396,7 +396,7 @@ EXPERIMENTS: Final = (
         "lsi-accuracy",
         "LSI without noise: figures 6.1–6.5",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={
             "percent": [96.0, 97.0, 98.0, 99.0, 99.1, 99.2, 99.3, 99.4, 99.5, 99.6],

@@ -105,7 +105,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return [part for part in parts if not wanted or part.key.rpartition("-")[0] in wanted]
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     values = part.values
     kind, level = values.get("kind"), values.get("level", 0.0)
 
@@ -368,7 +368,7 @@ EXPERIMENTS: Final = (
         "lsi-noise",
         "LSI with noise, false and missing stars: figures 6.6–6.11, 6.20–6.30, B, C",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"cases": [], "every": 1},
         quick={

@@ -35,13 +35,13 @@ def _logarithm(errors: Array) -> Array:
 
 def _patterns(context: Context, results: Mapping[str, Results], grid: str) -> str:
     fig, axes = figure(len(_CASES), 2, width=9.5, height=15.0, sharex=True)
-    for i, (case, words) in enumerate(_CASES.items()):
+    for i, (case, title) in enumerate(_CASES.items()):
         result = results[f"{case}-{grid}"]
         trials = np.arange(_TRIALS.start + 1, _TRIALS.stop + 1)
         for j, (name, symbol) in enumerate((("f_author_mse", "ε_f / °"), ("theta_author_mse", "ε_θ / °"))):
             axes[i, j].plot(trials, _logarithm(result[name][_TRIALS]), "r-", label=symbol)
             axes[i, j].plot(trials, _logarithm(result["psi_author"][_TRIALS]), "b--", label="ε_ψ")
-            axes[i, j].set_title(words)
+            axes[i, j].set_title(title)
             axes[i, j].set_ylabel("1 + log₁₀ ε")
     for j in range(2):
         axes[0, j].legend(loc="upper right")
@@ -67,7 +67,7 @@ def _thresholds(context: Context, results: Mapping[str, Results], quantity: str)
     columns: dict[str, Any] = {"threshold_psi": thresholds}
     symbol = "ε_f" if quantity == "f" else "ε_θ"
     fig, axes = figure(3, 4, width=12.0, height=8.5, sharex=True)
-    for i, (group, words) in enumerate(_GROUPS):
+    for i, (group, title) in enumerate(_GROUPS):
         keys = ["none", *(case for case in _CASES if case.startswith(group))]
         for g, grid in enumerate((ON, OFF)):
             for case, colour in zip(keys, ["black", *colours(3)], strict=True):
@@ -76,7 +76,7 @@ def _thresholds(context: Context, results: Mapping[str, Results], quantity: str)
                 for k, (values, name) in enumerate(zip(pair, ("mean", "deviation"), strict=True)):
                     axis = axes[i, 2 * g + k]
                     axis.plot(thresholds, values, color=colour, label=_CASES[case])
-                    axis.set_title(f"{words}, {GRID_LABELS[grid]}")
+                    axis.set_title(f"{title}, {GRID_LABELS[grid]}")
                     axis.set_ylabel(f"{name} of {symbol} / °")
                     columns[f"{case}_{grid}_{name}_deg"] = values
         axes[i, 0].legend()

@@ -67,7 +67,7 @@ def _milliseconds(count: int, work: Callable[[int], object]) -> Array:
     return best
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     from starid.thesis.features import extract_features
     from starid.thesis.lasso import LAMBDAS, choose_lambdas, lasso_path
     from starid.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work
@@ -79,7 +79,7 @@ def _work(context: Context, part: Part) -> Results:
     step = lsi.database.grid.step_deg
     frames = frames_under_test(context.rng(part.key), part.values["grid"], step, context.parameters["every"])
     stars = [sky.stars_in_frame(ra % 360.0, dec)[:2] for ra, dec in frames]
-    features = [extract_features(brightness, places) for brightness, places in stars]
+    features = [extract_features(brightness, positions) for brightness, positions in stars]
     observations = [lsi.database.normalise(vector) for vector in features]
     nearest = [lsi.nearest(observation)[0] for observation in observations]
     dictionaries = [
@@ -174,7 +174,7 @@ EXPERIMENTS: Final = (
         "lsi-run-time",
         "Run time of LSI by stage: table 6.1; table 6.2",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"percent": list(_PUBLISHED), "every": 9, "checked": True},
         quick={"percent": [96.0, 99.5], "every": 27, "checked": False},

@@ -53,10 +53,10 @@ def centres(every: int = 1) -> Array:
 
 def frames_under_test(rng: np.random.Generator, grid: str, step_deg: float, every: int) -> Array:
     """Centres of the test frames; with `grid` "off", each moved by a random fraction of the grid step."""
-    places = centres(every)
+    positions = centres(every)
     if grid == OFF:
-        places = places + step_deg * rng.uniform(0.0, 1.0, places.shape)
-    return places
+        positions = positions + step_deg * rng.uniform(0.0, 1.0, positions.shape)
+    return positions
 
 
 def solve_frames(
@@ -115,12 +115,12 @@ def solve_frames(
     angles = np.empty((len(names), len(frames)))
     psi = np.empty((3, len(frames)))
     for i, (ra, dec) in enumerate(frames):
-        brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
+        brightness, positions, _ = sky.stars_in_frame(ra % 360.0, dec)
         if noise is not None:
-            brightness, places, _ = add_noise(rng, brightness, places, noise(rng), sky.half_width)
+            brightness, positions, _ = add_noise(rng, brightness, positions, noise(rng), sky.half_width)
         if roll_deg != 0.0:
-            places = turned(places, roll_deg)
-        features = extract_features(brightness, places)
+            positions = turned(positions, roll_deg)
+        features = extract_features(brightness, positions)
         solution = lsi.solve(features)
         other = author.estimate(solution.observation, solution.nearest, solution.distance)
         better = fine.solve(features)
@@ -130,7 +130,7 @@ def solve_frames(
             better,
         ]
         if compares:
-            estimates.append(compared.solve(features, places))
+            estimates.append(compared.solve(features, positions))
         for j, estimate in enumerate(estimates):
             answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
             turn = features.theta_rad - estimate.theta_rad

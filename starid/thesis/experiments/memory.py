@@ -36,7 +36,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return parts_of("p{percent:g}", percent=parameters["percent"])
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     overlap = part.values["percent"] / 100.0
     context.database(overlap)
     command = [sys.executable, "-m", _PROBE, str(context.database_file(overlap))]
@@ -75,7 +75,7 @@ EXPERIMENTS: Final = (
         "memory",
         "Memory of the process at run time",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"percent": [99.5, 99.75]},
         quick=None,

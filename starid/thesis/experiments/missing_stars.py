@@ -70,20 +70,22 @@ def _divided() -> DividedField:
     return DividedField(LostInSpace(database), half_width_deg=_HALF_WIDTH_DEG)
 
 
-def _spoiled(rng: np.random.Generator, case: str, brightness: Array, places: Array) -> ObservedFrame:
+def _with_changed_stars(
+    rng: np.random.Generator, case: str, brightness: Array, positions: Array
+) -> ObservedFrame:
     """Remove stars from a frame, or add false ones, as a case says."""
     if case == "covered":
-        seen = places[:, 0] < _COVERED_FROM_DEG
-        return ObservedFrame(brightness[seen], places[seen])
+        seen = positions[:, 0] < _COVERED_FROM_DEG
+        return ObservedFrame(brightness[seen], positions[seen])
     kind, _, count = case.partition("-")
     noise = NoiseModel(
         missing_stars=int(count) if kind == "missing" else 0, false_stars=int(count) if kind == "false" else 0
     )
-    mags, positions, _ = add_noise(rng, brightness, places, noise, _HALF_WIDTH_DEG)
-    return ObservedFrame(mags, positions)
+    mags, noisy, _ = add_noise(rng, brightness, positions, noise, _HALF_WIDTH_DEG)
+    return ObservedFrame(mags, noisy)
 
 
-def _case(context: Context, part: Part) -> Results:
+def _boresight_errors(context: Context, part: Part) -> Results:
     """ε_f (2, n) of the whole and of the divided field; NaN for no answer."""
     lsi, divided, sky = context.lost_in_space(_OVERLAP), _divided(), context.sky()
     rng = context.rng(part.key)
@@ -92,8 +94,8 @@ def _case(context: Context, part: Part) -> Results:
     )
     errors = np.full((2, len(frames)), np.nan)
     for i, (ra, dec) in enumerate(frames):
-        brightness, places, _ = sky.stars_in_frame(ra % 360.0, dec)
-        frame = _spoiled(rng, part.values["case"], brightness, places)
+        brightness, positions, _ = sky.stars_in_frame(ra % 360.0, dec)
+        frame = _with_changed_stars(rng, part.values["case"], brightness, positions)
         if len(frame) == 0:
             continue
         whole = lsi.solve(extract_features(frame.brightness, frame.positions)).mse
@@ -156,8 +158,8 @@ def _put_back(context: Context) -> Results:
     return {"errors": errors}
 
 
-def _work(context: Context, part: Part) -> Results:
-    return _put_back(context) if part.key == "put-back" else _case(context, part)
+def _compute(context: Context, part: Part) -> Results:
+    return _put_back(context) if part.key == "put-back" else _boresight_errors(context, part)
 
 
 def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
@@ -170,10 +172,10 @@ def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
             within = {f"within_{limit:g}": share(one, limit) for limit in (0.3, 1.0)}
             lost = 100.0 * float(np.mean(np.isnan(one)))
             lines.append({"case": part.key, "method": name, **within, "no_answer": lost})
-        words = _LABELS.get(part.key, "one star missing, put back from the frame before")
+        label = _LABELS.get(part.key, "one star missing, put back from the frame before")
         rows.append(
             row(
-                f"{words}, off the grid: share with ε_f ≤ 1°",
+                f"{label}, off the grid: share with ε_f ≤ 1°",
                 ours=share(errors[1], 1.0),
                 unit="%",
                 passed=share(errors[1], 1.0) > share(errors[0], 1.0)
@@ -185,7 +187,7 @@ def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
         )
         rows.append(
             shown(
-                f"{words}: share with ε_f ≤ 0.3°",
+                f"{label}: share with ε_f ≤ 0.3°",
                 printed=share(errors[0], 0.3),
                 ours=share(errors[1], 0.3),
                 unit="%",
@@ -199,7 +201,7 @@ EXPERIMENTS: Final = (
         "missing-stars",
         "Missing stars and a covered field: what section 7.2 asks for (ours)",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"cases": list(_CASES), "every": 4, "frames": 120},
         quick={"cases": ["missing-1", "covered"], "every": 40, "frames": 8},

@@ -33,7 +33,7 @@ def _settings(values: Mapping[str, Any]) -> RsiSettings:
     return settings
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     v = part.values
     lsi = context.lost_in_space(v["overlap"])
     noise = NoiseModel.factor(v["factor"] * v["scale"], v["false_stars"])
@@ -98,7 +98,7 @@ EXPERIMENTS: Final = (
         "rsi",
         "Recursive identification with the scalable filter (ours): figures 6.33–6.43, E, F, G, tables 6.6–6.9",
         rsi_parts,
-        _work,
+        _compute,
         _evaluate,
         full={
             "overlaps": [0.995, 0.9975],

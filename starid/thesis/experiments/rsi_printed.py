@@ -149,7 +149,7 @@ def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]
     return found
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     if "overlap" in part.values:
         return _clean(context, part)
     m, author = part.values["factor"], part.values["reading"] == "author"
@@ -325,7 +325,7 @@ EXPERIMENTS: Final = (
         "rsi-as-printed",
         "Recursive identification with the thesis's own filter: tables 6.7, 6.8, H.1, H.2",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={
             "clean": [0.995, 0.9975],

@@ -94,7 +94,7 @@ def _processor_time() -> float:
 def _run_part(plan: _Plan, part: Part) -> tuple[str, float]:
     """Compute and store a part; return the name of the experiment and the processor time, seconds."""
     start = _processor_time()
-    results = plan.experiment.work(plan.context, part)
+    results = plan.experiment.compute(plan.context, part)
     seconds = _processor_time() - start
 
     write_results(plan.file(part), {**results, "seconds_": np.array(seconds)})
@@ -207,7 +207,7 @@ def run(
         if missing[plan.experiment.name] == 0:
             end(plan)
     by_name = {plan.experiment.name: plan for plan in open_plans}
-    todo.sort(key=lambda task: task[0].experiment.turn)
+    todo.sort(key=lambda task: task[0].experiment.start_order)
     for alone in (False, True):
         tasks = [(plan, part) for plan, part in todo if plan.alone == alone]
         work = (delayed(_run_part)(plan, part) for plan, part in tasks)

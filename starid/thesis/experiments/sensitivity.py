@@ -134,7 +134,7 @@ def _filter(context: Context, epsilon: float, part: float) -> Results:
     return {"indicators": np.array([total.precision, total.recall, total.accuracy])}
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     v = part.values
     if "kappa" in v:
         return _kappa(context, float(v["kappa"]))
@@ -231,7 +231,7 @@ EXPERIMENTS: Final = (
         "sensitivity",
         "Sensitivity to κ, λ, Γ_min, K, ε and min_samples: what chapter 7 asks for",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={
             "kappa": [10.0, 10.5, 11.0, 11.5, 12.0],

@@ -1,4 +1,4 @@
-"""Beyond the thesis: LSI and RSI on the sphere, with random attitudes, on what a real sensor sees."""
+"""Beyond the thesis: LSI and RSI on the sphere, with random attitudes and the stars of a real sensor."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def _identifier(name: str) -> Any:
 def points(
     rng: np.random.Generator, camera: Any, catalog: Any, attitude: Attitude, noise: Mapping[str, Any]
 ) -> tuple[Any, Any]:
-    """Positions and fluxes of the stars that a sensor sees to 6 mag, with noise and false stars."""
+    """Return positions and fluxes of the detected stars, to 6 mag, with noise and false stars."""
     stars = catalog.brighter_than(_LIMIT + 0.8)
     xy, inside = camera.project(attitude.to_sensor(stars.vectors))
     magnitude = stars.v + rng.normal(0.0, 1.0, len(stars)) * noise["magnitude"]
@@ -72,14 +72,14 @@ def _parts(parameters: Parameters) -> list[Part]:
     ]
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     identifier = _identifier(part.values["algorithm"])
     recursive = part.values["algorithm"] == "rsi"
     rng = context.rng(part.key)
     count = int(context.parameters["frames"])
     numbers = np.full((count, len(_COLUMNS)), np.nan)
     attitude = random_attitude(rng)
-    # this process may have used it for other parts
+    # this process may have used the identifier for other parts
     identifier.reset()
     predicted: Attitude | None = None
     for i in range(count):
@@ -115,13 +115,13 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
     rows = []
     for part in _parts(context.parameters):
         found = dict(zip(_COLUMNS, results[part.key]["numbers"].T, strict=True))
-        name, words = part.values["algorithm"].upper(), _label(part.values["noise"])
+        name, label = part.values["algorithm"].upper(), _label(part.values["noise"])
         valid = found["valid"] > 0.0
         errors = found["cross_arcsec"][valid]
         if name == "LSI":
             rows += [
                 row(
-                    f"one neighbour and LASSO, boresight within {limit:g}°, {words}",
+                    f"one neighbour and LASSO, boresight within {limit:g}°, {label}",
                     ours=share(found["coarse_deg"], limit),
                     unit="%",
                     digits=1,
@@ -130,7 +130,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             ]
         rows.append(
             row(
-                f"{name} verified and valid, {words}",
+                f"{name} verified and valid, {label}",
                 ours=100.0 * float(valid.mean()),
                 unit="%",
                 digits=1,
@@ -138,16 +138,16 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             )
         )
         wrong = float(np.count_nonzero(errors > _WRONG_ARCSEC))
-        rows.append(row(f"{name} valid but wrong, {words}", ours=wrong, digits=0, at_most=0.0))
+        rows.append(row(f"{name} valid but wrong, {label}", ours=wrong, digits=0, at_most=0.0))
         if valid.any():
             middle = float(np.median(errors))
-            rows.append(row(f"{name} median cross-boresight error, {words}", ours=middle, unit="″"))
+            rows.append(row(f"{name} median cross-boresight error, {label}", ours=middle, unit="″"))
         rows.append(
-            row(f"{name} median time a frame, {words}", ours=float(np.median(found["ms"])), unit="ms")
+            row(f"{name} median time a frame, {label}", ours=float(np.median(found["ms"])), unit="ms")
         )
         if name == "RSI":
             inside = 100.0 * float(found["tracking"][1:].mean())
-            rows.append(row(f"RSI answered from the region, {words}", ours=inside, unit="%", digits=1))
+            rows.append(row(f"RSI answered from the region, {label}", ours=inside, unit="%", digits=1))
     return rows
 
 
@@ -156,7 +156,7 @@ frame from a random attitude (RSI); positions and fluxes, without images. The fe
 mag in the inscribed circle; there are 234 095 cells, 0.42° apart over the whole sphere. The thesis's own
 answer, from one nearest neighbour and LASSO, is right in few frames: noise of 0.1 mag already carries several
 stars across the brightness limit, and each changes all five features. The features are still useful to order
-the cells: for the best candidates the stars themselves vote for a roll and are paired, and the attitude is
+the cells: for each of the best candidates, the stars vote for a roll and are paired, and the attitude is
 verified. An attitude that is not verified is invalid; none may be wrong."""
 
 
@@ -187,7 +187,7 @@ EXPERIMENTS: Final = (
         "spherical",
         "LSI and RSI on the sphere, on what a real sensor sees",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"noises": _NOISES, "frames": 1000},
         quick={"noises": _NOISES[1:2], "frames": 60},

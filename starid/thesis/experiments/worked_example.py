@@ -124,7 +124,7 @@ def _author(context: Context) -> Results:
     return {f"author_{name}": value for name, value in results.items()}
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     from starid.thesis.subcell import SubcellSearch
 
     lsi = context.lost_in_space(part.values["percent"] / 100.0)
@@ -341,11 +341,11 @@ EXPERIMENTS: Final = (
         "worked-example",
         "The worked example of section 5.1",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"percent": 96.0},
         quick={"percent": 96.0},
-        turn=0,
+        start_order=0,
         revision=4,
     ),
 )

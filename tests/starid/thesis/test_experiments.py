@@ -42,7 +42,7 @@ def _parts(parameters: Parameters) -> list[Part]:
     return [Part(f"part{i}", {"number": i}) for i in parameters["numbers"]]
 
 
-def _work(context: Context, part: Part) -> Results:
+def _compute(context: Context, part: Part) -> Results:
     calls = context.folder.parent / "calls.txt"
     calls.parent.mkdir(parents=True, exist_ok=True)
     with calls.open("a") as stream:
@@ -68,7 +68,7 @@ def _experiment(name: str = "toy", least: float = -1e9) -> Experiment:
         name,
         "A toy",
         _parts,
-        _work,
+        _compute,
         _evaluate,
         full={"numbers": [1, 2, 3], "least": least},
         quick={"numbers": [1], "least": least},
@@ -90,7 +90,7 @@ def test_a_finished_experiment_is_not_run_again(tmp_path):
 
 
 def test_experiments_start_by_turn_and_are_reported_in_order(tmp_path):
-    late, early = _experiment("late"), dataclasses.replace(_experiment("early"), turn=0)
+    late, early = _experiment("late"), dataclasses.replace(_experiment("early"), start_order=0)
     ended = runner.run([late, early], tmp_path, quick=True, jobs=1)
     assert _calls(tmp_path) == ["early part1", "late part1"]
     assert [result.experiment.name for result in ended] == ["late", "early"]
@@ -111,10 +111,10 @@ def test_a_run_resumes_where_it_was_interrupted(tmp_path):
     def interrupted(context: Context, part: Part) -> Results:
         if part.key == "part3":
             raise KeyboardInterrupt
-        return _work(context, part)
+        return _compute(context, part)
 
     with pytest.raises(KeyboardInterrupt):
-        runner.run([dataclasses.replace(_experiment(), work=interrupted)], tmp_path / "cut", jobs=1)
+        runner.run([dataclasses.replace(_experiment(), compute=interrupted)], tmp_path / "cut", jobs=1)
     assert len(_calls(tmp_path / "cut")) == 2
     resumed = runner.run([_experiment()], tmp_path / "cut", jobs=1)[0]
     assert (resumed.parts, resumed.outcome) == (1, whole)
@@ -176,7 +176,7 @@ def test_parts_on_the_sphere_do_not_depend_on_the_process_s_history(tmp_path):
     parts = {part.key: part for part in spherical.parts(parameters)}
 
     def numbers(key: str) -> np.ndarray:
-        return np.delete(spherical.work(context, parts[key])["numbers"], TIME_COLUMN, axis=1)
+        return np.delete(spherical.compute(context, parts[key])["numbers"], TIME_COLUMN, axis=1)
 
     first = numbers("lsi-1")
     numbers("lsi-2")
