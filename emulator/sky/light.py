@@ -12,15 +12,18 @@ import numpy.typing as npt
 
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.field import disc_in_field
-from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, fill, interpolated
+from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Sensitivity, expand, fill
 from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.jit import compiled_ieee
+from starid.jit import compiled_ieee, inner
 
 Glare: TypeAlias = tuple[npt.NDArray[np.float32], float, float, bool]
 """Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""
+
+Line: TypeAlias = npt.NDArray[np.float32]
+Mask: TypeAlias = npt.NDArray[np.bool_]
 
 Box: TypeAlias = tuple[slice, slice]
 """Rows and columns of part of an image."""
@@ -75,14 +78,38 @@ class Patch:
 
     def cover(self, mean: Image, backdrop: Backdrop) -> None:
         """Put it in front of the mean electrons (h, w), in place."""
-        sensed = backdrop.sensitivity[self.box] * np.float32(backdrop.unit * backdrop.exposure_s)
-        behind, sky = mean[self.box], sensed * np.float32(backdrop.sky_e_s)
-        if self.hides_glare:
-            dark = backdrop.still[self.box] - sky
-            seen = dark + (behind - dark) * self.passed
-        else:
-            seen = behind - sky * (1.0 - self.passed)
-        np.maximum(seen + sensed * self.light, 0.0, out=mean[self.box])
+        corner = self.box[0].start, self.box[1].start
+        light = backdrop.unit * backdrop.exposure_s, backdrop.sky_e_s
+        planes = mean, backdrop.still, backdrop.sensitivity
+        _cover(planes, self.light, self.passed, corner, light, self.hides_glare)
+
+
+@dataclass(frozen=True)
+class NearGlare:
+    """Glare around a source, where interpolation on the grid is too coarse.
+
+    Attributes
+    ----------
+    box : (slice, slice)
+        Rows and columns of the image, from points of the grid.
+    source : Glare
+        The source.
+    directions, grid_directions : ndarray (3, …), float32
+        Of all pixels, and of the points of the grid.
+    """
+
+    box: Box
+    source: Glare
+    directions: Image
+    grid_directions: Image
+
+    def refine(self, mean: Image, backdrop: Backdrop) -> None:
+        """Replace the interpolated glare in the mean electrons (h, w) by that of each pixel, in place."""
+        rows, columns = self.box
+        spans = (rows.start, rows.stop, columns.start, columns.stop)
+        exposure_s = backdrop.unit * backdrop.exposure_s
+        directions = self.directions, self.grid_directions
+        _refine_glare(mean, backdrop.sensitivity, directions, spans, self.source, exposure_s)
 
 
 @dataclass(frozen=True)
@@ -95,6 +122,8 @@ class AreaLight:
         Width and height of the image, pixels.
     glare : ndarray (gh, gw), float32, or None
         Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row.
+    near : tuple of NearGlare
+        What is not smooth of that light.
     earth : WideEarth or None
         An Earth in front of `glare`, sky and the patches before the last `in_front`.
     behind, in_front : tuple of Patch
@@ -105,6 +134,7 @@ class AreaLight:
 
     size: tuple[int, int]
     glare: Image | None = None
+    near: tuple[NearGlare, ...] = ()
     earth: WideEarth | None = None
     behind: tuple[Patch, ...] = ()
     in_front: tuple[Patch, ...] = ()
@@ -149,6 +179,8 @@ class AreaLight:
             exposure_s = backdrop.unit * backdrop.exposure_s
             smooth = none if glare is None else glare
             fill(mean, backdrop.still, backdrop.sensitivity, smooth, hidden, exposure_s)
+        for source in self.near:
+            source.refine(mean, backdrop)
         for layer in self._layers:
             layer.cover(mean, backdrop)
 
@@ -194,24 +226,133 @@ def _off_axis_deg(attitude: Attitude, body: SunGlare | Moon | EarthLimb) -> floa
 
 
 @compiled_ieee
-def _add_glare(
-    image: Image,
-    directions: Image,
-    source: npt.NDArray[np.float32],
-    strength: float,
-    soft2: float,
-    cube: bool,
+def _cover(
+    planes: tuple[Image, Image, Sensitivity],
+    light: Image,
+    passed: Image,
+    corner: tuple[int, int],
+    units: tuple[float, float],
+    hides_glare: bool,
 ) -> None:
-    """Add strength/(chord² + soft²), or its power 3/2, over the angle (as chord) between pixels and a source."""
-    a, b, c = source[0], source[1], source[2]
+    """As `Patch.cover`, with the planes of the image, the corner of the box, exposure at sensitivity 1, and sky."""
+    unit, sky_e_s = np.float32(units[0]), np.float32(units[1])
+    zero, one = np.float32(0.0), np.float32(1.0)
+    columns = slice(corner[1], corner[1] + light.shape[1])
+    for y in range(light.shape[0]):
+        to, base, gain = (
+            planes[0][corner[0] + y, columns],
+            planes[1][corner[0] + y, columns],
+            planes[2][corner[0] + y, columns],
+        )
+        for x in range(to.size):
+            sensed = np.float32(gain[x]) * unit
+            sky = sensed * sky_e_s
+            dark = base[x] - sky
+            through = (
+                dark + (to[x] - dark) * passed[y, x] if hides_glare else to[x] - sky * (one - passed[y, x])
+            )
+            to[x] = max(through + sensed * light[y, x], zero)
+
+
+@inner
+def _shine(row: Line, directions: tuple[Line, Line, Line], source: Glare) -> None:
+    """Add strength/(chord² + soft²), or its power 3/2, over the angle (as chord) between directions and a source."""
+    towards, strength, soft2, cube = source
+    a, b, c = towards[0], towards[1], towards[2]
     factor, soft = np.float32(strength), np.float32(soft2)
+    dx, dy, dz = directions
+    for x in range(row.size):
+        u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
+        chord2 = u * u + v * v + w * w + soft
+        row[x] += factor / (chord2 * np.sqrt(chord2) if cube else chord2)
+
+
+@compiled_ieee
+def _add_glare(image: Image, directions: Image, source: Glare) -> None:
+    """Add the glare of a source to an image (h, w) of directions (3, h, w)."""
     for y in range(image.shape[0]):
-        row = image[y]
+        _shine(image[y], (directions[0, y], directions[1, y], directions[2, y]), source)
+
+
+@compiled_ieee
+def _refine_glare(
+    mean: Image,
+    sensitivity: Sensitivity,
+    directions: tuple[Image, Image],
+    spans: tuple[int, int, int, int],
+    source: Glare,
+    exposure_s: float,
+) -> None:
+    """As `NearGlare.refine`, with first and last rows and columns."""
+    pixels, points = directions
+    top, bottom, left, right = spans
+    first, last = left // GLARE_STEP, -(-right // GLARE_STEP)
+    corners, exact = np.empty(last - first + 1, dtype=np.float32), np.empty(right - left, dtype=np.float32)
+    lines = np.empty((2, (last - first) * GLARE_STEP), dtype=np.float32)
+    exposure = np.float32(exposure_s)
+    for band in range(top // GLARE_STEP, -(-bottom // GLARE_STEP) + 1):
+        above, below = lines[(band + 1) % 2], lines[band % 2]
+        run = slice(first, last + 1)
+        corners[:] = 0.0
+        _shine(corners, (points[0, band, run], points[1, band, run], points[2, band, run]), source)
+        expand(corners, below, 0, last - first)
+        run = slice(left, right)
+        for y in range(max((band - 1) * GLARE_STEP, top), min(band * GLARE_STEP, bottom)):
+            exact[:] = 0.0
+            _shine(exact, (pixels[0, y, run], pixels[1, y, run], pixels[2, y, run]), source)
+            to, gain, share = mean[y, run], sensitivity[y, run], np.float32(y % GLARE_STEP / GLARE_STEP)
+            for x in range(to.size):
+                to[x] += (
+                    np.float32(gain[x]) * exposure * (exact[x] - above[x] - share * (below[x] - above[x]))
+                )
+
+
+@compiled_ieee
+def _mark_near(
+    rows: Mask, columns: Mask, directions: Image, centre: npt.NDArray[np.float32], cosine: float
+) -> None:
+    """Mark the rows (h,) and columns (w,) of directions (3, h, w) that come within an angle of a centre."""
+    a, b, c, least = centre[0], centre[1], centre[2], np.float32(cosine)
+    for y in range(rows.size):
         dx, dy, dz = directions[0, y], directions[1, y], directions[2, y]
-        for x in range(row.size):
-            u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
-            chord2 = u * u + v * v + w * w + soft
-            row[x] += factor / (chord2 * np.sqrt(chord2) if cube else chord2)
+        hits = 0
+        for x in range(columns.size):
+            near = a * dx[x] + b * dy[x] + c * dz[x] >= least
+            columns[x] |= near
+            hits += near
+        rows[y] = hits > 0
+
+
+@compiled_ieee
+def _draw_moon(
+    disc: Image,
+    passed: Image,
+    directions: Image,
+    corner: tuple[int, int],
+    axes: npt.NDArray[np.float64],
+    shape: tuple[float, float, float],
+) -> None:
+    """Draw the disc with the terminator, and what is visible behind it.
+
+    `axes` (3, 3) point towards the bright limb and across, in units of 1/radius, and at the centre, sensor frame; `shape` is
+    the radius, pixels, the illuminated fraction and the brightness of a pixel.
+    """
+    radius, illuminated, brightness = shape
+    terminator = 1.0 - 2.0 * illuminated
+    columns = slice(corner[1], corner[1] + disc.shape[1])
+    for y in range(disc.shape[0]):
+        row = corner[0] + y
+        dx, dy, dz = directions[0, row, columns], directions[1, row, columns], directions[2, row, columns]
+        for x in range(dx.size):
+            u = axes[0, 0] * dx[x] + axes[0, 1] * dy[x] + axes[0, 2] * dz[x]
+            v = axes[1, 0] * dx[x] + axes[1, 1] * dy[x] + axes[1, 2] * dz[x]
+            ahead = axes[2, 0] * dx[x] + axes[2, 1] * dy[x] + axes[2, 2] * dz[x]
+            inside = (
+                min(max(0.5 + (1.0 - math.sqrt(u * u + v * v)) * radius, 0.0), 1.0) if ahead > 0.0 else 0.0
+            )
+            edge = terminator * math.sqrt(max(1.0 - v * v, 0.0))
+            disc[y, x] = inside * min(max(0.5 + (u - edge) * radius, 0.0), 1.0) * brightness
+            passed[y, x] = 1.0 - inside
 
 
 @compiled_ieee
@@ -329,9 +470,8 @@ class AreaPainter:
         """Return light and transmission of all extended objects at one attitude."""
         if baffle_passed(objects, attitude):
             return AreaLight(self._size, flooded=True)
-        glare, behind = self._glare(objects, attitude)
-        if objects.moon is not None:
-            behind += self._moon_patch(objects.moon, attitude)
+        glare, near = self._glare(objects, attitude)
+        behind = () if objects.moon is None else self._moon_patch(objects.moon, attitude)
         earth: WideEarth | None = None
         in_front: list[Patch] = []
         if objects.earth is not None and self._in_reach(objects.earth, attitude):
@@ -343,11 +483,11 @@ class AreaPainter:
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
         in_front += [Patch(self._everything, np.zeros_like(cover), cover) for cover in covers]
-        return AreaLight(self._size, glare, earth, tuple(behind), tuple(in_front))
+        return AreaLight(self._size, glare, near, earth, behind, tuple(in_front))
 
-    def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, list[Patch]]:
-        """Return the glare of Sun and Moon on the grid, and what it lacks near them."""
-        total, near = None, []
+    def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, tuple[NearGlare, ...]]:
+        """Return the glare of Sun and Moon on the grid, and near them."""
+        glare, near = None, []
         for body in (objects.sun, objects.moon):
             if body is None:
                 continue
@@ -357,17 +497,15 @@ class AreaPainter:
             direction = attitude.to_sensor(icrs_vector(body.ra_deg, body.dec_deg))
             strength, soft, cube = self._glare_of(body)
             source: Glare = (direction.astype(np.float32), strength, soft * soft, cube)
-            glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
-            _add_glare(glare, self._grid_directions, *source)
-            total = glare if total is None else total + glare
+            if glare is None:
+                glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
+            _add_glare(glare, self._grid_directions, source)
             outside = math.radians(off_axis) - self._camera.field_radius_rad
             if max(soft, outside) < _SMOOTH_PX * self._camera.pixel_scale_rad:
                 box = self._box_around(direction, _SMOOTH_PX * self._camera.pixel_scale_rad)
                 if box is not None:
-                    light = -interpolated(glare, *box)
-                    _add_glare(light, self._directions_in(box), *source)
-                    near.append(Patch(box, light, np.ones_like(light), hides_glare=False))
-        return total, near
+                    near.append(NearGlare(box, source, self._directions, self._grid_directions))
+        return glare, tuple(near)
 
     def _glare_of(self, body: SunGlare | Moon) -> tuple[float, float, bool]:
         """Strength and softness of a body's stray light, and whether it falls with the cube of the angle."""
@@ -383,7 +521,7 @@ class AreaPainter:
         """Electrons/s from the whole Moon."""
         return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
 
-    def _moon_patch(self, moon: Moon, attitude: Attitude) -> list[Patch]:
+    def _moon_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
         """Return the Moon's disc with the terminator; nothing if it is outside the image."""
         import cv2
 
@@ -391,36 +529,32 @@ class AreaPainter:
         radius = math.radians(moon.diameter_deg) / 2.0
         box = self._box_around(source, radius + _EDGE_PX * self._camera.pixel_scale_rad)
         if box is None:
-            return []
-        # position on the disc in units of its radius, towards the bright limb and across
+            return ()
         ra, dec, angle = (math.radians(value) for value in (moon.ra_deg, moon.dec_deg, moon.bright_limb_deg))
         north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
         east = np.array([-math.sin(ra), math.cos(ra), 0.0])
         towards = attitude.to_sensor(math.cos(angle) * north + math.sin(angle) * east) / radius
         across = attitude.to_sensor(math.cos(angle) * east - math.sin(angle) * north) / radius
-        directions = self._directions_in(box)
-        u = np.tensordot(towards, directions, axes=1)
-        v = np.tensordot(across, directions, axes=1)
-        before = np.tensordot(source, directions, axes=1) > 0.0
         scale = radius / self._camera.pixel_scale_rad
-        inside = np.clip(0.5 + (1.0 - np.hypot(u, v)) * scale, 0.0, 1.0) * before
-        edge = (1.0 - 2.0 * moon.illuminated) * np.sqrt(np.clip(1.0 - v * v, 0.0, 1.0))
-        lit = inside * np.clip(0.5 + (u - edge) * scale, 0.0, 1.0)
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
-        disc = (lit * (self._moonlight(moon) / area)).astype(np.float32)
+        shape = (scale, moon.illuminated, self._moonlight(moon) / area)
+        disc, passed = np.empty((2, *(span.stop - span.start for span in box)), dtype=np.float32)
+        axes, corner = np.array([towards, across, source]), (box[0].start, box[1].start)
+        _draw_moon(disc, passed, self._directions, corner, axes, shape)
         light = np.asarray(cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px), dtype=np.float32)
-        return [Patch(box, light, (1.0 - inside).astype(np.float32), hides_glare=False)]
+        return (Patch(box, light, passed, hides_glare=False),)
 
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
         """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
         margin = 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
         if not disc_in_field(direction, radius_rad + margin, self._camera):
             return None
-        cosines = np.einsum("k,kij", direction.astype(np.float32), self._grid_directions)
-        near = cosines >= math.cos(min(radius_rad + margin, math.pi))
+        grid, cosine = self._grid_directions, math.cos(min(radius_rad + margin, math.pi))
+        near = np.zeros(grid.shape[1], dtype=np.bool_), np.zeros(grid.shape[2], dtype=np.bool_)
+        _mark_near(*near, grid, direction.astype(np.float32), cosine)
         spans = []
-        for axis, size in enumerate(self._size[::-1]):
-            points = GLARE_STEP * np.flatnonzero(near.any(axis=1 - axis))
+        for mask, size in zip(near, self._size[::-1], strict=True):
+            points = GLARE_STEP * np.flatnonzero(mask)
             if not points.size or points[0] >= size:
                 return None
             spans.append(slice(int(points[0]), min(int(points[-1]) + 1, size)))
