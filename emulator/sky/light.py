@@ -10,10 +10,9 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Sensitivity, expand, fill
-from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
+from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -94,22 +93,24 @@ class NearGlare:
         Rows and columns of the image, from points of the grid.
     source : Glare
         The source.
-    directions, grid_directions : ndarray (3, …), float32
-        Of all pixels, and of the points of the grid.
+    grid : ndarray (gh, gw), float32
+        Its glare at the points of the grid, electrons/s.
+    directions : ndarray (3, h, w), float32
+        Of all pixels, sensor frame.
     """
 
     box: Box
     source: Glare
+    grid: Image
     directions: Image
-    grid_directions: Image
 
     def refine(self, mean: Image, backdrop: Backdrop) -> None:
         """Replace the interpolated glare in the mean electrons (h, w) by that of each pixel, in place."""
         rows, columns = self.box
         spans = (rows.start, rows.stop, columns.start, columns.stop)
         exposure_s = backdrop.unit * backdrop.exposure_s
-        directions = self.directions, self.grid_directions
-        _refine_glare(mean, backdrop.sensitivity, directions, spans, self.source, exposure_s)
+        planes = mean, backdrop.sensitivity
+        _refine_glare(planes, self.grid, self.directions, spans, self.source, exposure_s)
 
 
 @dataclass(frozen=True)
@@ -199,30 +200,23 @@ def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
 
 def _is_lit(earth: EarthLimb, towards: npt.NDArray[np.float64], off_nadir_deg: float) -> bool:
     """Whether the Sun shines on the point of the Earth seen at an angle from its centre towards a direction."""
-    sun = _sun_of(earth)
+    sun = earth.sun_direction
     if sun is None:
         return True
-    nadir = icrs_vector(earth.ra_deg, earth.dec_deg)
+    nadir = earth.direction
     sideways = towards - float(towards @ nadir) * nadir
     sideways /= max(float(np.linalg.norm(sideways)), 1e-12)
-    angle, distance = math.radians(off_nadir_deg), 1.0 / math.sin(math.radians(earth.radius_deg))
+    angle, distance = math.radians(off_nadir_deg), 1.0 / math.sin(earth.radius_rad)
     line = math.cos(angle) * nadir + math.sin(angle) * sideways
     under = max(1.0 - (distance * math.sin(angle)) ** 2, 0.0)
     normal = (distance * math.cos(angle) - math.sqrt(under)) * line - distance * nadir
     return float(normal @ sun) > 0.0
 
 
-def _sun_of(earth: EarthLimb) -> npt.NDArray[np.float64] | None:
-    """Return the direction (3,) of the Sun that lights the Earth; None if all of the disc is lit."""
-    if earth.sun_ra_deg is None or earth.sun_dec_deg is None:
-        return None
-    return icrs_vector(earth.sun_ra_deg, earth.sun_dec_deg)
-
-
-def _off_axis_deg(attitude: Attitude, body: SunGlare | Moon | EarthLimb) -> float:
+def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
     """Angle of a body's centre from the boresight, degrees."""
-    place, boresight = icrs_vector(body.ra_deg, body.dec_deg), attitude.boresight
-    return math.degrees(2.0 * math.asin(min(0.5 * math.dist(place.tolist(), boresight.tolist()), 1.0)))
+    chord = math.dist(body.direction.tolist(), attitude.boresight.tolist())
+    return math.degrees(2.0 * math.asin(min(0.5 * chord, 1.0)))
 
 
 @compiled_ieee
@@ -255,72 +249,75 @@ def _cover(
 
 
 @inner
-def _shine(row: Line, directions: tuple[Line, Line, Line], source: Glare) -> None:
-    """Add strength/(chord² + soft²), or its power 3/2, over the angle (as chord) between directions and a source."""
-    towards, strength, soft2, cube = source
-    a, b, c = towards[0], towards[1], towards[2]
-    factor, soft = np.float32(strength), np.float32(soft2)
-    dx, dy, dz = directions
-    for x in range(row.size):
-        u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
-        chord2 = u * u + v * v + w * w + soft
-        row[x] += factor / (chord2 * np.sqrt(chord2) if cube else chord2)
+def _glare_at(chord2: np.float32, factor: np.float32, cube: bool) -> np.float32:
+    """Glare at a squared chord with the squared softness added."""
+    return factor / (chord2 * np.sqrt(chord2) if cube else chord2)
 
 
 @compiled_ieee
 def _add_glare(image: Image, directions: Image, source: Glare) -> None:
-    """Add the glare of a source to an image (h, w) of directions (3, h, w)."""
+    """Add strength/(chord² + soft²), or its power 3/2, over the angle (as chord) between directions and a source."""
+    towards, strength, soft2, cube = source
+    a, b, c = towards[0], towards[1], towards[2]
+    factor, soft = np.float32(strength), np.float32(soft2)
     for y in range(image.shape[0]):
-        _shine(image[y], (directions[0, y], directions[1, y], directions[2, y]), source)
+        row, dx, dy, dz = image[y], directions[0, y], directions[1, y], directions[2, y]
+        for x in range(row.size):
+            u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
+            row[x] += _glare_at(u * u + v * v + w * w + soft, factor, cube)
 
 
 @compiled_ieee
 def _refine_glare(
-    mean: Image,
-    sensitivity: Sensitivity,
-    directions: tuple[Image, Image],
+    planes: tuple[Image, Sensitivity],
+    grid: Image,
+    directions: Image,
     spans: tuple[int, int, int, int],
     source: Glare,
     exposure_s: float,
 ) -> None:
-    """As `NearGlare.refine`, with first and last rows and columns."""
-    pixels, points = directions
+    """As `NearGlare.refine`, with first and last rows and columns, and the exposure at sensitivity 1."""
     top, bottom, left, right = spans
-    first, last = left // GLARE_STEP, -(-right // GLARE_STEP)
-    corners, exact = np.empty(last - first + 1, dtype=np.float32), np.empty(right - left, dtype=np.float32)
-    lines = np.empty((2, (last - first) * GLARE_STEP), dtype=np.float32)
-    exposure = np.float32(exposure_s)
-    for band in range(top // GLARE_STEP, -(-bottom // GLARE_STEP) + 1):
-        above, below = lines[(band + 1) % 2], lines[band % 2]
-        run = slice(first, last + 1)
-        corners[:] = 0.0
-        _shine(corners, (points[0, band, run], points[1, band, run], points[2, band, run]), source)
-        expand(corners, below, 0, last - first)
-        run = slice(left, right)
-        for y in range(max((band - 1) * GLARE_STEP, top), min(band * GLARE_STEP, bottom)):
-            exact[:] = 0.0
-            _shine(exact, (pixels[0, y, run], pixels[1, y, run], pixels[2, y, run]), source)
-            to, gain, share = mean[y, run], sensitivity[y, run], np.float32(y % GLARE_STEP / GLARE_STEP)
+    towards, strength, soft2, cube = source
+    a, b, c = towards[0], towards[1], towards[2]
+    factor, soft, exposure = np.float32(strength), np.float32(soft2), np.float32(exposure_s)
+    lines = np.empty((2, (grid.shape[1] - 1) * GLARE_STEP), dtype=np.float32)
+    run, cells = slice(left, right), (left // GLARE_STEP, -(-right // GLARE_STEP))
+    above, below = lines[0, run], lines[1, run]
+    for band in range(top // GLARE_STEP, -(-bottom // GLARE_STEP)):
+        expand(grid[band], lines[0], cells[0], cells[1])
+        expand(grid[band + 1], lines[1], cells[0], cells[1])
+        for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, bottom)):
+            to, gain, share = planes[0][y, run], planes[1][y, run], np.float32(y % GLARE_STEP / GLARE_STEP)
+            dx, dy, dz = directions[0, y, run], directions[1, y, run], directions[2, y, run]
             for x in range(to.size):
-                to[x] += (
-                    np.float32(gain[x]) * exposure * (exact[x] - above[x] - share * (below[x] - above[x]))
-                )
+                u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
+                exact = _glare_at(u * u + v * v + w * w + soft, factor, cube)
+                coarse = above[x] + share * (below[x] - above[x])
+                to[x] += np.float32(gain[x]) * exposure * (exact - coarse)
 
 
 @compiled_ieee
-def _mark_near(
-    rows: Mask, columns: Mask, directions: Image, centre: npt.NDArray[np.float32], cosine: float
-) -> None:
-    """Mark the rows (h,) and columns (w,) of directions (3, h, w) that come within an angle of a centre."""
+def _points_near(
+    directions: Image, centre: npt.NDArray[np.float32], cosine: float
+) -> tuple[int, int, int, int]:
+    """First and last row and column of directions (3, h, w) within an angle of a centre; the last before the first if none."""
     a, b, c, least = centre[0], centre[1], centre[2], np.float32(cosine)
-    for y in range(rows.size):
+    height, width = directions.shape[1:]
+    top, bottom, left, right = height, -1, width, -1
+    near = np.empty(width, dtype=np.bool_)
+    for y in range(height):
         dx, dy, dz = directions[0, y], directions[1, y], directions[2, y]
         hits = 0
-        for x in range(columns.size):
-            near = a * dx[x] + b * dy[x] + c * dz[x] >= least
-            columns[x] |= near
-            hits += near
-        rows[y] = hits > 0
+        for x in range(width):
+            near[x] = a * dx[x] + b * dy[x] + c * dz[x] >= least
+            hits += near[x]
+        if hits:
+            top, bottom = min(top, y), y
+            for x in range(width):
+                if near[x]:
+                    left, right = min(left, x), max(right, x)
+    return top, bottom, left, right
 
 
 @compiled_ieee
@@ -329,14 +326,16 @@ def _draw_moon(
     passed: Image,
     directions: Image,
     corner: tuple[int, int],
-    axes: npt.NDArray[np.float64],
+    axes: tuple[npt.NDArray[np.float64], tuple[float, float], npt.NDArray[np.float64]],
     shape: tuple[float, float, float],
 ) -> None:
     """Draw the disc with the terminator, and what is visible behind it.
 
-    `axes` (3, 3) point towards the bright limb and across, in units of 1/radius, and at the centre, sensor frame; `shape` is
-    the radius, pixels, the illuminated fraction and the brightness of a pixel.
+    `axes` are the directions (2, 3) to north and east, cosine and sine of the position angle of the bright limb over the radius,
+    and the direction (3,) of the centre, sensor frame. `shape` is the radius, pixels, the illuminated fraction and the
+    brightness of a pixel.
     """
+    north, east, (along, sideways), source = axes[0][0], axes[0][1], axes[1], axes[2]
     radius, illuminated, brightness = shape
     terminator = 1.0 - 2.0 * illuminated
     columns = slice(corner[1], corner[1] + disc.shape[1])
@@ -344,9 +343,10 @@ def _draw_moon(
         row = corner[0] + y
         dx, dy, dz = directions[0, row, columns], directions[1, row, columns], directions[2, row, columns]
         for x in range(dx.size):
-            u = axes[0, 0] * dx[x] + axes[0, 1] * dy[x] + axes[0, 2] * dz[x]
-            v = axes[1, 0] * dx[x] + axes[1, 1] * dy[x] + axes[1, 2] * dz[x]
-            ahead = axes[2, 0] * dx[x] + axes[2, 1] * dy[x] + axes[2, 2] * dz[x]
+            up = north[0] * dx[x] + north[1] * dy[x] + north[2] * dz[x]
+            left = east[0] * dx[x] + east[1] * dy[x] + east[2] * dz[x]
+            ahead = source[0] * dx[x] + source[1] * dy[x] + source[2] * dz[x]
+            u, v = along * up + sideways * left, along * left - sideways * up
             inside = (
                 min(max(0.5 + (1.0 - math.sqrt(u * u + v * v)) * radius, 0.0), 1.0) if ahead > 0.0 else 0.0
             )
@@ -488,23 +488,24 @@ class AreaPainter:
     def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, tuple[NearGlare, ...]]:
         """Return the glare of Sun and Moon on the grid, and near them."""
         glare, near = None, []
+        grid, smooth_rad = self._grid_directions, _SMOOTH_PX * self._camera.pixel_scale_rad
         for body in (objects.sun, objects.moon):
             if body is None:
                 continue
             off_axis = _off_axis_deg(attitude, body)
             if off_axis > body.reach_deg:
                 continue
-            direction = attitude.to_sensor(icrs_vector(body.ra_deg, body.dec_deg))
             strength, soft, cube = self._glare_of(body)
+            direction = attitude.to_sensor(body.direction)
             source: Glare = (direction.astype(np.float32), strength, soft * soft, cube)
-            if glare is None:
-                glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
-            _add_glare(glare, self._grid_directions, source)
+            light = np.zeros(grid.shape[1:], dtype=np.float32)
+            _add_glare(light, grid, source)
             outside = math.radians(off_axis) - self._camera.field_radius_rad
-            if max(soft, outside) < _SMOOTH_PX * self._camera.pixel_scale_rad:
-                box = self._box_around(direction, _SMOOTH_PX * self._camera.pixel_scale_rad)
+            if max(soft, outside) < smooth_rad:
+                box = self._box_around(direction, smooth_rad)
                 if box is not None:
-                    near.append(NearGlare(box, source, self._directions, self._grid_directions))
+                    near.append(NearGlare(box, source, light, self._directions))
+            glare = light if glare is None else glare + light
         return glare, tuple(near)
 
     def _glare_of(self, body: SunGlare | Moon) -> tuple[float, float, bool]:
@@ -525,40 +526,35 @@ class AreaPainter:
         """Return the Moon's disc with the terminator; nothing if it is outside the image."""
         import cv2
 
-        source = attitude.to_sensor(icrs_vector(moon.ra_deg, moon.dec_deg))
-        radius = math.radians(moon.diameter_deg) / 2.0
-        box = self._box_around(source, radius + _EDGE_PX * self._camera.pixel_scale_rad)
+        source, scale = attitude.to_sensor(moon.direction), moon.radius_rad / self._camera.pixel_scale_rad
+        box = self._box_around(source, moon.radius_rad + _EDGE_PX * self._camera.pixel_scale_rad)
         if box is None:
             return ()
-        ra, dec, angle = (math.radians(value) for value in (moon.ra_deg, moon.dec_deg, moon.bright_limb_deg))
-        north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
-        east = np.array([-math.sin(ra), math.cos(ra), 0.0])
-        towards = attitude.to_sensor(math.cos(angle) * north + math.sin(angle) * east) / radius
-        across = attitude.to_sensor(math.cos(angle) * east - math.sin(angle) * north) / radius
-        scale = radius / self._camera.pixel_scale_rad
+        x, y, z = moon.direction.tolist()
+        across, along = math.hypot(x, y), math.radians(moon.bright_limb_deg)
+        east, north = (-y / across, x / across, 0.0), (-x * z / across, -y * z / across, across)
+        turn = (math.cos(along) / moon.radius_rad, math.sin(along) / moon.radius_rad)
+        axes = attitude.to_sensor(np.array([north, east]))
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
         shape = (scale, moon.illuminated, self._moonlight(moon) / area)
         disc, passed = np.empty((2, *(span.stop - span.start for span in box)), dtype=np.float32)
-        axes, corner = np.array([towards, across, source]), (box[0].start, box[1].start)
-        _draw_moon(disc, passed, self._directions, corner, axes, shape)
+        _draw_moon(disc, passed, self._directions, (box[0].start, box[1].start), (axes, turn, source), shape)
         light = np.asarray(cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px), dtype=np.float32)
         return (Patch(box, light, passed, hides_glare=False),)
 
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
         """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
-        margin = 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
-        if not disc_in_field(direction, radius_rad + margin, self._camera):
+        reach_rad = radius_rad + 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
+        if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
             return None
-        grid, cosine = self._grid_directions, math.cos(min(radius_rad + margin, math.pi))
-        near = np.zeros(grid.shape[1], dtype=np.bool_), np.zeros(grid.shape[2], dtype=np.bool_)
-        _mark_near(*near, grid, direction.astype(np.float32), cosine)
-        spans = []
-        for mask, size in zip(near, self._size[::-1], strict=True):
-            points = GLARE_STEP * np.flatnonzero(mask)
-            if not points.size or points[0] >= size:
-                return None
-            spans.append(slice(int(points[0]), min(int(points[-1]) + 1, size)))
-        return spans[0], spans[1]
+        cosine = math.cos(min(reach_rad, math.pi))
+        top, bottom, left, right = _points_near(self._grid_directions, direction.astype(np.float32), cosine)
+        width, height = self._size
+        box = (
+            slice(GLARE_STEP * top, min(GLARE_STEP * bottom + 1, height)),
+            slice(GLARE_STEP * left, min(GLARE_STEP * right + 1, width)),
+        )
+        return box if all(span.start < span.stop for span in box) else None
 
     def _directions_in(self, box: Box) -> Image:
         """Return the directions (3, h', w') of the pixels in part of the image."""
@@ -572,7 +568,7 @@ class AreaPainter:
             return []
         directions = self._directions_in(box)
         light, passed = np.zeros_like(directions[0]), np.ones_like(directions[0])
-        angles = (math.radians(earth.radius_deg), self._atmosphere_rad(earth))
+        angles = (earth.radius_rad, self._atmosphere_rad(earth))
         _add_earth(light, passed, directions, nadir, sun, angles, earth.electrons_s)
         return [Patch(box, light, passed)]
 
@@ -584,9 +580,9 @@ class AreaPainter:
         towards = np.array([nadir, sun], dtype=np.float32)
         np.matmul(towards, directions.reshape(3, -1), out=grid[:2].reshape(2, -1))
         np.arccos(np.clip(grid[0], -1.0, 1.0, out=grid[2]), out=grid[2])
-        grid[2] -= np.float32(math.radians(earth.radius_deg))
+        grid[2] -= np.float32(earth.radius_rad)
         grid[2] *= np.float32(1.0 / self._atmosphere_rad(earth))
-        distance = 1.0 / math.sin(math.radians(earth.radius_deg))
+        distance = 1.0 / math.sin(earth.radius_rad)
         behind = -distance * float(nadir @ sun) if np.any(sun) else 1.0
         step_rad = GLARE_STEP * self._camera.pixel_scale_rad
         return WideEarth(grid, distance, behind, earth.electrons_s, step_rad)
@@ -595,8 +591,8 @@ class AreaPainter:
         self, earth: EarthLimb, attitude: Attitude
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""
-        sun = _sun_of(earth)
-        nadir = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg))
+        sun = earth.sun_direction
+        nadir = attitude.to_sensor(earth.direction)
         return nadir, np.zeros(3) if sun is None else attitude.to_sensor(sun)
 
     def _atmosphere_rad(self, earth: EarthLimb) -> float:
@@ -606,12 +602,11 @@ class AreaPainter:
 
     def _reach_rad(self, earth: EarthLimb) -> float:
         """Return the angle from the Earth's centre to which the glow of its limb reaches."""
-        return math.radians(earth.radius_deg) + GLOW_HEIGHTS * self._atmosphere_rad(earth)
+        return earth.radius_rad + GLOW_HEIGHTS * self._atmosphere_rad(earth)
 
     def _in_reach(self, earth: EarthLimb, attitude: Attitude) -> bool:
         """Whether the Earth or the glow of its limb reaches into the field."""
-        nadir = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg))
-        return disc_in_field(nadir, self._reach_rad(earth), self._camera)
+        return disc_in_field(attitude.to_sensor(earth.direction), self._reach_rad(earth), self._camera)
 
     def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
         """Return the transmission (h, w) of an obstruction."""
