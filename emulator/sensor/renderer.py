@@ -253,29 +253,31 @@ class Renderer:
         mean = self._mean_without_stars(exposure, temperature, area)
         planets = () if others is None else others.planets
         path, chosen, inside = self._paths(optical_axis, rate, exposure, observer, planets)
-        flux_e_s = [self.sensor.electrons(planet.magnitude, 1.0) for planet in planets]
-        electrons = np.concatenate([self._flux_e_s, flux_e_s])[chosen] * exposure
-        drawn = electrons
-        is_star = inside & (chosen < len(self._rows))
+        count = int(np.count_nonzero(chosen < len(self._rows)))
+        magnitudes = [planets[number - len(self._rows)].magnitude for number in chosen[count:]]
+        planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
+        electrons = np.concatenate([self._flux_e_s[chosen[:count]] * exposure, planets_e])
+        drawn, centred = electrons, np.flatnonzero(inside[:count])
         object_truth = None
         if others is not None:
             drawn = electrons.copy()
-            drawn[np.flatnonzero(is_star)[: others.missing_stars]] = 0.0
+            drawn[centred[: others.missing_stars]] = 0.0
             if area is not None:
                 drawn *= area.seen_at(path[:, :2])
             planet_xy = np.full((len(planets), 2), np.nan)
-            planet_xy[chosen[inside & ~is_star] - len(self._rows)] = path[inside & ~is_star, :2]
+            shown = count + np.flatnonzero(inside[count:])
+            planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
             object_truth = self._add_objects(mean, others, planet_xy, exposure, index, area)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
-        rows = self._rows[chosen[is_star]]
+        rows = self._rows[chosen[centred]]
         stars = StarTruth(
             self.catalog.hip[rows],
             rows.astype(np.int64),
-            path[is_star, :2].copy(),
-            electrons[is_star],
+            path[centred, :2].copy(),
+            electrons[centred],
             self.catalog.v[rows].astype(np.float64),
-            drawn[is_star] > _VISIBLE_SHARE * electrons[is_star],
+            drawn[centred] > _VISIBLE_SHARE * electrons[centred],
         )
         rates = (float(rate[0]), float(rate[1]), float(rate[2]))
         return Frame(image, stars, attitude, rates, exposure, self.seed, index, object_truth)

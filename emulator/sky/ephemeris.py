@@ -115,7 +115,7 @@ class Observer:
     def towards(self, place_m: Vector) -> Vector:
         """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
         gap = place_m - self.position_m
-        return aberrated(gap / np.linalg.norm(gap, axis=-1, keepdims=True), self.velocity_m_s)
+        return aberrated(gap / np.sqrt(np.einsum("...k,...k", gap, gap))[..., None], self.velocity_m_s)
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
         """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""

@@ -68,12 +68,7 @@ class Patch:
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
-        rows, columns = self.box
-        column, row = np.rint(xy_px).astype(np.int64).T - np.array([[columns.start], [rows.start]])
-        inside = (column >= 0) & (column < self.passed.shape[1]) & (row >= 0) & (row < self.passed.shape[0])
-        seen = np.ones(len(xy_px))
-        seen[inside] = self.passed[row[inside], column[inside]]
-        return seen
+        return _nearest(self.passed, self.box[0].start, self.box[1].start, xy_px)
 
     def cover(self, mean: Image, backdrop: Backdrop) -> None:
         """Put it in front of the mean electrons (h, w), in place."""
@@ -217,6 +212,17 @@ def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
     """Angle of a body's centre from the boresight, degrees."""
     chord = math.dist(body.direction.tolist(), attitude.boresight.tolist())
     return math.degrees(2.0 * math.asin(min(0.5 * chord, 1.0)))
+
+
+@compiled_ieee
+def _nearest(passed: Image, top: int, left: int, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """As `Patch.seen_at`, with the first row and column of the box."""
+    seen = np.ones(len(xy_px))
+    for i in range(seen.size):
+        row, column = int(np.rint(xy_px[i, 1])) - top, int(np.rint(xy_px[i, 0])) - left
+        if 0 <= row < passed.shape[0] and 0 <= column < passed.shape[1]:
+            seen[i] = passed[row, column]
+    return seen
 
 
 @compiled_ieee

@@ -82,8 +82,8 @@ def fill(
             expand(glare[band + 1], lower, 0, cells)
         end = 0
         while end < cells:
-            start = end
-            while end < cells and not (height.size and _is_hidden(height, band, end)):
+            start, end = end, end if height.size else cells
+            while end < cells and not _is_hidden(height, band, end):
                 end += 1
             if start == end:
                 end += 1
