@@ -22,10 +22,12 @@ Glare: TypeAlias = tuple[npt.NDArray[np.float32], float, float, bool]
 """Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""
 
 Line: TypeAlias = npt.NDArray[np.float32]
-Mask: TypeAlias = npt.NDArray[np.bool_]
 
-Box: TypeAlias = tuple[slice, slice]
-"""Rows and columns of part of an image."""
+Box: TypeAlias = tuple[int, int, int, int]
+"""First row and the one after the last, and so the columns, of part of an image."""
+
+NearGlare: TypeAlias = tuple[Box, Glare, Image, Image]
+"""Where a source's glare is not smooth, the source, its glare on the grid, and the directions (3, h, w) of the pixels."""
 
 _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
@@ -51,7 +53,7 @@ class Patch:
 
     Attributes
     ----------
-    box : (slice, slice)
+    box : (int, int, int, int)
         Its rows and columns.
     light : ndarray (h', w'), float32
         Electrons/s in a pixel of mean sensitivity.
@@ -68,44 +70,13 @@ class Patch:
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
-        return _nearest(self.passed, self.box[0].start, self.box[1].start, xy_px)
+        return _nearest(self.passed, self.box, xy_px)
 
     def cover(self, mean: Image, backdrop: Backdrop) -> None:
         """Put it in front of the mean electrons (h, w), in place."""
-        corner = self.box[0].start, self.box[1].start
         light = backdrop.unit * backdrop.exposure_s, backdrop.sky_e_s
         planes = mean, backdrop.still, backdrop.sensitivity
-        _cover(planes, self.light, self.passed, corner, light, self.hides_glare)
-
-
-@dataclass(frozen=True)
-class NearGlare:
-    """Glare around a source, where interpolation on the grid is too coarse.
-
-    Attributes
-    ----------
-    box : (slice, slice)
-        Rows and columns of the image, from points of the grid.
-    source : Glare
-        The source.
-    grid : ndarray (gh, gw), float32
-        Its glare at the points of the grid, electrons/s.
-    directions : ndarray (3, h, w), float32
-        Of all pixels, sensor frame.
-    """
-
-    box: Box
-    source: Glare
-    grid: Image
-    directions: Image
-
-    def refine(self, mean: Image, backdrop: Backdrop) -> None:
-        """Replace the interpolated glare in the mean electrons (h, w) by that of each pixel, in place."""
-        rows, columns = self.box
-        spans = (rows.start, rows.stop, columns.start, columns.stop)
-        exposure_s = backdrop.unit * backdrop.exposure_s
-        planes = mean, backdrop.sensitivity
-        _refine_glare(planes, self.grid, self.directions, spans, self.source, exposure_s)
+        _cover(planes, self.light, self.passed, self.box, light, self.hides_glare)
 
 
 @dataclass(frozen=True)
@@ -175,8 +146,8 @@ class AreaLight:
             exposure_s = backdrop.unit * backdrop.exposure_s
             smooth = none if glare is None else glare
             fill(mean, backdrop.still, backdrop.sensitivity, smooth, hidden, exposure_s)
-        for source in self.near:
-            source.refine(mean, backdrop)
+        for near in self.near:
+            _refine_glare(mean, backdrop.sensitivity, near, backdrop.unit * backdrop.exposure_s)
         for layer in self._layers:
             layer.cover(mean, backdrop)
 
@@ -215,11 +186,11 @@ def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
 
 
 @compiled_ieee
-def _nearest(passed: Image, top: int, left: int, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """As `Patch.seen_at`, with the first row and column of the box."""
+def _nearest(passed: Image, box: Box, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """As `Patch.seen_at`."""
     seen = np.ones(len(xy_px))
     for i in range(seen.size):
-        row, column = int(np.rint(xy_px[i, 1])) - top, int(np.rint(xy_px[i, 0])) - left
+        row, column = int(np.rint(xy_px[i, 1])) - box[0], int(np.rint(xy_px[i, 0])) - box[2]
         if 0 <= row < passed.shape[0] and 0 <= column < passed.shape[1]:
             seen[i] = passed[row, column]
     return seen
@@ -230,20 +201,17 @@ def _cover(
     planes: tuple[Image, Image, Sensitivity],
     light: Image,
     passed: Image,
-    corner: tuple[int, int],
+    box: Box,
     units: tuple[float, float],
     hides_glare: bool,
 ) -> None:
-    """As `Patch.cover`, with the planes of the image, the corner of the box, exposure at sensitivity 1, and sky."""
+    """As `Patch.cover`, with the exposure at a sensitivity of 1, and the light of the sky."""
     unit, sky_e_s = np.float32(units[0]), np.float32(units[1])
     zero, one = np.float32(0.0), np.float32(1.0)
-    columns = slice(corner[1], corner[1] + light.shape[1])
+    run = slice(box[2], box[3])
     for y in range(light.shape[0]):
-        to, base, gain = (
-            planes[0][corner[0] + y, columns],
-            planes[1][corner[0] + y, columns],
-            planes[2][corner[0] + y, columns],
-        )
+        row = box[0] + y
+        to, base, gain = planes[0][row, run], planes[1][row, run], planes[2][row, run]
         for x in range(to.size):
             sensed = np.float32(gain[x]) * unit
             sky = sensed * sky_e_s
@@ -274,27 +242,20 @@ def _add_glare(image: Image, directions: Image, source: Glare) -> None:
 
 
 @compiled_ieee
-def _refine_glare(
-    planes: tuple[Image, Sensitivity],
-    grid: Image,
-    directions: Image,
-    spans: tuple[int, int, int, int],
-    source: Glare,
-    exposure_s: float,
-) -> None:
-    """As `NearGlare.refine`, with first and last rows and columns, and the exposure at sensitivity 1."""
-    top, bottom, left, right = spans
-    towards, strength, soft2, cube = source
+def _refine_glare(mean: Image, sensitivity: Sensitivity, near: NearGlare, exposure_s: float) -> None:
+    """Replace interpolated glare by that of each pixel, at an exposure for a sensitivity of 1."""
+    (top, bottom, left, right), (towards, strength, soft2, cube), grid, directions = near
+    run = slice(left, right)
     a, b, c = towards[0], towards[1], towards[2]
     factor, soft, exposure = np.float32(strength), np.float32(soft2), np.float32(exposure_s)
     lines = np.empty((2, (grid.shape[1] - 1) * GLARE_STEP), dtype=np.float32)
-    run, cells = slice(left, right), (left // GLARE_STEP, -(-right // GLARE_STEP))
+    cells = (left // GLARE_STEP, -(-right // GLARE_STEP))
     above, below = lines[0, run], lines[1, run]
     for band in range(top // GLARE_STEP, -(-bottom // GLARE_STEP)):
         expand(grid[band], lines[0], cells[0], cells[1])
         expand(grid[band + 1], lines[1], cells[0], cells[1])
         for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, bottom)):
-            to, gain, share = planes[0][y, run], planes[1][y, run], np.float32(y % GLARE_STEP / GLARE_STEP)
+            to, gain, share = mean[y, run], sensitivity[y, run], np.float32(y % GLARE_STEP / GLARE_STEP)
             dx, dy, dz = directions[0, y, run], directions[1, y, run], directions[2, y, run]
             for x in range(to.size):
                 u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
@@ -331,7 +292,7 @@ def _draw_moon(
     disc: Image,
     passed: Image,
     directions: Image,
-    corner: tuple[int, int],
+    box: Box,
     axes: tuple[npt.NDArray[np.float64], tuple[float, float], npt.NDArray[np.float64]],
     shape: tuple[float, float, float],
 ) -> None:
@@ -344,10 +305,10 @@ def _draw_moon(
     north, east, (along, sideways), source = axes[0][0], axes[0][1], axes[1], axes[2]
     radius, illuminated, brightness = shape
     terminator = 1.0 - 2.0 * illuminated
-    columns = slice(corner[1], corner[1] + disc.shape[1])
+    run = slice(box[2], box[3])
     for y in range(disc.shape[0]):
-        row = corner[0] + y
-        dx, dy, dz = directions[0, row, columns], directions[1, row, columns], directions[2, row, columns]
+        row = box[0] + y
+        dx, dy, dz = directions[0, row, run], directions[1, row, run], directions[2, row, run]
         for x in range(dx.size):
             up = north[0] * dx[x] + north[1] * dy[x] + north[2] * dz[x]
             left = east[0] * dx[x] + east[1] * dy[x] + east[2] * dz[x]
@@ -459,10 +420,6 @@ class AreaPainter:
         return self._directions_of(*steps)
 
     @property
-    def _everything(self) -> Box:
-        return slice(0, self._camera.height), slice(0, self._camera.width)
-
-    @property
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
 
@@ -488,7 +445,8 @@ class AreaPainter:
         covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
-        in_front += [Patch(self._everything, np.zeros_like(cover), cover) for cover in covers]
+        everything = (0, self._camera.height, 0, self._camera.width)
+        in_front += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
         return AreaLight(self._size, glare, near, earth, behind, tuple(in_front))
 
     def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, tuple[NearGlare, ...]]:
@@ -510,7 +468,7 @@ class AreaPainter:
             if max(soft, outside) < smooth_rad:
                 box = self._box_around(direction, smooth_rad)
                 if box is not None:
-                    near.append(NearGlare(box, source, light, self._directions))
+                    near.append((box, source, light, self._directions))
             glare = light if glare is None else glare + light
         return glare, tuple(near)
 
@@ -543,28 +501,22 @@ class AreaPainter:
         axes = attitude.to_sensor(np.array([north, east]))
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
         shape = (scale, moon.illuminated, self._moonlight(moon) / area)
-        disc, passed = np.empty((2, *(span.stop - span.start for span in box)), dtype=np.float32)
-        _draw_moon(disc, passed, self._directions, (box[0].start, box[1].start), (axes, turn, source), shape)
+        disc, passed = np.empty((2, box[1] - box[0], box[3] - box[2]), dtype=np.float32)
+        _draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
         light = np.asarray(cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px), dtype=np.float32)
         return (Patch(box, light, passed, hides_glare=False),)
 
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
-        """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
+        """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""
         reach_rad = radius_rad + 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
         if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
             return None
         cosine = math.cos(min(reach_rad, math.pi))
         top, bottom, left, right = _points_near(self._grid_directions, direction.astype(np.float32), cosine)
         width, height = self._size
-        box = (
-            slice(GLARE_STEP * top, min(GLARE_STEP * bottom + 1, height)),
-            slice(GLARE_STEP * left, min(GLARE_STEP * right + 1, width)),
-        )
-        return box if all(span.start < span.stop for span in box) else None
-
-    def _directions_in(self, box: Box) -> Image:
-        """Return the directions (3, h', w') of the pixels in part of the image."""
-        return np.ascontiguousarray(self._directions[(slice(None), *box)])
+        top, bottom = GLARE_STEP * top, min(GLARE_STEP * bottom + 1, height)
+        left, right = GLARE_STEP * left, min(GLARE_STEP * right + 1, width)
+        return (top, bottom, left, right) if top < bottom and left < right else None
 
     def _small_earth(self, earth: EarthLimb, attitude: Attitude) -> list[Patch]:
         """Return the Earth's disc, pixel by pixel; nothing if it is outside the image."""
@@ -572,7 +524,7 @@ class AreaPainter:
         box = self._box_around(nadir, self._reach_rad(earth))
         if box is None:
             return []
-        directions = self._directions_in(box)
+        directions = np.ascontiguousarray(self._directions[:, box[0] : box[1], box[2] : box[3]])
         light, passed = np.zeros_like(directions[0]), np.ones_like(directions[0])
         angles = (earth.radius_rad, self._atmosphere_rad(earth))
         _add_earth(light, passed, directions, nadir, sun, angles, earth.electrons_s)
