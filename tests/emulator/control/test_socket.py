@@ -128,7 +128,7 @@ def test_with_a_token_nothing_is_done_without_it(run, control):
                 assert answer == {
                     "id": 7,
                     "ok": False,
-                    "error": "token: missing or wrong; give the one of --control-token",
+                    "error": "token: missing or wrong; give the token set with --control-token",
                 }
             assert not run.launched.ended.is_set()
             assert (await control.do("status", token="sésame"))["ok"]

@@ -94,10 +94,10 @@ def test_elements_in_parameters_give_an_orbit():
     assert known_orbit({}) is None
 
 
-def test_an_orbit_that_meets_the_earth_is_refused(bench):
-    with pytest.raises(Exception, match="meets the Earth"):
+def test_an_orbit_that_intersects_the_earth_is_refused(bench):
+    with pytest.raises(Exception, match="intersects the Earth"):
         bench.device.parameters.set({"orbit_semi_major_axis": 6000.0})
-    with pytest.raises(Exception, match="meets the Earth"):
+    with pytest.raises(Exception, match="intersects the Earth"):
         bench.device.parameters.set({"orbit_semi_major_axis": 7000.0, "orbit_eccentricity": 0.2})
     bench.device.parameters.set({"orbit_semi_major_axis": 26600.0, "orbit_eccentricity": 0.7})
 

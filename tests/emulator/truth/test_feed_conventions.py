@@ -117,8 +117,8 @@ def test_without_a_mount_the_truth_is_the_sensor_s():
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({}, "one of them"),
-        ({"euler_deg": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}, "one of them"),
+        ({}, "give one of"),
+        ({"euler_deg": [0, 0, 0], "quaternion_xyzw": [0, 0, 0, 1]}, "give one of"),
         ({"quaternion_xyzw": [0, 0, 0, 2]}, "length 1"),
         ({"matrix": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "right-handed"),
         ({"matrix": [[1, 0, 0], [0, 1, 0], [0, 0.1, 1]]}, "orthonormal"),
