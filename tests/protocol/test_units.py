@@ -197,7 +197,7 @@ def test_all_errors_are_listed(tmp_path):
         load_unit(tmp_path)
 
 
-def test_rows_that_are_bound_to_nothing_cannot_be_emulated(unit, tmp_path):
+def test_unbound_rows_cannot_be_emulated(unit, tmp_path):
     icd = unit(
         HEAD + telemetry('{ name = "a", type = "u8" }') + telecommand("").replace('action = "nothing"\n', "")
     )

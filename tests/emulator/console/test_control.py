@@ -88,7 +88,7 @@ def test_a_clock_that_passes_by_itself_cannot_be_stopped(run):
 
 
 @pytest.mark.parametrize("mount", [None, ALONG_X])
-def test_the_sensor_points_turns_and_stands_as_the_page_asks_however_it_is_mounted(run, mount):
+def test_the_sensor_points_turns_and_stops_as_the_page_asks_with_any_mount(run, mount):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:

@@ -15,7 +15,7 @@ from tests.emulator.console.pages import OPTIONS, Page
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 
 
-def test_a_telecommand_goes_over_a_link_and_its_outcome_comes_back(run):
+def test_a_telecommand_is_sent_over_a_link_and_its_outcome_shown(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:

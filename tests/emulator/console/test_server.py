@@ -270,7 +270,7 @@ def test_a_report_to_no_console_is_an_error_in_one_line(run):
         ("no.such.host:1", "cannot listen"),
     ],
 )
-def test_an_address_that_is_none_ends_the_start_in_one_line(run, where, said):
+def test_an_invalid_address_ends_startup_with_one_line(run, where, said):
     async def nothing(_emulation, _line):
         return
 

@@ -117,7 +117,7 @@ def test_a_run_continues_after_its_orbit_has_decayed(make_bench, caplog):
     assert caplog.text.count("has decayed; the run continues without an orbit") == 1
 
 
-def test_an_orbit_of_a_profile_that_is_none_names_the_profile(make_bench):
+def test_an_invalid_orbit_in_a_profile_names_the_profile(make_bench):
     tle = {"kind": "tle", "line1": "1", "line2": "2"}
     with pytest.raises(EmulatorError, match=r"profile .*: orbit: line 1 of the TLE"):
         make_bench(Profile.model_validate({"orbit": tle}))

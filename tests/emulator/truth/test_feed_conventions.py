@@ -51,7 +51,7 @@ def test_a_quaternion_of_each_convention_gives_the_same_attitude(convention, ord
 
 @pytest.mark.parametrize("sent", CONVENTIONS)
 @pytest.mark.parametrize("read", CONVENTIONS)
-def test_a_convention_that_is_not_the_senders_is_rejected_at_the_second_message(sent, read):
+def test_a_wrong_convention_is_rejected_at_the_second_message(sent, read):
     live = LiveTruth(Attitude.identity(), message_format=JsonFormat(*read))
     taken = [
         live.receive(line(0.1 * n, propagate(ORION, np.radians(RATE_DEG_S), 0.1 * n), *sent), 0.1 * n)
@@ -126,7 +126,7 @@ def test_without_a_mount_the_truth_is_the_sensor_s():
         ({"euler_deg": [0, 0, 0], "sequence": "124"}, "pattern"),
     ],
 )
-def test_a_mount_that_is_none_is_rejected(keys, said):
+def test_an_invalid_mount_is_rejected(keys, said):
     with pytest.raises(ValidationError, match=said):
         MountConfig.model_validate(keys)
 
