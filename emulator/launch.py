@@ -97,7 +97,7 @@ class Head:
         return self._faults
 
     def open_logs(self, options: RunOptions) -> None:
-        """Open the truth log, and that of the recording."""
+        """Open the truth log and the recording's truth log."""
         wall_times = self.emulation.clock.speed > 0.0
         if options.truth_log is not None:
             path = path_of_head(options.truth_log, self.number)
@@ -323,7 +323,7 @@ def check_heads(profiles: Sequence[Profile]) -> None:
     for profile in profiles:
         if profile is not first and profile.run.clock != first.run.clock:
             raise EmulatorError(
-                f"--head {profile.source}: run.clock is {profile.run.clock}, that of {first.source} "
+                f"--head {profile.source}: run.clock is {profile.run.clock}, but {first.source} has "
                 f"{first.run.clock}; heads share a clock, give --clock"
             )
         links = profile.links

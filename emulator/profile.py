@@ -132,7 +132,7 @@ class PowerConfig(Strict):
 
 
 class ThermalConfig(Strict):
-    """Temperature of the unit: that of the mounting, plus heating by the unit's power."""
+    """Temperature of the unit: the mounting's temperature plus heating by the unit's power."""
 
     mounting_c: Annotated[float, Field(ge=-100.0, le=150.0)] = 20.0
     """Mean temperature of the mounting, degrees Celsius."""

@@ -95,8 +95,8 @@ class StepPump:
     Parameters
     ----------
     devices
-        Scheduler and pipeline of each device on the clock. Of simultaneous events, those of the first device
-        run first.
+        Scheduler and pipeline of each device on the clock. Simultaneous events run in the
+        order of the devices.
     transports
         Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not wait for its
         transport until it reads again.

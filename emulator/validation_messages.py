@@ -98,7 +98,7 @@ def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str],
 
 
 def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
-    """Return the discriminator values of a model: those of fields with a single allowed value."""
+    """Return the discriminator values of a model: the values of fields that allow only one."""
     literals = (
         get_args(field.annotation)
         for field in model.model_fields.values()

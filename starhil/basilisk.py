@@ -46,7 +46,7 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
     lockstep : bool
         Whether to wait for the answer to each message; TCP only.
     epoch_unix_s : float, optional
-        Date of simulation time zero, as Unix time; default: that of the emulator.
+        Date of simulation time zero, as Unix time; default: the emulator's date.
 
     Attributes
     ----------

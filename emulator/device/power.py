@@ -105,7 +105,7 @@ class PowerModel:
 
 
 class ThermalModel:
-    """Temperature of the unit: that of the mounting, which follows the orbit, plus heating by its power.
+    """Temperature of the unit: the mounting's temperature, which follows the orbit, plus heating by power.
 
     The heating follows the mean power with one time constant.
     """

@@ -90,7 +90,7 @@ def _turns(device: Device) -> list[np.ndarray]:
 
 @cache
 def axes_turns(conventions: Conventions) -> list[np.ndarray]:
-    """Return the rotation vector from the axes of the sensor to those of the reported frame, radians."""
+    """Return the rotation vector from sensor axes to reported axes, radians."""
     matrix = np.array(conventions.rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
     sine = float(np.linalg.norm(axis))

@@ -130,9 +130,9 @@ class FrameRequest:
     faults
         Fields of the sky objects that are overridden by the control channel.
     temperature_c
-        Temperature of detector and lens, °C; None: that of the sensor model.
+        Temperature of detector and lens, °C; None: as in the sensor model.
     particles_s
-        Particles per second that hit the detector, in addition to those of the sky.
+        Particles per second that hit the detector, in addition to the sky's particles.
     upsets
         Bits flipped by radiation in the unit's star catalogue.
     unix_s

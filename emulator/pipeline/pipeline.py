@@ -377,7 +377,7 @@ def detection_settings(known: DetectionSettings, settings: SolverSettings) -> De
 
 
 def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
-    """Return the camera as calibrated in the device parameters; other constants are those of the optics."""
+    """Return the camera as calibrated in the device parameters; other constants come from the optics."""
     return Camera(
         optics.width,
         optics.height,

@@ -167,7 +167,7 @@ class FixedConfig(Strict):
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """The attitude."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
@@ -184,7 +184,7 @@ class RateConfig(Strict):
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the rotation begins now."""
@@ -259,7 +259,7 @@ class SlewConfig(Strict):
     repeat: bool = False
     """Whether to start again after the last segment."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -279,7 +279,7 @@ class FileConfig(Strict):
     repeat: bool = False
     """Whether to start again after the last row."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then that of the body."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""

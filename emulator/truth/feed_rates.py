@@ -60,8 +60,8 @@ class FeedRates:
     Parameters
     ----------
     timed
-        Whether times are those of the sender; otherwise they are times of receipt, and only the directions of
-        rotations are checked.
+        Whether times are from the sender's clock; otherwise they are times of receipt, and only the
+        directions of rotations are checked.
     """
 
     def __init__(self, *, timed: bool) -> None:

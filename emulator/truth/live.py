@@ -166,7 +166,7 @@ class LiveTruth:
             self._times.clear()
             self._states.clear()
         else:
-            raise FeedError(f"its time is {self._times[-1] - t:.3g} s before that of the previous message")
+            raise FeedError(f"its time is {self._times[-1] - t:.3g} s before the previous message's")
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""

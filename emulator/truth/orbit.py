@@ -203,7 +203,7 @@ class TleOrbit:
         error, position_km, velocity_km_s = self._satellite.sgp4(UNIX_EPOCH_JD + days, seconds / DAY_S)
         if error:
             raise EmulatorError(
-                f"orbit: TLE: {_sgp4_error(error)}; give a TLE of a date closer to that of the run"
+                f"orbit: TLE: {_sgp4_error(error)}; give a TLE with an epoch closer to the run's date"
             )
         tt = terrestrial_time(unix_s)
         equinoxes = float(erfa.ee00b(*tt))

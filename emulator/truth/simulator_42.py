@@ -10,7 +10,7 @@ A message is a block of text lines that ends with ``[ENDMSG]``::
     [ENDMSG]
 
 ``qn`` is an attitude quaternion J2000 → body, scalar last, the conjugate of the quaternion used here. ``wn`` is the
-body rate in the body frame, rad/s. ``PosN`` and ``VelN`` are those of the reference orbit, to which ``SC[0].PosR`` and
+body rate in the body frame, rad/s. ``PosN`` and ``VelN`` describe the reference orbit, to which ``SC[0].PosR`` and
 ``VelR`` are added. Older versions of 42 write no brackets, and only ``SC[0].B[0].qn``. If blocking is enabled, 42
 waits for four bytes, ``Ack`` and a zero, after each message.
 """

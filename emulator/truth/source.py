@@ -1,7 +1,7 @@
 """Truth sources: the true attitude and body rate of the sensor at any simulation time.
 
 A source has neither clock nor socket; `state(t)` depends only on the time and the received data. Some sources also
-provide date and orbit; otherwise `TruthState.completed` adds those of the run.
+provide date and orbit; otherwise `TruthState.completed` adds the run's.
 """
 
 from __future__ import annotations

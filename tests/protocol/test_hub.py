@@ -329,7 +329,7 @@ def test_any_text_is_a_frame_or_a_command_error(text: bytes) -> None:
             assert "CAN" in str(error)  # noqa: PT017
 
 
-# -- a log that cannot be written, a host that is none ------------------------------------------------------------------
+# -- a log that cannot be written, an invalid host ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("at", ["write", "flush", "close"])

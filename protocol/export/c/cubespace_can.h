@@ -21,7 +21,7 @@ typedef struct {
 /* Number of frames of a request with `size` bytes of data. */
 #define UNIT_CAN_FRAMES(size) ((size) <= 8u ? 1u : ((size) + 6u) / 7u)
 
-/* Make frame `number`, from 0, of a request from the address of the OBC to that of the unit: a telecommand with its
+/* Make frame `number`, from 0, of a request from the OBC's address to the unit's: a telecommand with its
  * encoded data, or a telemetry ID without data. Return false if the request has no such frame. */
 bool unit_can_request(uint8_t id, const uint8_t *data, size_t size, uint8_t address, uint8_t device, size_t number,
                       unit_can_frame_t *frame);

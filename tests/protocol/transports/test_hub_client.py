@@ -1,4 +1,4 @@
-"""The CAN bus over TCP from its clients' side: a hub that goes, hangs, comes back, or is none."""
+"""The CAN bus over TCP from its clients' side: a hub that ends, hangs, restarts, or is no hub."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-// Dark or light theme: the user's choice, or else that of the system.
+// Dark or light theme: the user's choice, or else the system's.
 
 const listeners = [];
 
