@@ -193,7 +193,7 @@ class RowModel(_Model):
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
     fields: list[FieldModel] | None = None
-    """Fields, in their order on the wire, after those of `include`; each is a table or a string (`text`)."""
+    """Fields in wire order, after the fields of `include`; each is a table or a string (`text`)."""
     include: list[str] | None = None
     """Rows whose fields this row concatenates, in order."""
     unbound: Literal["zeros"] | None = None
@@ -206,7 +206,7 @@ class RowModel(_Model):
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     answer: list[str] | None = None
-    """Answers, in order: `echo`, `reply`, `row:NAME`; default: those of the class."""
+    """Answers, in order: `echo`, `reply`, `row:NAME`; default: the answers of the class."""
 
 
 class ParameterModel(_Model):
@@ -219,7 +219,7 @@ class ParameterModel(_Model):
     type: ParameterType | None = None
     """Type on the wire."""
     unit: str | None = None
-    """Unit; must be that of the device model."""
+    """Unit; must be the one in the device model."""
     min: float | None = None
     """Lowest value."""
     max: float | None = None
