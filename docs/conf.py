@@ -47,7 +47,7 @@ LINKS = {
 
 
 def put_readme_first(_app: Sphinx, page: str, source: list[str]) -> None:
-    """Begin the front page with the README, its links turned to those of the pages here."""
+    """Begin the front page with the README, with its links pointing to the pages here."""
     if page == "index":
         text = (Path(__file__).resolve().parent.parent / "README.md").read_text(encoding="utf-8")
         for there, here in LINKS.items():

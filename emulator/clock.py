@@ -1,6 +1,6 @@
-"""Simulation time, and the device's Unix clock derived from it.
+"""Simulation time, and the Unix clock of the device, which is derived from it.
 
-Simulation time counts nanoseconds since the start of the run. The model uses no other time; only
+Simulation time is counted in nanoseconds since the start of the run. The model uses no other time; only
 `RealClock` and `ScaledClock` read the wall clock.
 """
 
@@ -35,7 +35,7 @@ class Clock(Protocol):
 
 
 class ScaledClock:
-    """Simulation time that passes `speed` times as fast as wall time."""
+    """A clock that runs `speed` times as fast as wall time."""
 
     def __init__(self, speed: float) -> None:
         if not 0.0 < speed <= MAX_SCALE:
@@ -54,7 +54,7 @@ class ScaledClock:
 
 
 class RealClock(ScaledClock):
-    """Simulation time that passes as fast as wall time; setting the wall clock does not affect it."""
+    """A clock that runs as fast as wall time; setting the wall clock does not affect it."""
 
     def __init__(self) -> None:
         super().__init__(1.0)
@@ -66,7 +66,7 @@ class RealClock(ScaledClock):
 
 
 class SteppedClock:
-    """Simulation time that advances only on request, so that the same run gives the same bytes."""
+    """A clock that advances only on request, so that the same run gives the same bytes."""
 
     name: Final = "stepped"
     speed: Final = 0.0
@@ -84,7 +84,7 @@ class SteppedClock:
         Raises
         ------
         EmulatorError
-            The time is earlier than the present one.
+            The time is earlier than the current one.
         """
         if now_ns < self._now_ns:
             raise EmulatorError(f"clock: cannot go back from {self._now_ns} ns to {now_ns} ns")
@@ -108,7 +108,7 @@ def make_clock(text: str) -> RealClock | ScaledClock | SteppedClock:
 
 @dataclass
 class DeviceTime:
-    """The device's Unix time: simulation time plus an offset that telecommand 2 sets.
+    """Unix time of the device: simulation time plus an offset, which telecommand 2 sets.
 
     Attributes
     ----------
@@ -129,6 +129,6 @@ class DeviceTime:
         return (self.clock.now_ns() if run_ns is None else run_ns) + self.offset_ns
 
     def set_unix_ns(self, unix_ns: int) -> None:
-        """Set the present Unix time, nanoseconds."""
+        """Set the current Unix time, nanoseconds."""
         self.offset_ns = unix_ns - self.clock.now_ns()
         self.was_set = True

@@ -1,4 +1,4 @@
-"""An emulation: device, pipeline, links, truth and clock, opened, started and closed together."""
+"""An emulation: device, pipeline, links, truth and clock."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from starid.attitude import Attitude
 log = logging.getLogger("starhil.run")
 
 PATIENCE_S: Final = 8.0
-"""Time after which a slow start is explained in the log, seconds."""
+"""Time after which the log explains a slow start, seconds."""
 
 
 class Emulation:
@@ -63,18 +63,18 @@ class Emulation:
     worker
         Pipeline worker that was started earlier; by default one is started here.
     leader
-        The first head, if this is a further one: it shares that head's clock and truth.
+        The first head, for a further head, which shares its clock and truth.
     tape
         Records the run, or plays a recording.
     previews
-        Somebody may look at the frames.
+        Whether frames may be displayed.
 
     Attributes
     ----------
     icd
         Interface definition of the profile's unit.
     ready_fields
-        Fields of the ready line: which port, bus or address was opened for what.
+        Fields of the ready line: the opened ports, buses and addresses.
     heads
         The heads that share clock and truth, the leader first.
     body_truth
@@ -124,7 +124,7 @@ class Emulation:
 
     @property
     def requests(self) -> Requests:
-        """The device's handling of requests.
+        """Request handling of the device.
 
         Raises
         ------
@@ -157,7 +157,7 @@ class Emulation:
         return ThreadImager(setup)
 
     async def open(self) -> None:
-        """Open truth and links and switch the device on; its time is stopped until `begin`.
+        """Open truth and links and switch the device on; time is stopped until `begin`.
 
         Raises
         ------
@@ -184,7 +184,7 @@ class Emulation:
             raise
 
     def begin(self) -> None:
-        """Let time pass and start the pipeline; `ready` waits for it."""
+        """Start time and the pipeline; `ready` waits for the pipeline."""
         device = self.device
         if isinstance(self.clock, SteppedClock):
             if self.leader is self:
@@ -204,7 +204,7 @@ class Emulation:
 
     @property
     def _state_dir(self) -> Path | None:
-        """Folder of the state that survives a restart; None to keep it in memory."""
+        """Folder for state that survives a restart; None: it is kept in memory."""
         state_dir = self.profile.run.state_dir
         return self.profile.folder / Path(state_dir).expanduser() if state_dir else None
 
@@ -241,7 +241,7 @@ class Emulation:
         leader.replace_truth(truth, config)
 
     async def play_truth(self, config: TruthConfig, start_s: float) -> None:
-        """Replace the truth as a recorded command did, with time zero of its motion at `start_s` seconds."""
+        """Replace the truth as in a recorded command, with time zero of its motion at `start_s` seconds."""
         truth = await self._open_truth(config)
         if isinstance(truth, FileTruth | SlewTruth):
             truth.start_s = start_s
@@ -261,12 +261,12 @@ class Emulation:
             head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
 
     def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
-        """Return the truth of this head, at the mount of a configuration, else of its profile."""
+        """Return the truth of this head, with the mount in a configuration, or else in its profile."""
         mount = config.mount or self.profile.truth.mount
         return mounted(truth, None if mount is None else mount.build())
 
     async def _open_truth(self, config: TruthConfig) -> TruthSource:
-        """Build a truth source, with its socket if it is a live feed, and close the previous feed."""
+        """Build a truth source, with a socket for a live feed, and close the previous feed."""
         truth = await asyncio.to_thread(config.build, self._now_s(), self.profile.folder)
         if isinstance(truth, FileTruth) and isinstance(config, FileConfig) and config.start == "now":
             truth.start_s = self._now_s()  # reading has taken time
@@ -291,12 +291,12 @@ class Emulation:
         return truth
 
     def _enter(self, kind: str, **values: object) -> None:
-        """Note an entry on the tape, if there is one."""
+        """Record an entry on the tape, if there is one."""
         if self.tape is not None:
             self.tape.enter(kind, **values)
 
     def _message_received(self, data: bytes) -> None:
-        """Note a message of the feed."""
+        """Record a message of the feed."""
         self._enter("feed", data=data.decode("latin-1"))
 
     def _now_s(self) -> float:
@@ -304,7 +304,7 @@ class Emulation:
         return self.clock.now_ns() / NANOSECONDS
 
     def _is_lockstep(self, config: FeedConfig) -> bool:
-        """Whether the messages of a feed are to advance the clock."""
+        """Return whether the messages of a feed advance the clock."""
         stepped = self.profile.run.clock == "stepped"
         if isinstance(config, Config42):
             return stepped
@@ -315,7 +315,7 @@ class Emulation:
         return config.lockstep
 
     async def _step_in_lock(self, seconds: float) -> None:
-        """Advance the clock for a simulator, once every head is ready."""
+        """Advance the clock for a simulator, after waiting until every head is ready."""
         if self.tape is not None and self.tape.plays:
             return  # the events of the step are on the tape
         for head in self.heads:
@@ -363,17 +363,17 @@ class Emulation:
 
     @property
     def _canopen_wanted(self) -> bool:
-        """Whether a node is asked for, or CANopen is the only link that the unit has."""
+        """Return whether a node is requested, or CANopen is the only link of the unit."""
         links = self.profile.links
         return bool(links.canopen.node) or (self.icd.canopen_only and links.can.channel != "off")
 
     def _check_links(self) -> None:
-        """Check that the unit has one of the links that the profile asks for; note those that it lacks.
+        """Check that the unit has at least one of the requested links; log those that it lacks.
 
         Raises
         ------
         EmulatorError
-            It has none of them, a CANopen node is asked for and it has no CANopen, or it lacks the dialect.
+            The unit has none of them, no CANopen node though one is requested, or not the requested dialect.
         """
         links, has, name = self.profile.links, self.icd.link, self.icd.name
         canopen = self.icd.canopen is not None
@@ -394,13 +394,13 @@ class Emulation:
                 log.warning("links.%s: unit %s has no such link; it is not opened", key, name)
 
     def _can_transport(self, name: str, channel: str) -> Transport[CanFrame]:
-        """Return the transport of a CAN link, on the tape if there is one."""
+        """Return the transport of a CAN link, connected to the tape if there is one."""
         from starhil.protocol.transports.can import open_can
 
         return open_can(channel) if self.tape is None else self.tape.can(name, lambda: open_can(channel))
 
     async def _open_canopen(self, requests: Requests) -> None:
-        """Open the CANopen link on the bus of the CAN link, or on the bus in its setting."""
+        """Open the CANopen link on the bus of the CAN link, or on the configured bus."""
         from starhil.emulator.links.canopen import open_canopen
 
         channel = self.profile.links.can.channel
@@ -414,11 +414,11 @@ class Emulation:
 
     @property
     def links(self) -> list[Link]:
-        """Links in the order in which they are closed: the CAN link may hold the hub of the bus."""
+        """Links in closing order; the CAN link is last because it may run the hub of the bus."""
         return [link for link in (self.serial, self.canopen, self.can) if link is not None]
 
     async def _warm_up(self) -> None:
-        """Wait for the pipeline; the device then leaves the boot mode when its boot time is over."""
+        """Wait for the pipeline; after that, the device leaves the boot mode at the end of its boot time."""
         device = self.device
         try:
             self.warm = await self.imager.start()
@@ -438,12 +438,12 @@ class Emulation:
             self._awake.set()
 
     async def ready(self) -> str:
-        """Wait until the device takes commands; return the ready line.
+        """Wait until the device accepts commands; return the ready line.
 
         Raises
         ------
         EmulatorError
-            The pipeline cannot start, for example for want of a catalogue; one line.
+            The pipeline cannot start, for example because there is no catalogue; one line.
         """
         awake = asyncio.create_task(self._awake.wait())
         patience = asyncio.get_running_loop().call_later(PATIENCE_S, _warn_of_first_compilation)
@@ -466,9 +466,9 @@ class Emulation:
         return "ready " + " ".join(f"{key}={value}" for key, value in fields.items())
 
     async def close(self) -> None:
-        """Close everything: links first, so that no more requests arrive, then the pipeline and the files.
+        """Close everything: links first, so that no more requests arrive, then pipeline and files.
 
-        An error in closing one is logged, and the others are closed all the same.
+        If closing one of them fails, the error is logged and the others are closed.
         """
         closers: list[Callable[[], object]] = []
         if self._pump is not None:
@@ -493,7 +493,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 def pipeline_setup(profile: Profile, *, repeatable: bool = False) -> PipelineSetup:
-    """Return the pipeline configuration of a profile; `repeatable` if no result may depend on the machine's speed."""
+    """Return the pipeline configuration of a profile; `repeatable`: results independent of machine speed."""
     path = profile.catalog.path
     return PipelineSetup(
         camera=profile.camera.values(),
@@ -527,7 +527,7 @@ def camera_constants(warm: PipelineReady) -> dict[str, Value]:
 
 
 def _warn_of_first_compilation() -> None:
-    log.warning("a first start compiles its kernels, about a minute; the links answer already")
+    log.warning("the first start compiles kernels for about a minute; the links already answer")
 
 
 def _log_frame(measurement: Measurement) -> None:

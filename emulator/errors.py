@@ -1,4 +1,4 @@
-"""The base class of the emulator's errors for users."""
+"""Base class of the emulator's errors."""
 
 
 class EmulatorError(Exception):

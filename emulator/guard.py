@@ -18,7 +18,7 @@ Arguments = ParamSpec("Arguments")
 
 
 def one_line(error: BaseException) -> str:
-    """Return the type, text and origin of an unexpected error in one line."""
+    """Return type, text and origin of an unexpected error in one line."""
     text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
     frames = traceback.extract_tb(error.__traceback__)
     if not frames:
@@ -28,7 +28,7 @@ def one_line(error: BaseException) -> str:
 
 
 def log_internal_error(what: str, error: Exception) -> None:
-    """Log an unexpected error in one line, and its traceback at level debug."""
+    """Log an unexpected error in one line, with its traceback at level debug."""
     log.error("%s: internal error: %s", what, one_line(error))
     log.debug("%s", what, exc_info=error)
 
@@ -36,7 +36,7 @@ def log_internal_error(what: str, error: Exception) -> None:
 def call_guarded(
     what: str, callback: Callable[Arguments, object], *args: Arguments.args, **kwargs: Arguments.kwargs
 ) -> None:
-    """Call back; an exception is logged as an internal error and not raised."""
+    """Call a function; an exception is logged as an internal error and not raised."""
     try:
         callback(*args, **kwargs)
     except Exception as error:  # noqa: BLE001 (whatever it is, the caller has more to do)
@@ -44,7 +44,7 @@ def call_guarded(
 
 
 async def close_all(closers: Sequence[Callable[[], object]]) -> None:
-    """Call each closer in order and await it where needed; one that fails is logged, and keeps no other open."""
+    """Call, and await if needed, each closer in order; a failure is logged, and the others are called."""
     async with AsyncExitStack() as stack:
         for close in reversed(closers):
             stack.push_async_callback(_close_guarded, close)

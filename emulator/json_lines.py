@@ -1,4 +1,4 @@
-"""JSON objects, one per line: lines of limited length, without repeated keys."""
+"""JSON objects, one per line, with limited length and without repeated keys."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 async def read_lines(reader: asyncio.StreamReader, end: bytes = b"\n") -> AsyncIterator[bytes | None]:
     """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped.
 
-    `end` is what ends a line.
+    `end` is the line terminator.
     """
     too_long = False
     while True:

@@ -1,4 +1,4 @@
-"""The composition root: makes one or several heads with truth logs, faults, scenario, control channel and console."""
+"""The composition root: builds one or several heads with truth logs, faults, scenario, control channel and console."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class RunOptions:
     overwrite
         Replace an existing truth log.
     control
-        `off`, `auto` (a Unix socket for this user alone), unix:/PATH or HOST:PORT.
+        `off`, `auto` (a Unix socket that only this user can open), unix:/PATH or HOST:PORT.
     control_token
-        Token that each request on the control channel must carry; empty for none.
+        Token that each request on the control channel must contain; empty for none.
     scenario
         Name or path of a scenario; empty for none.
     record
@@ -47,7 +47,7 @@ class RunOptions:
     mcap
         MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`).
     make_client
-        Makes the OBC of console and MCAP file; needed for these two.
+        Makes the OBC for console and MCAP file; required for these.
     """
 
     truth_log: Path | None = None
@@ -62,17 +62,17 @@ class RunOptions:
 
     @property
     def watched(self) -> bool:
-        """Whether a console or an MCAP file shows the images."""
+        """Whether a console or an MCAP file uses the images."""
         return self.view != "off" or self.mcap is not None
 
 
 class Head:
-    """One device of a run, with its faults and its truth log.
+    """One device of a run, with its faults and truth log.
 
     Parameters
     ----------
     number
-        1 for the first head.
+        Number of the head; the first is 1.
     emulation
         Device, pipeline and links.
     """
@@ -97,7 +97,7 @@ class Head:
         return self._faults
 
     def open_logs(self, options: RunOptions) -> None:
-        """Open the truth log, and the recording's."""
+        """Open the truth log and the recording's truth log."""
         wall_times = self.emulation.clock.speed > 0.0
         if options.truth_log is not None:
             path = path_of_head(options.truth_log, self.number)
@@ -113,7 +113,7 @@ class Head:
         emulation.device.on_frame += [log.write for log in self._truth_logs]
 
     def enter(self, scenario: Scenario) -> None:
-        """Schedule a scenario; its truth is set once, by the first head."""
+        """Schedule a scenario; only the first head sets its truth."""
         emulation = self.emulation
         set_truth = emulation.set_truth if self.number == 1 else _leave_truth
         scenario.enter(emulation.device.scheduler, self.faults, set_truth, emulation.profile.folder)
@@ -141,12 +141,12 @@ class Run:
     Attributes
     ----------
     ended
-        Set when the run is to end.
+        Set to end the run.
 
     Raises
     ------
     EmulatorError
-        Two heads exclude each other; one line.
+        Two heads are incompatible; one line.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Run:
         self._recorder: Recorder | None = None
         if self.options.record is not None:
             if others:
-                raise EmulatorError("--record: records one head; run the others apart, or leave it out")
+                raise EmulatorError("--record: records one head; run the others separately, or omit it")
             from starhil.emulator.replay import prepare_recording
 
             prepare_recording(self.options.record, profile, self.options.scenario)
@@ -182,7 +182,7 @@ class Run:
         return self.heads[0].faults
 
     async def start(self) -> None:
-        """Open files, links and control channel, switch the devices on and let time pass.
+        """Open files, links and control channel, switch the devices on and start time.
 
         Raises
         ------
@@ -217,9 +217,9 @@ class Run:
             head.emulation.begin()
 
     async def ready(self) -> str:
-        """Wait until every device takes commands; return the ready line.
+        """Wait until every device accepts commands; return the ready line.
 
-        Fields of the nth head end in `.n`, but for the first head.
+        The names of the fields of the nth head end in `.n`, except for the first head.
 
         Raises
         ------
@@ -293,12 +293,12 @@ class Run:
 
 
 def path_of_head(path: Path, number: int) -> Path:
-    """Return the path of a head's file: of the second head, `truth.2.csv` for `truth.csv`."""
+    """Return the path of a file of a head: for the second head, `truth.2.csv` instead of `truth.csv`."""
     return path if number == 1 else path.with_name(f"{path.stem}.{number}{path.suffix}")
 
 
 def with_own_seeds(profiles: Sequence[Profile]) -> list[Profile]:
-    """Return the profiles of heads with a seed each: one that an earlier head has is increased until it is free."""
+    """Return the profiles with distinct seeds: a seed that an earlier head has is increased until unused."""
     seeds: set[int] = set()
     found: list[Profile] = []
     for profile in profiles:
@@ -316,14 +316,14 @@ def check_heads(profiles: Sequence[Profile]) -> None:
     Raises
     ------
     EmulatorError
-        They cannot; the text names the two profiles and the key to change.
+        They are incompatible; the text names the two profiles and the key to change.
     """
     first = profiles[0]
     taken: dict[tuple[str, str, int], Profile] = {}
     for profile in profiles:
         if profile is not first and profile.run.clock != first.run.clock:
             raise EmulatorError(
-                f"--head {profile.source}: run.clock is {profile.run.clock}, that of {first.source} "
+                f"--head {profile.source}: run.clock is {profile.run.clock}, but {first.source} has "
                 f"{first.run.clock}; heads share a clock, give --clock"
             )
         links = profile.links
@@ -339,14 +339,14 @@ def check_heads(profiles: Sequence[Profile]) -> None:
             if other is not profile:
                 value = number or bus
                 raise EmulatorError(
-                    f"--head {profile.source}: {key} is {value}, as that of {other.source}; give it another"
+                    f"--head {profile.source}: {key} is {value}, as in {other.source}; change one of them"
                 )
 
 
 def _fixed_port(port: str) -> str:
-    """Return the port of a serial link that only one head can have, else an empty text."""
+    """Return the port of a serial link if only one head can use it, otherwise an empty text."""
     return "" if port in ("auto", "off") or port.endswith(":0") else port
 
 
 def _leave_truth(_truth: TruthSource, _config: TruthConfig) -> None:
-    """Leave the truth to the first head."""
+    """Do nothing: the first head sets the truth."""

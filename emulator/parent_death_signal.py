@@ -1,4 +1,4 @@
-"""Ends a child process when its parent ends for any reason."""
+"""Ends a child process when its parent ends, for whatever reason."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ PR_SET_PDEATHSIG: Final = 1
 
 
 def end_with_parent(parent: int | None = None, number: int = signal.SIGKILL) -> None:
-    """Make the kernel send this process a signal when the thread that started it ends.
+    """Have the kernel send this process a signal when the thread that started it ends.
 
     Parameters
     ----------
     parent
-        Process ID of the expected parent. If it has ended before this call, the signal is raised here.
+        Process ID of the expected parent. If it ended before this call, the signal is raised here.
     number
         Signal number.
 

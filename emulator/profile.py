@@ -1,7 +1,7 @@
 """Device profiles: TOML files that configure camera, sensor, truth, links and parameters of a run.
 
-A profile may extend another (`extends = "ideal"`, or a path relative to the file) and override its
-keys. Every key is validated; an error names the file, the key and the remedy.
+A profile may extend another (`extends = "ideal"`, or a path relative to the file) and override its keys. Every key
+is validated; an error names the file, the key and the remedy.
 """
 
 from __future__ import annotations
@@ -43,26 +43,26 @@ class RunConfig(Strict):
     """Seed, clock, algorithm and saved state of a run."""
 
     seed: Annotated[int, Field(ge=0, le=2**63 - 1)] = 1
-    """Seed of all noise and faults; the same seed, profile and commands give the same bytes on the stepped
-    clock."""
+    """Seed of all noise and faults; on the stepped clock, the same seed, profile and commands give the same
+    bytes."""
     clock: str = "real"
-    """`real`, `scaled:FACTOR` or `stepped` (time passes only by the control channel's `step`)."""
+    """`real`, `scaled:FACTOR` or `stepped` (advances only by `step` on the control channel)."""
     algorithm: Literal["geometric", "lsi", "rsi"] = "geometric"
-    """Star identification: the product's own (`geometric`), or one of the thesis (`lsi`, `rsi`)."""
+    """Star identification algorithm: `geometric`, or one of the thesis (`lsi`, `rsi`)."""
     worker: Literal["process", "thread"] = "process"
-    """Where frames are rendered and solved: in a worker process, or in a thread of the emulator."""
+    """Whether frames are rendered and solved in a worker process or in a thread of the emulator."""
     state_dir: str = ""
-    """Folder for what survives a restart: saved parameters, boot count, CANopen settings. Empty: nothing
-    does."""
+    """Folder for state that survives a restart: saved parameters, boot count, CANopen settings. Empty: no
+    state is kept."""
     start_unix_s: Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S)] = 1_767_225_600.0
-    """The device's clock at the start of the run, until it is set: 2026-01-01."""
+    """Device clock at the start of the run, until it is set; default: 2026-01-01."""
 
 
 class CatalogConfig(Strict):
     """The star catalogue."""
 
     path: str = ""
-    """Another Hipparcos file; empty: the installed catalogue."""
+    """Hipparcos file; empty: the installed catalogue."""
     epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] = 2026.0
     """Julian year of the star positions."""
 
@@ -75,11 +75,11 @@ class CameraConfig(Strict):
     height: Annotated[int, Field(ge=64, le=4096)] = 937
     """Rows of the pixel array."""
     fov_deg: Annotated[float, Field(ge=1.0, le=120.0)] | None = None
-    """Field of view from edge to edge along a row; 42 if neither this nor `focal_px` is given."""
+    """Field of view along a row, edge to edge; 42 if neither this nor `focal_px` is given."""
     focal_px: Annotated[list[FocalLength], Field(min_length=2, max_length=2)] | None = None
     """Focal length along x and y, instead of `fov_deg`."""
     centre_px: Annotated[list[PixelPosition], Field(min_length=2, max_length=2)] | None = None
-    """Where the optical axis meets the pixel array; default: the middle."""
+    """Position of the optical axis on the pixel array; default: the centre."""
     model: Literal["pinhole", "equidistant", "flat"] = "pinhole"
     """Projection of the lens."""
     distortion: list[DistortionTerm] = Field(default_factory=list, max_length=5)
@@ -94,7 +94,7 @@ class CameraConfig(Strict):
 
 
 class DeviceConfig(Strict):
-    """The unit's identification, boot time and rate estimation."""
+    """Identification, boot time and rate estimation of the unit."""
 
     node_type: Annotated[int, Field(ge=0, le=255)] = 0x53
     """Reported in `identification` (128)."""
@@ -107,32 +107,32 @@ class DeviceConfig(Strict):
     boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
     """Minimum time in boot mode."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
-    """Number of valid frames for the body rate, if the star identifier does not estimate it."""
+    """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
-    """Frames averaged on the ground into the dark frame that the unit subtracts from each image; 0: none."""
+    """Number of frames averaged into the dark frame that the unit subtracts from each image; 0: none."""
 
 
 class PowerConfig(Strict):
-    """What the unit draws in each phase of a frame: the first CubeStar's published currents."""
+    """Current of the unit in each phase of a frame; the defaults are published for the first CubeStar."""
 
     voltage_v: Annotated[float, Field(ge=0.1, le=100.0)] = 3.3
     """Supply voltage."""
     idle_ma: Milliamperes = 71.0
     """Current while idle, and in modes without frames."""
     imager_on_ma: Milliamperes = 121.0
-    """Current from switching on the imager to the exposure."""
+    """Current between switching on the imager and the exposure."""
     exposure_ma: Milliamperes = 177.0
     """Current during exposure, read-out and processing."""
     transfer_ma: Milliamperes = 82.0
     """Current while the result is transferred."""
     imager_on_s: FrameSeconds = 0.068
-    """Time by which the imager is on before an exposure."""
+    """Time from switching on the imager to the exposure."""
     transfer_s: FrameSeconds = 0.404
     """Duration of the transfer."""
 
 
 class ThermalConfig(Strict):
-    """Temperature of the unit: its mounting's, and what its own power adds."""
+    """Temperature of the unit: the mounting's temperature plus heating by the unit's power."""
 
     mounting_c: Annotated[float, Field(ge=-100.0, le=150.0)] = 20.0
     """Mean temperature of the mounting, degrees Celsius."""
@@ -141,7 +141,7 @@ class ThermalConfig(Strict):
     period_s: Annotated[float, Field(ge=1.0, le=1e6)] = 5700.0
     """Period of that variation."""
     heating_c_w: Annotated[float, Field(ge=0.0, le=1000.0)] = 0.0
-    """Rise of detector and lens above the mounting for each watt of mean power, in the end."""
+    """Steady-state temperature rise of detector and lens above the mounting per watt of mean power."""
     time_constant_s: Annotated[float, Field(ge=0.1, le=1e6)] = 600.0
     """Time constant of that rise."""
 
@@ -152,22 +152,21 @@ class RadiationConfig(Strict):
     quiet_s: ParticleRate = 0.0
     """Particles per second outside the South Atlantic Anomaly."""
     anomaly_s: ParticleRate = 0.0
-    """Particles per second in addition in its centre at an altitude of 500 km; needs a truth with a
-    position."""
+    """Additional particles per second in the centre of the anomaly at an altitude of 500 km; needs a truth
+    with a position."""
 
 
 class ImagesConfig(Strict):
-    """Source of images instead of rendered ones; `[camera]` then describes the camera that takes them."""
+    """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
     folder: str = ""
-    """Folder of PNG, TIFF or JPEG images, taken in the order of their names; relative to the profile's
-    folder."""
+    """Folder of PNG, TIFF or JPEG images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
-    """Number of a camera (0 is the first), or a video file, as OpenCV's `VideoCapture` opens it."""
+    """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
-    """Begin the folder again after its last image."""
+    """Whether to start again after the last image in the folder."""
     dark: str = ""
-    """Image of the same camera and exposure without light, to subtract from each."""
+    """Dark image of the same camera and exposure, which is subtracted from each image."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -191,12 +190,12 @@ class ImagesConfig(Strict):
 
 
 class TimingConfig(Strict):
-    """Processing times of the emulated unit: reported in telemetry, and elapsed before a result is published."""
+    """Processing times of the emulated unit, which are reported in telemetry and delay the results."""
 
     readout_s: FrameSeconds = 0.020
     """Read-out of the detector."""
     detect_s: FrameSeconds = 0.040
-    """Detection, for any number of stars."""
+    """Detection, fixed part."""
     detect_per_star_s: Annotated[float, Field(ge=0.0, le=0.01)] = 0.00005
     """Detection, in addition for each star."""
     identify_lost_s: FrameSeconds = 0.020
@@ -211,13 +210,13 @@ class SerialConfig(Strict):
     port: str = "auto"
     """`auto` (a pty), a device path, `listen://HOST:PORT`, or `off`."""
     dialect: Literal["a", "b", "c"] = "b"
-    """Format of replies: `a` to a CubeComputer, `b` stand-alone node, `c` generation 2."""
+    """Format of replies: `a` for a CubeComputer, `b` for a stand-alone node, `c` for generation 2."""
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
-    """Limit transmission to the baud rate."""
+    """Whether transmission is limited to the bit rate."""
     symlink: str = ""
-    """Path of a link to the pty, made at start and removed at the end."""
+    """Path of a symbolic link to the pty, created at the start and removed at the end."""
 
 
 class CanConfig(Strict):
@@ -248,7 +247,7 @@ class LinksConfig(Strict):
     can: CanConfig = CanConfig()
     """The CAN bus."""
     canopen: CanopenConfig = CanopenConfig()
-    """The CANopen node on it."""
+    """The CANopen node on the CAN bus."""
 
 
 class Profile(Strict):
@@ -274,10 +273,9 @@ class Profile(Strict):
     truth: TruthConfig = FixedConfig(kind="fixed")
     """True attitude of the sensor."""
     orbit: OrbitConfig | None = None
-    """True orbit of the spacecraft; none: the sensor is at the Earth's centre, and the Earth is not in its
-    sky."""
+    """True orbit of the spacecraft. Without it, the sensor is at the Earth's centre and does not see it."""
     images: ImagesConfig = ImagesConfig()
-    """Images from elsewhere."""
+    """Images from a folder or a camera."""
     device: DeviceConfig = DeviceConfig()
     """Identification and boot."""
     timing: TimingConfig = TimingConfig()
@@ -291,9 +289,9 @@ class Profile(Strict):
     links: LinksConfig = LinksConfig()
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)
-    """Notes that `starhil calibrate` writes for people; not used."""
+    """Notes by `starhil calibrate` for the reader; not used."""
     health: dict[str, float] = Field(default_factory=dict)
-    """Numbers that a unit reports as the quantities `health.NAME`, such as temperatures, in the field's unit;
+    """Numbers reported as the quantities `health.NAME`, such as temperatures, in the unit of the field;
     default: 0."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Defaults of device parameters, named as in the interface definition."""
@@ -312,19 +310,19 @@ class Profile(Strict):
 
     @property
     def source(self) -> str:
-        """The profile's file, or its name if it has none, for messages."""
+        """File of the profile, or its name if there is none, for messages."""
         return self.name if self._source is None else str(self._source)
 
     @property
     def unit_source(self) -> str:
-        """The unit for `load_unit`: a bundled unit's name, else a folder relative to the profile's file."""
+        """The unit for `load_unit`: name of a bundled unit, or a folder relative to the profile."""
         if self.unit in bundled_units():
             return self.unit
         return str(self.folder / Path(self.unit).expanduser())
 
     @property
     def folder(self) -> Path:
-        """Folder of the profile's file, to which its relative paths refer."""
+        """Folder of the profile, to which its relative paths refer."""
         return Path() if self._source is None else self._source.parent
 
 
@@ -335,7 +333,7 @@ ALTERNATIVES: Final = (
 """Pairs of key sets that exclude each other in a table."""
 
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
-"""Device parameters that describe the camera; without them the device knows its camera exactly."""
+"""Device parameters that describe the camera; by default, the device is calibrated exactly."""
 
 LINK_PARAMETERS: Final[dict[str, str]] = {
     "serial_dialect": "links.serial.dialect",
@@ -358,7 +356,7 @@ def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
     Raises
     ------
     EmulatorError
-        No such profile; the message lists the known names.
+        There is no such profile; the message lists the known names.
     """
     folder = configs_folder() / "profiles"
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
@@ -404,7 +402,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
 
 
 def _source_of_key(path: Path, overrides: Sequence[str], why: str) -> str:
-    """Name the source of the key that `why` begins with: an override, or else the file."""
+    """Return the source of the key with which `why` begins: an override, or else the file."""
     wrong = why.partition(": ")[0]
     for override in reversed(overrides):
         key = override.partition("=")[0].strip()
@@ -431,14 +429,14 @@ def _read_extended(path: Path, depth: int) -> dict[str, Any]:
 
 
 def _drop_calibration(values: dict[str, Any]) -> None:
-    """Remove what a device knows of its camera, which is about to be replaced."""
+    """Remove the calibration of a camera that is going to be replaced."""
     parameters = values.get("parameters")
     if isinstance(parameters, dict):
         values["parameters"] = {key: value for key, value in parameters.items() if key not in CALIBRATION}
 
 
 def _replaced_by(given: Iterable[str]) -> set[str]:
-    """Return the keys of a table that these keys exclude."""
+    """Return the keys of a table that are excluded by the given ones."""
     return {
         key
         for one, other in ALTERNATIVES
@@ -451,7 +449,7 @@ def _replaced_by(given: Iterable[str]) -> set[str]:
 def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Merge `over` into `base`, table by table.
 
-    A table of another `kind` replaces the whole table, and keys in `over` remove their alternatives from
+    A table with another `kind` replaces the whole table, and keys in `over` remove their alternatives from
     `base` (field of view or focal lengths, angles or quaternion).
     """
     if "kind" in over and over["kind"] != base.get("kind"):
@@ -468,7 +466,7 @@ def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _apply_override(values: dict[str, Any], override: str) -> None:
-    """Set one `section.key=value`; a value that is not TOML is text."""
+    """Apply one `section.key=value`; a value that is not TOML is text."""
     key, equals, text = override.partition("=")
     names = [name.strip() for name in key.split(".")]
     if not equals or not all(names):
@@ -484,7 +482,7 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
             raise EmulatorError(f"--set {override}: {name} is a value, not a section")
         table = below
     if names[-1] == "kind":
-        value = text.strip().strip("\"'")  # a name, also where it is a number: 42
+        value = text.strip().strip("\"'")  # a name, even if it is a number: 42
     if names[-1] == "kind" and table.get("kind") != value:
         for other in set(table) - ({"attitude"} if value != "file" else set()):
             del table[other]

@@ -1,4 +1,4 @@
-"""Pumps that run the device's events: with the wall clock, or step by step."""
+"""Pumps that run the events of the device, with the wall clock or step by step."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ PEER_PATIENCE_S: Final = 1.0
 
 
 class ClockPump:
-    """Runs each event in the event loop when the clock reaches it.
+    """Runs each event in the event loop when it is due.
 
     Parameters
     ----------
     clock
-        Clock that passes.
+        Clock that runs by itself.
     tape
         Records the events.
     """
@@ -95,11 +95,11 @@ class StepPump:
     Parameters
     ----------
     devices
-        Scheduler and pipeline of each device on the clock. Of simultaneous events, the first device's run
-        first.
+        Scheduler and pipeline of each device on the clock. Simultaneous events run in the
+        order of the devices.
     transports
-        Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, its transport is not
-        waited for until it reads again.
+        Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not wait for its
+        transport until it reads again.
     tape
         Records the events.
     """
@@ -117,16 +117,16 @@ class StepPump:
         self._imagers = [imager for _, imager in devices]
         self._transports = transports
         self._stalled: dict[Transport[Any], int] = {}
-        """Transports that are not waited for, with the bytes or frames sent when the peer stopped reading."""
+        """Transports for which steps do not wait, with the items sent when the peer stopped reading."""
         self._lock = asyncio.Lock()
 
     async def step(self, seconds: float) -> None:
-        """Advance simulation time; all events within the step are done on return.
+        """Advance simulation time; on return, all events within the step are done.
 
         Raises
         ------
         EmulatorError
-            The step is not positive, or above `MAX_STEP_S`.
+            The step is not positive, or larger than `MAX_STEP_S`.
         """
         if not 0.0 < seconds <= MAX_STEP_S:
             raise EmulatorError(f"step: must be seconds in (0, {MAX_STEP_S:g}], not {seconds}")
@@ -162,7 +162,7 @@ class StepPump:
             await self._drain(transport)
 
     async def _drain(self, transport: Transport[Any]) -> None:
-        """Wait until a transport has sent everything, as long as its peer reads."""
+        """Wait until a transport has sent everything, while its peer reads."""
         sent = transport.statistics.sent
         if self._stalled.get(transport) == sent:
             return

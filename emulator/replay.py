@@ -1,4 +1,4 @@
-"""Recordings of runs: making the folder, and playing it again on the stepped clock, to the byte."""
+"""Recordings of runs: preparing the folder, and replaying it on the stepped clock."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ TRUTH_SOURCE_FILE: Final = "truth_source.csv"
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
-    """Make the folder of a recording, with all that the run needs and that may change after it.
+    """Make the folder of a recording, with copies of all inputs of the run that may change later.
 
     Raises
     ------
@@ -84,7 +84,7 @@ class Player:
     Parameters
     ----------
     ends_at_once
-        Whether slow writes ended at once in the run, as on the stepped clock.
+        Whether slow writes ended at once in the recorded run, as on the stepped clock.
     """
 
     plays: Final = True
@@ -93,18 +93,18 @@ class Player:
         self.stepped = SteppedClock()
         self.clock: Clock = self.stepped
         self.sent: dict[str, list[Any]] = {}
-        """What the device has sent, by link, as JSON."""
+        """Items that the device has sent, by link, as JSON."""
         self.receivers: dict[str, Callable[[Any], None]] = {}
         self.pipeline: PlayedImager | None = None
         self.writes: deque[Callable[[], None]] = deque()
-        """Ends of slow writes that are still open."""
+        """Functions that end pending slow writes."""
         self._ends_at_once = ends_at_once
 
     def begin(self) -> None:
-        """Do nothing: the entries follow."""
+        """Do nothing: the entries are played next."""
 
     def latch(self) -> None:
-        """Do nothing: the clock shows the time of the entry that is played."""
+        """Do nothing: the clock shows the time of the played entry."""
 
     def write(self, kind: str, **values: Any) -> None:
         """Do nothing: a replay is not recorded."""
@@ -113,20 +113,20 @@ class Player:
         """Do nothing: a replay is not recorded."""
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (nothing is opened)
-        """Return a serial line that leads to the tape."""
+        """Return a serial line that is connected to the tape."""
         return _PlayedSerial("serial", self)
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002
-        """Return a CAN bus that leads to the tape."""
+        """Return a CAN bus that is connected to the tape."""
         return _PlayedTransport(name, self)
 
     def imager(self, inner: Imager) -> Imager:
-        """Return a pipeline whose replies wait for their entry."""
+        """Return a pipeline whose replies wait for their entries."""
         self.pipeline = PlayedImager(inner)
         return self.pipeline
 
     def background(self, inner: Background) -> Background:
-        """Return what runs slow writes: at once, and their end waits for its entry."""
+        """Return a function that runs slow writes at once; their end waits for its entry."""
         if self._ends_at_once:
             return inner
 
@@ -138,7 +138,7 @@ class Player:
 
 
 class _PlayedTransport(Transport[Item]):
-    """A port or bus that leads to the tape."""
+    """A port or bus that is connected to the tape."""
 
     def __init__(self, name: str, player: Player) -> None:
         super().__init__(f"virtual:{name}")  # a bus that no other process can join
@@ -157,21 +157,21 @@ class _PlayedTransport(Transport[Item]):
         return True
 
     async def drain(self) -> None:
-        """Nothing is ever pending."""
+        """Do nothing: items are never pending."""
 
     async def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: there is no port."""
 
 
 class _PlayedSerial(_PlayedTransport[bytes], SerialTransport):
-    """A serial line that leads to the tape."""
+    """A serial line that is connected to the tape."""
 
     def set_baud(self, baud: int) -> None:
-        """Change nothing: there is no line."""
+        """Do nothing: there is no line."""
 
 
 class PlayedImager:
-    """A pipeline whose replies wait for their entry.
+    """A pipeline whose replies wait for their entries.
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ class PlayedImager:
         self.pending = 0
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
-        """Hand a request to the pipeline."""
+        """Pass a request to the pipeline."""
 
         def arrived(reply: PipelineReply) -> None:
             self._arrived.append(lambda: done(reply))
@@ -194,7 +194,7 @@ class PlayedImager:
         self._inner.submit(request, arrived)
 
     async def settle(self) -> None:
-        """Wait until the pipeline has nothing to do."""
+        """Wait until the pipeline is idle."""
         await self._inner.settle()
 
     async def deliver(self) -> None:
@@ -203,7 +203,7 @@ class PlayedImager:
         Raises
         ------
         EmulatorError
-            The device has requested less than in the recorded run.
+            The device has sent fewer requests than in the recorded run.
         """
         if not self._arrived:
             await self._inner.settle()
@@ -224,7 +224,7 @@ class ReplayReport:
     sent
         Number of serial bytes or CAN frames sent, by link.
     differences
-        One line for each link or file that differs; empty if all is equal.
+        One line for each link or file that differs; empty if all are identical.
     """
 
     entries: int = 0
@@ -238,7 +238,7 @@ def read_run(folder: Path) -> Profile:
     Raises
     ------
     EmulatorError
-        The folder is not a recording, or of another version whose profile differs.
+        The folder is not a recording, or is one of another version with a different profile.
     """
     path = folder / RUN_FILE
     try:
@@ -262,7 +262,7 @@ def read_events(folder: Path) -> Iterator[dict[str, Any]]:
     Raises
     ------
     EmulatorError
-        The file is not there, or is damaged.
+        The file is missing or damaged.
     """
     path = folder / EVENTS_FILE
     try:
@@ -279,12 +279,12 @@ def read_events(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 async def replay(folder: Path) -> ReplayReport:
-    """Play a recording on the stepped clock, and compare what is sent and measured with it.
+    """Play a recording on the stepped clock, and compare sent items and measurements with it.
 
     Raises
     ------
     EmulatorError
-        The folder is not a recording, or the device takes another course than in it.
+        The folder is not a recording, or the device behaves differently, so that it cannot be continued.
     """
     recorded = read_run(folder)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
@@ -334,7 +334,7 @@ def _enter_scenario(folder: Path, emulation: Emulation, faults: Faults) -> None:
 
 
 class _Playing:
-    """Plays entries, one after the other."""
+    """Plays entries one by one."""
 
     def __init__(self, emulation: Emulation, player: Player, faults: Faults, camera: dict[str, Any]) -> None:
         self._emulation = emulation
@@ -343,7 +343,7 @@ class _Playing:
         self._camera = camera
 
     async def entry(self, event: dict[str, Any]) -> None:
-        """Play one entry at the present time."""
+        """Play one entry at the current time."""
         device, player, kind = self._emulation.device, self._player, event["do"]
         if kind == "event":
             due = device.scheduler.pop_due(player.clock.now_ns())
@@ -364,7 +364,7 @@ class _Playing:
             await self._command(event)
 
     async def _command(self, event: dict[str, Any]) -> None:
-        """Play a message of the feed, or a command on the control channel."""
+        """Play a feed message or a command on the control channel."""
         emulation, kind = self._emulation, event["do"]
         if kind == "feed" and emulation.feed is not None:
             await emulation.feed.process(event["data"].encode("latin-1"))
@@ -380,14 +380,14 @@ class _Playing:
 
 
 def _deviation(event: dict[str, Any], why: str) -> str:
-    return f"replay: at {event['ns'] / NANOSECONDS:.6f} s the device takes another course: {why}"
+    return f"replay: at {event['ns'] / NANOSECONDS:.6f} s the device behaves differently: {why}"
 
 
 def _compare_sent(expected: dict[str, list[Any]], sent: dict[str, list[Any]], report: ReplayReport) -> None:
-    """Compare what was sent on each link."""
+    """Compare the items sent on each link."""
     for link in sorted(expected.keys() | sent.keys()):
         before, now = expected.get(link, []), sent.get(link, [])
-        if link == "serial":  # a line has bytes, however they were handed over
+        if link == "serial":  # on a serial line only the bytes matter, not how they are divided into items
             before, now = (["".join(pieces)] if pieces else [] for pieces in (before, now))
             report.sent[link] = len(before[0]) // 2 if before else 0
         else:
@@ -403,7 +403,7 @@ def _compare_sent(expected: dict[str, list[Any]], sent: dict[str, list[Any]], re
 
 
 def _compare_truth(recorded: Path, now: Path, report: ReplayReport) -> None:
-    """Compare the truth logs, but for their wall times."""
+    """Compare the truth logs, except for wall times."""
     if not recorded.exists():
         return
     before, after = (_rows(path) for path in (recorded, now))

@@ -1,8 +1,8 @@
 """Restarts of the image pipeline after it has ended unexpectedly.
 
-The number of attempts is limited, and the pauses before them grow. After `STEADY_S` without a failure
-the count starts again. When no attempt is left, the device stays in its error mode with the error
-`pipeline_ended` until it is reset, which starts the attempts again.
+The number of attempts is limited, and the pauses before them increase. After `STEADY_S` without a failure, counting
+starts again. When no attempts are left, the device stays in the error mode with the error `pipeline_ended` until it
+is reset, which starts the attempts again.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Locks on symlinks and other names, each held by one running emulator.
+"""Locks on symlinks and other names, held by one running emulator each.
 
-A lock is an abstract Unix socket. The kernel releases it when the process ends, and reports the process ID to
-another process that connects to it. Abstract sockets belong to a network namespace: emulators in different
-containers do not see each other's locks.
+A lock is an abstract Unix socket. The kernel releases it when the process ends, and reports the process ID to another
+process that connects to it. Abstract sockets belong to a network namespace, so emulators in different containers do
+not see each other's locks.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Final
 from starhil.emulator.errors import EmulatorError
 
 _PEER: Final = struct.Struct("3i")
-"""Process, user and group at the other end of a local socket."""
+"""Process, user and group of the peer of a local socket."""
 
 
 def lock_symlink(path: Path) -> socket.socket:
@@ -27,11 +27,11 @@ def lock_symlink(path: Path) -> socket.socket:
     Raises
     ------
     EmulatorError
-        Another emulator uses it, it cannot be locked, or the existing symlink was not made by an emulator.
+        Another emulator uses the symlink, it cannot be locked, or it was not made by an emulator.
     """
     if path.is_symlink() and not str(path.readlink()).startswith("/dev/pts/"):
         raise EmulatorError(
-            f"symlink {path}: points to {path.readlink()}, so no emulator made it; choose another name"
+            f"symlink {path}: points to {path.readlink()}, so it was not made by an emulator; choose another name"
         )
     try:
         return lock_name("symlink", os.fsencode(path.parent.resolve() / path.name))
@@ -40,7 +40,7 @@ def lock_symlink(path: Path) -> socket.socket:
 
 
 class LockError(EmulatorError):
-    """A name cannot be locked; the text is the reason, usually another emulator and its process ID."""
+    """A name cannot be locked; the text gives the reason, usually another emulator with its process ID."""
 
 
 def lock_name(kind: str, name: bytes) -> socket.socket:
@@ -49,7 +49,7 @@ def lock_name(kind: str, name: bytes) -> socket.socket:
     Raises
     ------
     LockError
-        Another emulator uses it, or the operating system does not make the lock.
+        Another emulator uses the name, or the operating system cannot make the lock.
     """
     address = f"\0starhil-{kind}-{hashlib.sha256(name).hexdigest()}".encode()
     lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

@@ -1,12 +1,11 @@
-"""The tape of a run: everything that reaches the device from outside, with its time, and everything that it sends.
+"""The tape of a run: all inputs of the device with their times, and all its output.
 
-Between two entries the model computes alone. An entry is what makes it compute: input on a link, an event
-that is due, a reply of the pipeline, a message of a feed, a command on the control channel, a write that has
-ended. While an entry is processed the clock stops, so that a run on the real clock can be repeated on
-the stepped clock to the byte.
+An entry is an input that causes the model to compute: data on a link, an event that is due, a reply of the pipeline,
+a message of a feed, a command on the control channel, or the end of a write. The clock stops while an entry is
+processed, so that a run on the real clock can be repeated exactly on the stepped clock.
 
-A recording is a folder: `run.json` (profile and version), `events.jsonl` (entries and output, one JSON
-object per line, in order), `truth.csv` (truth log), and what else the run needed: `scenario.json`, `state/`.
+A recording is a folder: `run.json` (profile and version), `events.jsonl` (entries and output, one JSON object per
+line, in order), `truth.csv` (truth log), and other files that the run needs: `scenario.json`, `state/`.
 """
 
 from __future__ import annotations
@@ -35,27 +34,27 @@ STATE_FOLDER: Final = "state"
 
 
 class Tape(Protocol):
-    """Interface between an emulation and the outside: a recorder, or a player."""
+    """Interface between an emulation and its environment: a recorder or a player."""
 
     @property
     def plays(self) -> bool:
-        """Whether nothing outside is opened, as a recording is played."""
+        """Whether a recording is played, so that no ports or files are opened."""
 
     @property
     def clock(self) -> Clock:
         """The clock of the model."""
 
     def begin(self) -> None:
-        """Note that everything is open and time passes."""
+        """Begin: everything is open and time passes."""
 
     def latch(self) -> None:
-        """Let the clock show the present time."""
+        """Set the clock to the current time."""
 
     def write(self, kind: str, **values: Any) -> None:
-        """Note an entry at the time that the clock shows."""
+        """Record an entry with the time of the clock."""
 
     def enter(self, kind: str, **values: Any) -> None:
-        """Let the clock show the present time, and note an entry."""
+        """Set the clock to the current time, and record an entry."""
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
         """Return the transport of the serial line."""
@@ -64,10 +63,10 @@ class Tape(Protocol):
         """Return the transport of a CAN link."""
 
     def imager(self, inner: Imager) -> Imager:
-        """Return the pipeline as the device sees it."""
+        """Return the pipeline for the device."""
 
     def background(self, inner: Background) -> Background:
-        """Return what runs slow writes."""
+        """Return the function that runs slow writes."""
 
 
 class LatchedClock:
@@ -76,7 +75,7 @@ class LatchedClock:
     Parameters
     ----------
     source
-        The clock that passes.
+        The running clock.
     """
 
     def __init__(self, source: Clock) -> None:
@@ -90,7 +89,7 @@ class LatchedClock:
         return self._now_ns
 
     def latch(self) -> None:
-        """Show the present time from now on."""
+        """Set this clock to the current time."""
         self._now_ns = self.source.now_ns()
 
 
@@ -102,7 +101,7 @@ def as_json(item: bytes | CanFrame) -> Any:
 
 
 def from_json(value: Any) -> bytes | CanFrame:
-    """Return the item of a link that `as_json` has written."""
+    """Return the item of a link from the value made by `as_json`."""
     if isinstance(value, str):
         return bytes.fromhex(value)
     number, data, extended, remote = value
@@ -115,9 +114,9 @@ class Recorder:
     Parameters
     ----------
     folder
-        Folder of the recording; it exists.
+        Folder of the recording, which must exist.
     clock
-        Clock of the run: stepped, or one that passes by itself.
+        Clock of the run.
     """
 
     plays: Final = False
@@ -127,8 +126,8 @@ class Recorder:
         self.clock: Clock = self._latched or clock
         self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8", buffering=1)
         self._held: list[Callable[[], None]] | None = []
-        """Entries that arrived while the links were being opened, which takes no time on the tape; None once
-        open."""
+        """Entries that arrived while the links were being opened, which takes no time on the tape; None
+        afterwards."""
 
     def begin(self) -> None:
         """Process the entries that arrived while the links were being opened."""
@@ -137,7 +136,7 @@ class Recorder:
             entry()
 
     def when_open(self, entry: Callable[[], None]) -> None:
-        """Process an entry, once everything is open."""
+        """Process an entry now, or once everything is open."""
         if self._held is None:
             entry()
         else:
@@ -149,29 +148,29 @@ class Recorder:
             self._latched.latch()
 
     def enter(self, kind: str, **values: Any) -> None:
-        """Let the clock show the present time, and write an entry."""
+        """Set the clock to the current time, and write an entry."""
         self.latch()
         self.write(kind, **values)
 
     def write(self, kind: str, **values: Any) -> None:
-        """Write a line at the time that the clock shows."""
+        """Write a line with the time of the clock."""
         if not self._file.closed:
             self._file.write(json.dumps({"ns": self.clock.now_ns(), "do": kind, **values}) + "\n")
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
-        """Return the transport of the serial line, which is written down."""
+        """Return the transport of the serial line, whose items are recorded."""
         return _RecordedSerial(make(), self)
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:
-        """Return the transport of a CAN link, which is written down."""
+        """Return the transport of a CAN link, whose items are recorded."""
         return _RecordedTransport(make(), name, self)
 
     def imager(self, inner: Imager) -> Imager:
-        """Return a pipeline whose replies are entries."""
+        """Return a pipeline whose replies are recorded as entries."""
         return _RecordedImager(inner, self)
 
     def background(self, inner: Background) -> Background:
-        """Make the end of a write an entry, unless it ends at once, as on the stepped clock."""
+        """Return a function whose writes end with an entry, unless they end at once (stepped clock)."""
         if self._latched is None:
             return inner
 
@@ -193,7 +192,7 @@ class Recorder:
 
 
 class _RecordedTransport(Transport[Item]):
-    """A transport whose input and output are written down."""
+    """A transport whose input and output are recorded."""
 
     def __init__(self, inner: Transport[Item], name: str, recorder: Recorder) -> None:
         super().__init__(inner.description, inner.statistics)
@@ -227,7 +226,7 @@ class _RecordedTransport(Transport[Item]):
 
 
 class _RecordedSerial(_RecordedTransport[bytes], SerialTransport):
-    """A serial line whose bytes are written down."""
+    """A serial line whose bytes are recorded."""
 
     def __init__(self, inner: SerialTransport, recorder: Recorder) -> None:
         super().__init__(inner, "serial", recorder)
@@ -238,7 +237,7 @@ class _RecordedSerial(_RecordedTransport[bytes], SerialTransport):
 
 
 class _RecordedImager:
-    """A pipeline whose replies are entries."""
+    """A pipeline whose replies are recorded as entries."""
 
     def __init__(self, inner: Imager, recorder: Recorder) -> None:
         self._inner = inner

@@ -1,4 +1,4 @@
-"""Reading of TOML files, with errors for users."""
+"""Reading of TOML files."""
 
 from __future__ import annotations
 
@@ -34,4 +34,4 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise EmulatorError(f"{what} {path}: not TOML ({error})") from None
     except RecursionError:
-        raise EmulatorError(f"{what} {path}: nested too deeply; write it flatter") from None
+        raise EmulatorError(f"{what} {path}: nested too deeply") from None

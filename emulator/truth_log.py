@@ -29,18 +29,17 @@ COLUMNS: Final = (
     "cross_boresight_arcsec", "roll_arcsec", "total_arcsec", "sigma_cross_arcsec", "sigma_roll_arcsec",
     "stars_detected", "stars_matched", "rms_px", "latency_ms", "processing_ms", "render_ms", "detect_ms", "identify_ms", "late",
 )  # fmt: skip
-"""Columns: Unix time on the device's clock, quaternions ICRS→sensor scalar last, errors of the measured
-attitude.
+"""Columns: device time as Unix time, quaternions ICRS→sensor scalar last, errors of the measured attitude.
 
-`latency_ms` is simulation time from mid-exposure to publication; `processing_ms` and the three after
-it are wall time, and empty on the stepped clock, so that the same run gives the same file.
+`latency_ms` is simulation time from mid-exposure to publication. `processing_ms` and the next three columns
+are wall times; they are empty on the stepped clock, so that the same run gives the same file.
 """
 
 WALL_TIMES: Final = ("processing_ms", "render_ms", "detect_ms", "identify_ms")
 
 
 def compare(measurement: Measurement) -> dict[str, Any]:
-    """Return truth, measurement and errors by the names of `COLUMNS`; None where invalid."""
+    """Return truth, measurement and errors by the names in `COLUMNS`; None if invalid."""
     result = measurement.result
     truth = measurement.truth
     row: dict[str, Any] = {
@@ -84,19 +83,19 @@ def compare(measurement: Measurement) -> dict[str, Any]:
 
 
 class TruthLog:
-    """A CSV file with one row per exposure, written without buffering and never in part.
+    """A CSV file with one row per exposure; rows are written complete and unbuffered.
 
-    One emulator at a time writes to a file. When writing fails, as on a full disk, a warning is logged,
-    the file ends with the last complete row and the run continues.
+    Only one emulator at a time can write to a file. If writing fails, for example because the disk is full, a
+    warning is logged, the file ends with the last complete row and the run continues.
 
     Parameters
     ----------
     path
         The file; created if it does not exist.
     overwrite
-        Replace an existing file.
+        Whether to replace an existing file.
     wall_times
-        Fill the columns of `WALL_TIMES`.
+        Whether to fill the columns in `WALL_TIMES`.
 
     Raises
     ------
@@ -135,7 +134,7 @@ class TruthLog:
             self.close()
 
     def _write_row(self, cells: Iterable[str]) -> None:
-        """Write a whole row, or nothing."""
+        """Write a complete row, or nothing."""
         if self._file is None:
             return
         text = io.StringIO()
@@ -145,7 +144,7 @@ class TruthLog:
         try:
             while row:
                 written: int | None = self._file.write(row)
-                if written is None:  # a device that would block
+                if written is None:  # a character device that would block
                     raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
                 row = row[written:]
         except OSError:

@@ -1,4 +1,4 @@
-"""Validation errors in one line: the key, the problem and the remedy."""
+"""Validation errors in one line: key, problem and remedy."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any, Final, Literal, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 
 MIN_SIMILARITY: Final = 0.55
-"""Similarity from which a known key is suggested for an unknown one (`difflib`)."""
+"""Similarity above which a known key is suggested for an unknown one (`difflib`)."""
 
 
 def explain(
     error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
 ) -> str:
-    """Describe the first validation error in one line: the key, the problem and the remedy.
+    """Describe the first validation error in one line: key, problem and remedy.
 
     Parameters
     ----------
     error, model
         The error, and the model that rejected the input.
     under
-        Path of keys within the model to the validated input.
+        Path of keys in the model to the validated input.
     also
         Further keys allowed at the top level.
     """
@@ -31,7 +31,7 @@ def explain(
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])
-        unknown = str(loc[-1])  # _along would drop it if it equals the tag of an alternative
+        unknown = str(loc[-1])  # _along would drop it if it is also the tag of an alternative
         known = sorted(
             {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
         )
@@ -54,7 +54,7 @@ def explain(
 
 
 def _most_helpful_error(error: ValidationError) -> Any:
-    """Return the first error, but prefer an unknown key to a missing one in the same table: it may be a typo."""
+    """Return the first error, but prefer an unknown key, maybe a typo, to a missing one in the same table."""
     errors = error.errors(include_url=False)
     first = errors[0]
     if first["type"] == "missing":
@@ -65,7 +65,7 @@ def _most_helpful_error(error: ValidationError) -> Any:
 
 
 def plain(message: str) -> str:
-    """Rephrase a validator's message in the project's style: `must be …`, without a capital."""
+    """Rephrase the message of a validator in the style of the project: `must be …`, without a capital."""
     text = message.partition(", unable to parse")[0].partition(" or instance of ")[0]
     for original, replacement in _REPLACEMENTS:
         text = text.replace(original, replacement)
@@ -82,7 +82,7 @@ _REPLACEMENTS: Final = (
 
 
 def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str], list[type[BaseModel]]]:
-    """Follow a pydantic location; return its keys without the tags of unions, and the models at its end."""
+    """Follow a pydantic location; return the keys without tags of unions, and the models at the end."""
     models: list[type[BaseModel]] = [model]
     keys: list[str] = []
     for step in loc:
@@ -98,7 +98,7 @@ def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str],
 
 
 def _tags_of(model: type[BaseModel]) -> tuple[object, ...]:
-    """Return the discriminator values of a model: of its fields with a single allowed value."""
+    """Return the discriminator values of a model: the values of fields that allow only one."""
     literals = (
         get_args(field.annotation)
         for field in model.model_fields.values()

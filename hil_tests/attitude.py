@@ -1,7 +1,7 @@
 """Quaternions (x, y, z, w) from ICRS to the sensor frame, and attitude errors, in plain Python.
 
 The bench has its own quaternion algebra so that it shares no numerics with the unit under test. Conventions
-(roll, sensor axes, scalar last) are those of the attitude rows of the interface definition.
+(roll, sensor axes, scalar last) match the attitude rows of the interface definition.
 """
 
 from __future__ import annotations

@@ -206,7 +206,7 @@ def read_expectation(field: str, value: Any, reader: TableReader, known: frozens
 class AttitudeCheck:
     """Largest allowed attitude errors in arcseconds; None: not checked.
 
-    `truth` is the attitude given in the step; None: that of the script.
+    `truth` is the attitude given in the step; None: the script's.
     """
 
     cross_arcsec: float | None

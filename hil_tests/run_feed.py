@@ -128,7 +128,7 @@ class RunFeed:
 
 
 def console_address(view: str, emulator: EmulatorProcess | None) -> str:
-    """Return the address of the console; for `auto`, print and return that of the started emulator.
+    """Return the address of the console; for `auto`, print and return the started emulator's.
 
     Raises
     ------

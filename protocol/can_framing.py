@@ -227,7 +227,7 @@ class _Assembler:
         """Add a segment; return the message if it is complete, and the fault if there is one.
 
         A segment out of order breaks its message. Further segments are skipped up to one whose counter is 0,
-        which ends the message, or at least that of the first segment, which starts a new one.
+        which ends the message, or at least the first segment's counter, which starts a new one.
         """
         if not payload:
             self.drop(key)

@@ -53,7 +53,7 @@ class Conventions:
         except ValueError:
             known = ", ".join((*EPOCHS, "midnight"))
             raise IcdError(
-                f"conventions.epoch: {self.epoch!r} is none of {known}, nor a date such as 2000-01-01"
+                f"conventions.epoch: {self.epoch!r} is not one of {known}, nor a date such as 2000-01-01"
             ) from None
         if date.tzinfo is None:
             date = date.replace(tzinfo=dt.UTC)
@@ -64,7 +64,7 @@ class Conventions:
         return unix_ns % DAY_NS if self.epoch_ns is None else unix_ns - self.epoch_ns
 
     def unix_ns(self, reported_ns: int, now_ns: int) -> int:
-        """Convert time since the unit's epoch to Unix time, ns; `now_ns` gives the day of a midnight epoch."""
+        """Convert time since the unit's epoch to Unix time, ns; `now_ns` sets the day of a midnight epoch."""
         return (
             now_ns - now_ns % DAY_NS + reported_ns if self.epoch_ns is None else reported_ns + self.epoch_ns
         )

@@ -23,7 +23,7 @@ _Message = TypeVar("_Message")
 
 
 class BodySizeError(ProtocolError):
-    """The beginning of a body that is not that of any message."""
+    """The beginning of a body that matches no message."""
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ class _CountedDeframer(_Collector[_Message]):
         return True
 
     def _reject(self, fault: LinkFault, extent: int) -> bool:
-        """Report the message at the start of the buffer unless it is part of a reported one; search within it."""
+        """Report the message at the start of the buffer unless already covered by a report; search within it."""
         if self._reported <= 0:
             self._add(fault)
             self._reported = extent

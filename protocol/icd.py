@@ -141,7 +141,7 @@ class InterfaceDefinition:
         return Request(RequestKind(row.kind), row.id, data, source, klass=row.klass)
 
     def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
-        """Return a request by ID, which need not be that of a row, and by class if the unit has classes.
+        """Return a request by ID, which need not belong to a row, and by class if the unit has classes.
 
         The default class is that of the first row with this ID, or the first class if there is none.
         """

@@ -98,7 +98,7 @@ class _BoundModel(_Model):
     """Name of an enumeration of the unit or the device model."""
     default: Scalar | None = None
     """Value if a client omits the field of a telecommand, or if the quantity of a telemetry field has no
-    value or a value without a number."""
+    value, or one to which `map` or `enum` assigns no number."""
     parameter: str | None = None
     """Parameter that the field sets or reports."""
     value: str | None = None
@@ -132,7 +132,7 @@ class RepeatModel(_Model):
 
 
 class FieldModel(_BoundModel):
-    """One field of a row; unused and sent as zeros if it has no name. A string means a table with `text`."""
+    """One field of a row; unused and sent as zeros if it has no name. A string is short for `{ text = … }`."""
 
     text: str | None = None
     """Short form of one or several fields, such as `i16 mag{0,1}_{x,y,z} uT 0.01`, instead of all other
@@ -193,20 +193,20 @@ class RowModel(_Model):
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
     fields: list[FieldModel] | None = None
-    """Fields, in their order on the wire, after those of `include`; each is a table or a string (`text`)."""
+    """Fields in wire order, after the fields of `include`; each is a table or a string (`text`)."""
     include: list[str] | None = None
     """Rows whose fields this row concatenates, in order."""
     unbound: Literal["zeros"] | None = None
     """`zeros`: fields without a binding are sent as zeros; default: they are an error."""
     readback: Annotated[int, Field(ge=0, le=0xFFFFFFFF)] | None = None
-    """ID of a telemetry row that reports the last accepted values of this telecommand. The telecommand's name
-    is `set_…`; the telemetry row has the rest of it."""
+    """ID of a telemetry row that reports the last accepted values of this telecommand. If the
+    telecommand is `set_NAME`, the telemetry row is `NAME`."""
     action: str | None = None
     """Action that a telecommand performs."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     answer: list[str] | None = None
-    """Answers, in order: `echo`, `reply`, `row:NAME`; default: those of the class."""
+    """Answers, in order: `echo`, `reply`, `row:NAME`; default: the answers of the class."""
 
 
 class ParameterModel(_Model):
@@ -219,7 +219,7 @@ class ParameterModel(_Model):
     type: ParameterType | None = None
     """Type on the wire."""
     unit: str | None = None
-    """Unit; must be that of the device model."""
+    """Unit; must be the one in the device model."""
     min: float | None = None
     """Lowest value."""
     max: float | None = None

@@ -79,7 +79,7 @@ class SlipFraming(_Model):
 
 
 class LengthFraming(_Model):
-    """`start`, a message whose size is given by the header field `length`, `end`."""
+    """`start`, a message whose header field `length` gives its size, then `end`."""
 
     kind: Literal["length"]
     """Selects this framing."""
@@ -90,7 +90,7 @@ class LengthFraming(_Model):
 
 
 class FixedFraming(_Model):
-    """`start`, a message whose size is given by its row, `end`."""
+    """`start`, a message of the size that its row has, then `end`."""
 
     kind: Literal["fixed"]
     """Selects this framing."""
@@ -103,7 +103,7 @@ class FixedFraming(_Model):
 
 
 class DelimitedFraming(_Model):
-    """`start`, a message that does not contain `end`, `end`."""
+    """`start`, a message that must not contain the bytes of `end`, then `end`."""
 
     kind: Literal["delimited"]
     """Selects this framing."""
@@ -228,7 +228,7 @@ class HeaderFieldModel(_Model):
 
     Roles: `address` is the address of the device, in both directions; `source` (in a request) and
     `destination` (in a reply) are the address of the OBC. `class`, `id` and `status` are the codes of class,
-    row and error. `length` is described by `includes`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
+    row and error. `length` counts the parts in `includes`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
     the last reply to a request. A reply repeats the `sequence` and `flags` of its request. `ticks` is the
     time since start, `time` the time of the unit's clock.
     """

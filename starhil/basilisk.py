@@ -24,16 +24,16 @@ import numpy as np
 from Basilisk.architecture import messaging, sysModel
 
 ANSWER_WITHIN_S: Final = 300.0
-"""Longest wait for an answer in lock-step, seconds: a first start of the emulator compiles."""
+"""Maximum time for an answer in lock-step, seconds; at its first start, the emulator compiles kernels."""
 
 EARTH_RADIUS_M: Final = 6.3e6
-"""Positions nearer to the origin are not on an Earth orbit, and are not sent."""
+"""Positions closer to the origin are not in an Earth orbit and are not sent."""
 
 NANOSECONDS: Final = 1e9
 
 
 class StarTrackerFeedError(Exception):
-    """The emulator is not there, or has rejected a message; the text gives the reason."""
+    """The emulator is not available, or has rejected a message; the text gives the reason."""
 
 
 class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
@@ -42,25 +42,25 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
     Parameters
     ----------
     address : str
-        Where the emulator listens: ``udp:HOST:PORT`` or ``tcp:HOST:PORT``.
+        Address of the emulator: ``udp:HOST:PORT`` or ``tcp:HOST:PORT``.
     lockstep : bool
-        Wait for the answer to each message; over TCP only.
+        Whether to wait for the answer to each message; TCP only.
     epoch_unix_s : float, optional
-        Date of simulation time zero, as Unix time; default: the emulator's.
+        Date of simulation time zero, as Unix time; default: the emulator's date.
 
     Attributes
     ----------
     scStateInMsg : SCStatesMsgReader
-        State of the spacecraft, to be subscribed.
+        State of the spacecraft, to be connected with `subscribeTo`.
     sent : int
         Number of messages sent.
     fault : str
-        Why the emulator has rejected a message; empty if it has accepted all. In lock-step only.
+        Fault reported by the emulator for a rejected message, empty if there is none; in lock-step only.
 
     Raises
     ------
     StarTrackerFeedError
-        The address is none, or nothing listens there.
+        The address is invalid, or no emulator listens there.
     """
 
     def __init__(self, address: str, *, lockstep: bool = False, epoch_unix_s: float | None = None) -> None:
@@ -77,7 +77,7 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
         if protocol not in ("udp", "tcp") or not host or not port.isdecimal():
             raise StarTrackerFeedError(f"{address}: must be udp:HOST:PORT or tcp:HOST:PORT")
         if lockstep and protocol == "udp":
-            raise StarTrackerFeedError(f"{address}: lock-step needs tcp, as each message is answered")
+            raise StarTrackerFeedError(f"{address}: lock-step needs tcp, because each message is answered")
         kind = socket.SOCK_STREAM if protocol == "tcp" else socket.SOCK_DGRAM
         self._socket = socket.socket(socket.AF_INET, kind)
         try:
@@ -85,20 +85,20 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
         except OSError as error:
             self._socket.close()
             raise StarTrackerFeedError(
-                f"{address}: no emulator ({error.strerror or error}); see the truth field of its ready line"
+                f"{address}: no emulator ({error.strerror or error}); the address is on its ready line, truth=…"
             ) from None
         self._socket.settimeout(ANSWER_WITHIN_S)
         self._answers = self._socket.makefile("rb")
 
     def Reset(self, CurrentSimNanos: int) -> None:  # noqa: ARG002 (Basilisk's interface)
-        """Check that the module is connected to a spacecraft, as Basilisk does before a run."""
+        """Check that the module is connected to a spacecraft; called by Basilisk before a run."""
         if not self.scStateInMsg.isLinked():
             raise StarTrackerFeedError(
                 "scStateInMsg is not connected; subscribe it to scStateOutMsg of a spacecraft"
             )
 
     def UpdateState(self, CurrentSimNanos: int) -> None:
-        """Send the present state."""
+        """Send the current state."""
         message = feed_message(self.scStateInMsg(), CurrentSimNanos / NANOSECONDS, self._epoch_unix_s)
         try:
             self._socket.sendall(json.dumps(message).encode() + b"\n")
@@ -124,7 +124,7 @@ class StarTrackerFeed(sysModel.SysModel):  # type: ignore[misc]
 
 
 def feed_message(state: Any, t: float, epoch_unix_s: float | None = None) -> dict[str, Any]:
-    """Return the message of a spacecraft's state.
+    """Return the message for the state of a spacecraft.
 
     Parameters
     ----------

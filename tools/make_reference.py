@@ -432,7 +432,7 @@ def unit_definition() -> str:
         )
     numbers = "\n".join(f"| `{code.name.lower()}` | `{int(code)}` |" for code in ErrorCode)
     parts.append(
-        "### `[errors]`\n\nThe number of each error on the wire, 0 to 0xFFFF. If the table is there, an error that it lacks is sent "
+        "### `[errors]`\n\nThe number of each error on the wire, 0 to 0xFFFF. An error missing from an existing table is sent "
         f"as `other`, if given; `ok` keeps its default.\n\n| key | default |\n|---|---|\n{numbers}\n| `other` | |"
     )
     return "\n\n".join(parts)

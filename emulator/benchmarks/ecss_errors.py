@@ -165,13 +165,13 @@ class _Nested:
         return _level(self.condition_ms, self.noise_ms + self.k1 * known, self.k1, dof)
 
     def field_variance(self, condition: Vectors) -> tuple[Vectors, Vectors]:
-        """Return the variance of the fields for that of the conditions, and the smallest significant value."""
+        """Return the field variance, corrected for the conditions, and the smallest significant value."""
         dof = (self.fields - 1, self.cells - self.fields)
         return _level(self.field_ms, self.noise_ms + self.k2 * condition, self.k3, dof)
 
 
 def _level(above: Vectors, below: Vectors, k: float, dof: tuple[float, float]) -> tuple[Vectors, Vectors]:
-    """Return the variance of a level above the next, 0 if not significant, and the smallest significant value."""
+    """Return a level's variance above the next, 0 if not significant, and the smallest significant value."""
     from scipy.stats import f as f_distribution
 
     threshold = below * float(f_distribution.isf(SIGNIFICANCE, *dof))
@@ -210,7 +210,7 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
     """Return the error that differs between dates: the aberration that the device does not correct.
 
     The conditions of the first series are dates. Aberration also moves the stars across pixels, so the pixel
-    spatial error in the second series (that of `static_errors`) is subtracted from the variance. If a series
+    spatial error in the second series (see `static_errors`) is subtracted from the variance. If a series
     is None, the line is not evaluated.
     """
     if dated is None:

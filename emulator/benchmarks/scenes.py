@@ -50,9 +50,9 @@ class SceneSettings:
     least_stars : int
         Minimum number of stars in the field; attitudes are drawn until it is reached (at most `MAX_DRAWS`).
     mirrored : bool
-        Whether the image is mirrored: as dense and clustered as the sky, but nowhere the same.
+        Whether the image is mirrored: as dense and clustered as the sky, but different everywhere.
     field_deg, side_px
-        Width of the field and side of the image, if they differ from those of the given camera.
+        Width of the field and side of the image, if they differ from the given camera's.
     predicted_px : float
         Error of the predicted attitude passed to a tracking solver, one sigma about each axis, in pixels at
         the centre of the field; 0: no prediction.

@@ -58,7 +58,7 @@ ConsoleAddress: TypeAlias = Annotated[
         "--view",
         metavar="[ADDRESS]",
         help="Show the results on a console as they arrive. ADDRESS is on the ready line of `starhil run --view`; "
-        "default with --start: that of the started emulator.",
+        "default with --start: the started emulator's console.",
     ),
 ]
 

@@ -219,7 +219,7 @@ def command(
 
 
 def _absolute_folder(unit: str) -> str:
-    """Return a folder from the command line as an absolute path, as a profile would resolve it differently."""
+    """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
     from starhil.protocol.unit_folders import bundled_units, find_unit
 
     return unit if unit in bundled_units() else str(find_unit(unit).absolute())
@@ -237,7 +237,7 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
 
 
 def _folder_of_head(folder: Path, number: int) -> Path:
-    """Return the state folder of a head; that of the second head is `head-2` in that of the first."""
+    """Return the state folder of a head; the second head uses `head-2` in the folder of the first."""
     return folder if number == 1 else folder / f"head-{number}"
 
 

@@ -1,1 +1,1 @@
-"""The console: a web page that shows a running emulator and speaks to it as one more OBC."""
+"""The console: a web page that shows a running emulator and talks to it as another OBC."""

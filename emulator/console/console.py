@@ -1,4 +1,4 @@
-"""The console of a run: listens to its frames and wires, speaks to the device as an OBC, and serves the page."""
+"""The console of a head: listens to frames and links, talks to the device as an OBC, and serves the page."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ from starid.errors import StaridError
 log = logging.getLogger("starhil.console")
 
 TURN_S: Final = 0.1
-"""Time between two deliveries of the trace, seconds."""
+"""Interval at which the trace is sent to pages, seconds."""
 
 STATUS_S: Final = 0.5
-"""Time between two reports of the run's status, seconds."""
+"""Interval at which the status of the run is reported, seconds."""
 
 POLL_S: Final = 1.0
-"""Time in which every telemetry row that a page shows is read once, seconds."""
+"""Period in which every telemetry row shown on a page is read once, seconds."""
 
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
-"""Requests of the control channel that a page may make."""
+"""Requests on the control channel that a page may make."""
 
 
 class Console:
-    """Everything behind the page of a head.
+    """Server side of the pages of a head.
 
     Parameters
     ----------
     emulation
-        The head, open.
+        Emulation of the head; it is open.
     number
         Number of the head, 1 for the first.
     client
-        OBC on a link to the device, open.
+        OBC on a link to the device; it is open.
     stepping
-        Runs the stepped clock, for all heads.
+        Runs the stepped clock; shared by all heads.
     runs
-        Session and conformance runs, for all heads.
+        Session and conformance runs; shared by all heads.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class Console:
         self._requests = RequestEncoder(device.icd)
         self._address = "canopen_node" if device.icd.canopen_only else "can_address"
         self._last_frame = b""
-        """The newest message with an image; empty before the first."""
+        """The latest message with an image; empty before the first."""
         self.viewers: set[Viewer] = set()
         self._tasks: list[asyncio.Task[None]] = []
         self._rows_wanted = asyncio.Event()
@@ -116,7 +116,7 @@ class Console:
 
     @staticmethod
     async def _guarded(loop: Callable[[], Awaitable[None]]) -> None:
-        """Repeat a loop's turn until cancelled; a turn that fails is logged."""
+        """Repeat one turn of a loop until cancelled; a turn that fails is logged."""
         while True:
             try:
                 await loop()
@@ -125,7 +125,7 @@ class Console:
                 await asyncio.sleep(STATUS_S)
 
     async def _execute(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Execute a request of the control channel for this head."""
+        """Execute a request on the control channel for this head."""
         return await self.stepping.execute({**request, "head": self._number})
 
     # --- pages ---
@@ -158,7 +158,7 @@ class Console:
             self._status_due.clear()
 
     async def welcome(self, viewer: Viewer) -> bytes:
-        """Send the description of the run to a page; return its history as rows of 64-bit floats."""
+        """Send the description of the run to a page; return the history as rows of 64-bit floats."""
         stars = await self._stars if self._stars is not None else {}
         content = describe(self._emulation, self._number) | stars | {"session_steps": self.obc.steps}
         viewer.send(json.dumps({"type": "hello", **content}))
@@ -226,7 +226,7 @@ class Console:
         await asyncio.sleep(STATUS_S)
 
     async def _poll_telemetry(self) -> None:
-        """Read every row that a page shows, once."""
+        """Read every row that is shown on a page once."""
         await self._rows_wanted.wait()
         rows = sorted(frozenset[str]().union(*(viewer.rows for viewer in self.viewers)))
         begin = time.monotonic()
@@ -239,7 +239,7 @@ class Console:
             due = begin + (number + 1) * POLL_S / len(rows)
             await asyncio.sleep(max(0.005, due - time.monotonic()))
 
-    # --- what a page asks for ---
+    # --- requests of a page ---
 
     async def answer(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         """Execute a request of a page and return the answer."""
@@ -285,7 +285,7 @@ class Console:
 
     async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         if self._emulation.leader.stepper is None:
-            raise EmulatorError(f"the clock is {self._emulation.clock.name}: it cannot be stopped")
+            raise EmulatorError(f"the clock is {self._emulation.clock.name} and cannot be stopped")
         speed = request.get("speed")
         self.stepping.run(float(speed) if isinstance(speed, (int, float)) else 0.0)
         return {"speed": self.stepping.speed}

@@ -1,4 +1,4 @@
-"""What a page has to know before anything happens: the interface, the faults, the sky and the run."""
+"""Description of a run for a page: the interface, the faults, the sky and the options of the run."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from starid.catalog import load_catalog
 from starid.star_names import STAR_NAMES
 
 MAP_V: Final = 4.2
-"""Faintest star on the map of the whole sky."""
+"""Magnitude of the faintest star on the map of the whole sky."""
 
 
 def load_bright_stars(path: str | None, epoch: float) -> dict[str, Any]:
-    """Return the stars for the map of the whole sky, and the names of stars, as JSON data."""
+    """Return the stars on the map of the whole sky, and names of stars, as JSON data."""
     bright = load_catalog(path, epoch).brighter_than(MAP_V)
     stars = np.column_stack([np.degrees(bright.ra_rad), np.degrees(bright.dec_rad), bright.v])
     return {"map": stars.round(2).tolist(), "star_names": STAR_NAMES}
@@ -101,7 +101,7 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
 
 
 def fault_controls(icd: InterfaceDefinition, buses: list[str]) -> list[dict[str, Any]]:
-    """Return the controls of the faults by level: name, kind and range of each value."""
+    """Return the controls for faults by level: name, kind and range of each value."""
     choices = {
         "error": [name for name, code in icd.enum("device_error").values.items() if code != NO_ERROR],
         "reset": list(icd.enum("reset_cause").values),
@@ -126,7 +126,7 @@ def _model_controls(
 def _schema_controls(
     properties: dict[str, Any], models: dict[str, Any], choices: dict[str, list[str]]
 ) -> list[dict[str, Any]]:
-    """Return the controls of a model by its JSON schema; a model within it becomes a group."""
+    """Return the controls for a model from its JSON schema; a nested model becomes a group."""
     kinds = {"boolean": "flag", "integer": "integer", "number": "number", "string": "choice"}
     controls: list[dict[str, Any]] = []
     for name, schema in properties.items():
@@ -151,7 +151,7 @@ def _schema_controls(
 
 
 def _class_controls(kind: type[Any]) -> list[dict[str, Any]]:
-    """Return the controls of the fields of a class of sky objects; a body becomes a group."""
+    """Return the controls for the fields of a class of sky objects; a body becomes a group."""
     hints = typing.get_type_hints(kind)
     controls = []
     for field in dataclasses.fields(kind):

@@ -1,4 +1,4 @@
-"""What a published frame says in numbers, and the numbers of the last hour."""
+"""The numbers of each published frame, and their history of an hour."""
 
 from __future__ import annotations
 
@@ -23,34 +23,34 @@ COLUMNS: Final = (
 )  # fmt: skip
 """Columns of a row: times in seconds, errors and sigmas in arcseconds, rates in degrees/s, angles in degrees.
 
-`mode` is an index of `MODES`, `reason` one of the history's `reasons`. NaN: unknown.
+`mode` is an index into `MODES`, `reason` an index into the `reasons` of the history. NaN: unknown.
 """
 
 MODES: Final = tuple(mode.value for mode in Mode)
 
 KEPT_ROWS: Final = 36_000
-"""Rows of the history: an hour at 10 Hz."""
+"""Number of rows in the history: an hour at 10 Hz."""
 
 Numbers = npt.NDArray[np.float64]
 
 
 class History:
-    """The newest rows, oldest first, in memory of fixed size.
+    """The latest rows, oldest first, in memory of fixed size.
 
     Parameters
     ----------
     kept
-        Largest number of rows.
+        Maximum number of rows.
     """
 
     def __init__(self, kept: int = KEPT_ROWS) -> None:
         self._rows: Numbers = np.zeros((kept, len(COLUMNS)))
         self._count = 0
         self.reasons: list[str] = []
-        """Reasons that have occurred; the column `reason` is an index of this list."""
+        """Reasons that have occurred; the column `reason` is an index into this list."""
 
     def add(self, measurement: Measurement) -> list[float]:
-        """Add the row of a measurement, and return it."""
+        """Add a row for a measurement, and return it."""
         row = self._row(measurement)
         self._rows[self._count % len(self._rows)] = row
         self._count += 1
@@ -109,14 +109,14 @@ class History:
 
 
 def json_row(row: list[float]) -> list[float | None]:
-    """Return a row for JSON, which has no NaN."""
+    """Return a row for JSON, with None for NaN."""
     return [value if math.isfinite(value) else None for value in map(float, row)]
 
 
 def frame_message(measurement: Measurement, row: list[float]) -> bytes:
-    """Return a frame as a page receives it: `F`, the sizes of two JSON objects, these, and the JPEG.
+    """Return a frame as a message for a page: `F`, the sizes of two JSON objects, the objects, and the JPEG.
 
-    The first object has the frame's numbers, the second the overlay of the image.
+    The first object has the numbers of the frame, the second the overlay of the image.
     """
     preview = measurement.result.preview
     numbers = json.dumps(

@@ -1,4 +1,4 @@
-"""The console as an OBC: telecommands and readings over a link, and the session they make."""
+"""The console as an OBC: telecommands and readings over a link, and their export as a session."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ HOST_ADDRESS: Final = 253
 """CAN address of the console as an OBC."""
 
 KEPT_STEPS: Final = 1000
-"""Newest transactions that can be saved as a session."""
+"""Number of latest transactions that can be saved as a session."""
 
 SHORTEST_WAIT_S: Final = 0.05
-"""Pauses from this one on become steps of a session."""
+"""Shortest pause that becomes a step of a session, seconds."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class ObcClient(Protocol):
 
 @dataclass(frozen=True)
 class ObcPort:
-    """Where an OBC finds the device.
+    """Bus and address at which an OBC reaches the device.
 
     Attributes
     ----------
@@ -78,9 +78,9 @@ class ObcPort:
     icd
         Interface definition of the device.
     device_address
-        Returns the device's present address on that bus, or node ID, which a telecommand may change.
+        Returns the current address or node ID of the device on this bus; a telecommand may change it.
     dialect
-        Returns the present dialect of serial replies; None for a unit that has no dialects.
+        Returns the current dialect of serial replies; None for a unit without dialects.
     """
 
     bus: Bus
@@ -91,12 +91,12 @@ class ObcPort:
 
 
 MakeClient = Callable[[ObcPort], ObcClient]
-"""Makes the OBC at a port."""
+"""Makes the OBC for a port."""
 
 
 @dataclass(frozen=True)
 class SentStep:
-    """A transaction as a step of a session, with the times of its request and its outcome."""
+    """A transaction for a step of a session, with the times of request and outcome."""
 
     begin_s: float
     end_s: float
@@ -107,7 +107,7 @@ class SentStep:
 
 
 class ConsoleObc:
-    """Sends what a page asks for, and notes it.
+    """Sends the requests of pages and records them.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class ConsoleObc:
     icd
         Interface definition of the device.
     clock
-        Returns a time in seconds that only grows.
+        Returns a monotonic time in seconds.
     """
 
     def __init__(
@@ -129,26 +129,25 @@ class ConsoleObc:
 
     @property
     def steps(self) -> int:
-        """Number of noted transactions."""
+        """Number of recorded transactions."""
         return len(self._steps)
 
     def clear(self) -> None:
-        """Forget the noted transactions."""
+        """Discard the recorded transactions."""
         self._steps.clear()
 
     def encode(self, name: str, values: Mapping[str, Any]) -> tuple[Row, bytes, dict[str, Value], str]:
-        """Encode a telecommand; limits are not enforced, as the device is to judge.
+        """Encode a telecommand; limits are not enforced, so that the response of the device can be tested.
 
         Returns
         -------
         row, data, values, problem
-            The row, its bytes, the values by field, and what the definition has against them; empty if
-            nothing.
+            The row, its bytes, the values by field, and a violation of the definition, or an empty text.
 
         Raises
         ------
         EmulatorError
-            A value is not one that the field's type can hold.
+            The type of a field cannot hold its value.
         """
         row = self._row("telecommand", name)
         try:
@@ -178,13 +177,13 @@ class ConsoleObc:
         return await self._exchange(row, data, physical)
 
     async def read(self, name: str) -> tuple[Exchange, dict[str, Any]]:
-        """Read a telemetry row, and note it; return the outcome and the values by field."""
+        """Read a telemetry row and record this; return the outcome and the values by field."""
         row = self._row("telemetry", name)
         exchange = await self._exchange(row, b"", {})
         return exchange, decode(row, exchange)
 
     async def poll(self, name: str) -> tuple[Exchange, dict[str, Any]]:
-        """Read a telemetry row without noting it."""
+        """Read a telemetry row without recording this."""
         row = self._row("telemetry", name)
         exchange = await self.client.exchange(row, b"")
         return exchange, decode(row, exchange)
@@ -210,7 +209,7 @@ class ConsoleObc:
             Nothing was sent.
         """
         if not self._steps:
-            raise EmulatorError("nothing was sent yet: send a telecommand or read a row first")
+            raise EmulatorError("nothing has been sent yet: send a telecommand or read a row first")
         lines = [f"title = {toml(title)}", "", "[defaults]", "timeout_s = 2.0"]
         end_s = math.inf
         for step in self._steps:
@@ -247,12 +246,12 @@ def toml(value: Value) -> str:
 
 
 def parse_value(field: Field, value: object) -> Value:
-    """Return what a page has given for a field, in the field's type.
+    """Convert the text that a page has given for a field to the type of the field.
 
     Raises
     ------
     ValueError
-        The text is not of that type; the message names the field.
+        The text cannot be converted; the message names the field.
     """
     if field.kind == "flag":
         return bool(value) if isinstance(value, (bool, int)) else str(value) == "true"
@@ -274,14 +273,14 @@ def parse_value(field: Field, value: object) -> Value:
 
 
 def decode(row: Row, exchange: Exchange) -> dict[str, Any]:
-    """Return the values of a telemetry reply by field, for JSON; empty without a reply that fits."""
+    """Return the values of a telemetry reply by field, for JSON; empty without a valid reply."""
     if exchange.outcome != "ok" or len(exchange.data) != row.size:
         return {}
     return {key: json_value(value) for key, value in row.decode(exchange.data).items()}
 
 
 def json_value(value: Value) -> Any:
-    """Return a value for JSON: bytes in hexadecimal, None for a number that is not finite."""
+    """Return a value for JSON: bytes in hexadecimal, and None for a number that is not finite."""
     if isinstance(value, bytes):
         return value.hex(" ").upper()
     if isinstance(value, float) and not abs(value) < float("inf"):

@@ -1,4 +1,4 @@
-"""The link of the console's OBC to the device."""
+"""The link between the console's OBC and the device."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from starhil.protocol.icd import InterfaceDefinition
 async def open_obc(
     emulation: Emulation, make_client: MakeClient, closers: list[Callable[[], object]]
 ) -> ObcClient:
-    """Open an OBC on the CAN bus of the run, or on a separate link if the unit has no bus there.
+    """Open an OBC on the CAN bus of the run, or on a separate link if the run has no CAN bus.
 
     Parameters
     ----------
     emulation
-        The run, open.
+        The emulation; it is open.
     make_client
         Makes the OBC.
     closers
@@ -68,7 +68,7 @@ def _open_virtual_bus(emulation: Emulation) -> Link:
 
 
 def obc_bus(icd: InterfaceDefinition) -> Bus:
-    """Return the bus on which an OBC speaks to a unit."""
+    """Return the bus on which an OBC talks to a unit."""
     if icd.canopen_only:
         return "canopen"
     return "can" if icd.link.can is not None else "serial"

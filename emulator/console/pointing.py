@@ -1,4 +1,4 @@
-"""Where the sensor points: requests for a slew, a turn or a fixed attitude, as truth of the body that carries it."""
+"""Pointing requests of a page (a slew, a turn or a fixed attitude), converted to the truth of the body."""
 
 from __future__ import annotations
 
@@ -27,16 +27,16 @@ def pointing_request(
     catalog_path: str | None,
     epoch: float,
 ) -> dict[str, Any]:
-    """Return the control channel's request for a new truth.
+    """Return the control channel request that sets the truth.
 
     Parameters
     ----------
     wanted
-        `kind`: `slew`, `rate` or `fixed`. For a slew and `fixed`, `to`: `star` (a name, or HIP and its
-        number), or `ra_deg` and `dec_deg`; without `roll_deg`, the roll stays. An empty `to` is the current
-        attitude. For a slew, `max_rate_deg_s`. For `rate`, `rate_deg_s`: three numbers, in the sensor frame.
+        `kind`: `slew`, `rate` or `fixed`. For `slew` and `fixed`, `to` has `star` (a name, or HIP and a
+        number), or `ra_deg` and `dec_deg`; without `roll_deg`, the roll is kept. An empty `to` is the current
+        attitude. `slew` also has `max_rate_deg_s`, and `rate` has `rate_deg_s`: three numbers, sensor frame.
     truth
-        Present truth of the sensor, as the control channel answers it.
+        Current truth of the sensor, in the format of the control channel's answer.
     mount
         Rotation body→sensor; None if the frames are equal.
     catalog_path, epoch
@@ -45,7 +45,7 @@ def pointing_request(
     Raises
     ------
     EmulatorError
-        No such star or kind, or a value that is out of range.
+        Star or kind is unknown, or a value is out of range.
     """
     to_body = np.eye(3) if mount is None else mount.matrix.T
     here = Attitude(np.array(truth["quaternion_xyzw"]))
@@ -73,7 +73,7 @@ def pointing_request(
 
 
 def _target(to: dict[str, Any], here: Attitude, catalog_path: str | None, epoch: float) -> Attitude:
-    """Return the attitude of the sensor that a page asks for."""
+    """Return the attitude of the sensor that a page requests."""
     if not to:
         return here
     target = {key: to[key] for key in ("ra_deg", "dec_deg", "roll_deg") if to.get(key) is not None}
@@ -92,7 +92,7 @@ def find_star(text: str, catalog_path: str | None, epoch: float) -> tuple[float,
     Raises
     ------
     EmulatorError
-        There is no such star.
+        The star is unknown.
     """
     wanted = text.strip()
     named = {name.lower(): hip for hip, name in STAR_NAMES.items()}
@@ -100,7 +100,7 @@ def find_star(text: str, catalog_path: str | None, epoch: float) -> tuple[float,
     hip = int(number[1]) if number is not None else named.get(wanted.lower())
     if hip is None:
         raise EmulatorError(
-            f"star {wanted!r}: unknown; give a proper name such as Rigel, or HIP and its number"
+            f"star {wanted!r}: unknown; give a proper name such as Rigel, or HIP and a number"
         )
     catalog = load_catalog(catalog_path, epoch)
     rows = np.flatnonzero(catalog.hip == hip)

@@ -1,4 +1,4 @@
-"""Records a run in an MCAP file: images, truth, measurements, telemetry and events."""
+"""Recording of a run in an MCAP file: images, truth, measurements, telemetry and events."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ SCHEMAS: Final[dict[str, dict[str, Any]]] = {
     | {"mode": _TEXT, "reason": _TEXT, "valid": {"type": "boolean"}},
     "starhil.Telemetry": {},
 }
-"""Schema → properties. The first three are Foxglove's own, which it displays."""
+"""Schema → properties. The first three are defined, and displayed, by Foxglove."""
 
 INFO: Final = 2
 """Level of foxglove.Log."""
@@ -77,13 +77,13 @@ class McapRecorder:
     Parameters
     ----------
     emulation
-        The run, started.
+        The emulation; it has been started.
     client
         OBC client that reads the telemetry.
     path
         File to write.
     overwrite
-        Replace an existing file.
+        Whether to replace an existing file.
 
     Raises
     ------
@@ -225,7 +225,7 @@ class McapRecorder:
         )
 
     def _on_disk(self, action: Callable[[], object]) -> None:
-        """Run a write; if it fails, the recording stops."""
+        """Write to the file; if this fails, the recording stops."""
         if self._ended:
             return
         try:

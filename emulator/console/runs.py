@@ -1,4 +1,4 @@
-"""Session and conformance runs that report their results here while they run."""
+"""Session and conformance runs, which report their results to the console."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STATUSES: Final = ("passed", "failed", "skipped", "not run")
 
 @dataclass
 class Run:
-    """One run: its description and its results so far."""
+    """A run: its description and its results so far."""
 
     run: str
     kind: str
@@ -31,19 +31,19 @@ class Run:
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(STATUSES, 0))
 
     def head(self) -> dict[str, Any]:
-        """Return everything but the results."""
+        """Return everything except the results."""
         content = vars(self).copy()
         del content["results"]
         return content
 
 
 class Runs:
-    """The newest runs.
+    """The latest runs.
 
     Attributes
     ----------
     listeners
-        Each sends a message to its pages.
+        Functions that send a message to the pages of a console.
     """
 
     def __init__(self) -> None:
@@ -51,12 +51,12 @@ class Runs:
         self._runs: OrderedDict[str, Run] = OrderedDict()
 
     def report(self, event: object) -> None:
-        """Note what a run reports: its begin, a result or its end.
+        """Record a report of a run: its begin, a result or its end.
 
         Raises
         ------
         EmulatorError
-            The report is not one of these.
+            The report is invalid.
         """
         if not isinstance(event, dict) or not isinstance(event.get("run"), str):
             raise EmulatorError("report: must be an object with `run` and `event`")
@@ -104,7 +104,7 @@ class Runs:
     def _find(self, event: dict[str, Any]) -> Run:
         run = self._runs.get(str(event["run"]))
         if run is None:
-            raise EmulatorError("report: no such run; report its begin first")
+            raise EmulatorError("report: unknown run; report its begin first")
         return run
 
     def messages(self) -> Iterator[str]:

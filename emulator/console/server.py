@@ -1,4 +1,4 @@
-"""The console's HTTP server: the pages, their WebSocket, exports, and the reports of other programs' runs."""
+"""HTTP server of the console: pages, WebSocket, exports, and reports of session and conformance runs."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ LARGEST_MESSAGE: Final = 1 << 16
 """Longest message that a page may send, bytes."""
 
 LARGEST_REPORT: Final = 1 << 20
-"""Longest report of a run, bytes."""
+"""Longest report that is accepted, bytes."""
 
 MAX_REQUESTS: Final = 16
-"""Requests of a page that may be under way at a time."""
+"""Maximum number of concurrent requests of a page."""
 
 HEARTBEAT_S: Final = 20.0
 """Time after which a page that does not answer is disconnected, seconds."""
@@ -50,14 +50,14 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
 class ConsoleServer:
-    """Serves the consoles of all heads at an address that holds a token; `head` in it is the number of one.
+    """Serves the consoles of all heads at an address with a token; `head` in the address selects a head.
 
     Parameters
     ----------
     consoles
-        A console for each head, started.
+        A console for each head; they have been started.
     token
-        Token that every page must know; by default a random one.
+        Token that the address of every page must contain; by default a random one.
     """
 
     def __init__(self, consoles: Sequence[Console], token: str | None = None) -> None:
@@ -66,7 +66,7 @@ class ConsoleServer:
         self._runner: web.AppRunner | None = None
 
     async def start(self, where: str) -> str:
-        """Listen at `auto` (the loopback interface, a free port) or HOST:PORT; return the page's address.
+        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page.
 
         Raises
         ------
@@ -104,11 +104,11 @@ class ConsoleServer:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Reject other origins and, but for the files of the page itself, requests without the token."""
+        """Reject other origins and, except for static files, requests without the token."""
         origin = request.headers.get("Origin")
         if origin is not None and urlsplit(origin).netloc != request.host:
             return web.Response(
-                status=403, text="403: this page belongs to another origin\n", headers=HEADERS
+                status=403, text="403: the request comes from a page of another origin\n", headers=HEADERS
             )
         if not request.path.startswith("/static/") and not self._token_is_valid(request):
             text = (
@@ -127,11 +127,11 @@ class ConsoleServer:
         return hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode())
 
     def _console(self, request: web.Request) -> Console:
-        """Return the console of the head that a request is for, the first one if it names none."""
+        """Return the console of the head that a request names; default: the first."""
         wanted = request.query.get("head", "1")
         known = {str(number): console for number, console in enumerate(self._consoles, start=1)}
         if wanted not in known:
-            raise EmulatorError(f"head: {wanted!r} given, must be 1 to {len(known)}")
+            raise EmulatorError(f"head: must be 1 to {len(known)}, not {wanted!r}")
         return known[wanted]
 
     async def _session(self, request: web.Request) -> web.Response:
@@ -150,10 +150,10 @@ class ConsoleServer:
         return web.json_response({"ok": True})
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
-        """Connect a page: answer its requests and send what it has subscribed to."""
+        """Connect a page: answer its requests and send its subscriptions."""
         console = self._console(request)
         if sum(len(each.viewers) for each in self._consoles) >= MAX_VIEWERS:
-            return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are open already\n")
+            return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are already open\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
         await socket.prepare(request)
         viewer = Viewer(socket)
@@ -225,7 +225,7 @@ def parse_address(where: str) -> tuple[str, int]:
     Raises
     ------
     EmulatorError
-        It is neither.
+        The address is invalid.
     """
     if where == "auto":
         return "127.0.0.1", 0

@@ -1,4 +1,4 @@
-"""The stepped clock run from the page: small steps, as fast as wanted, until it is paused."""
+"""Runs the stepped clock in small steps at a given speed, on request of a page."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, Final
 from starhil.emulator.errors import EmulatorError
 
 Execute = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
-"""Executes a request of the control channel."""
+"""Executes a request on the control channel."""
 
 STEP_WALL_S: Final = 0.1
 """Wall time of one step, seconds."""
 
 FASTEST: Final = 100.0
-"""Most simulation seconds per second."""
+"""Maximum speed, simulation seconds per second."""
 
 
 class StepRunner:
@@ -24,7 +24,7 @@ class StepRunner:
     Parameters
     ----------
     execute
-        Executes requests of the control channel.
+        Executes requests on the control channel.
     """
 
     def __init__(self, execute: Execute) -> None:
@@ -49,7 +49,7 @@ class StepRunner:
             self._task = asyncio.create_task(self._step())
 
     def pause(self) -> None:
-        """Pause after the present step."""
+        """Pause after the current step."""
         self.speed = 0.0
         self._task = None
 

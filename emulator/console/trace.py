@@ -36,13 +36,13 @@ KEPT_ITEMS: Final = 20_000
 """Number of items kept for export."""
 
 DECODED_PER_TURN: Final = 200
-"""Maximum number of items decoded at a time; the rest of a burst is only kept for export."""
+"""Maximum number of items decoded at a time; further items of a burst are only kept for export."""
 
 SHOWN_VALUES: Final = 8
 """Maximum number of values in a line."""
 
 MAX_ADDRESSES: Final = 64
-"""Limit of the addresses whose segments are joined: a wire fault can make any number of random CAN IDs."""
+"""Maximum number of addresses whose segments are joined: a link fault can cause many random CAN IDs."""
 
 _REQUEST_TYPES: Final = (
     MessageType.TELECOMMAND,
@@ -138,13 +138,13 @@ class WireTrace:
         return lines, left_out
 
     def recent(self) -> list[dict[str, Any]]:
-        """Return the newest items, decoded, for a page that subscribes."""
+        """Return the latest items, decoded, for a page that subscribes."""
         decoder = Decoder(self._icd, self._dialect)
         first = max(0, len(self._kept) - DECODED_PER_TURN)
         return [decoder.line(item) for item in itertools.islice(self._kept, first, None)]
 
     def discard(self) -> None:
-        """Drop undecoded items; no page shows the trace."""
+        """Drop undecoded items, because no page shows the trace."""
         self._new.clear()
 
     def candump(self) -> str:
@@ -237,7 +237,7 @@ class Decoder:
         return found[-1][0], "; ".join(text for _, text in found)
 
     def _row(self, message: Request | Reply) -> Row | None:
-        """Return the row of a message, by class and ID, else by ID alone."""
+        """Return the row of a message by class and ID, or else by ID alone."""
         if message.id is None:
             return None
         return self._icd.rows_by_key.get((message.klass, message.id)) or self._icd.row_by_id(message.id)
@@ -305,7 +305,7 @@ class RequestEncoder:
         self._objects = build_dictionary(icd) if icd.canopen_only else None
 
     def encode(self, row: Row, data: bytes, host: int, device: int) -> dict[str, Any]:
-        """Return data and serial bytes in hexadecimal, and arguments of cansend, for CAN addresses of OBC and device.
+        """Return a request as data and serial bytes in hexadecimal, and as arguments of cansend.
 
         Raises
         ------

@@ -21,7 +21,7 @@ class Socket(Protocol):
 
 
 class Viewer:
-    """The server side of a page; a page that does not read loses messages and delays nothing.
+    """The server side of a page; a page that reads too slowly loses messages but delays nothing.
 
     Parameters
     ----------
@@ -31,11 +31,11 @@ class Viewer:
     Attributes
     ----------
     frames, wire
-        Whether the page shows images, and the trace.
+        Whether the page shows images, and whether it shows the trace.
     rows
         Telemetry rows that the page shows.
     dropped
-        Messages and images that were dropped because the page did not read.
+        Number of messages and images dropped because the page read too slowly.
     """
 
     def __init__(self, socket: Socket) -> None:
@@ -50,7 +50,7 @@ class Viewer:
 
     @property
     def waiting(self) -> int:
-        """Number of queued messages, image included."""
+        """Number of queued messages, including an image."""
         return len(self._texts) + (self._frame is not None)
 
     def send(self, text: str) -> None:

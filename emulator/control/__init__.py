@@ -1,1 +1,1 @@
-"""Control of a run from outside: faults, scenarios and the control channel."""
+"""Control of a run: faults, scenarios and the control channel."""

@@ -1,14 +1,13 @@
-"""The control channel: commands a running emulator, apart from the links to the OBC.
+"""The control channel, which controls a running emulator independently of the links to the OBC.
 
-Requests and answers are JSON objects, one per line, answered in order. A request has `do` and its
-arguments; an optional `id` is returned in the answer. An answer has `ok`; if it is false, `error` gives
-the reason in one line, and nothing was changed.
+Requests and answers are JSON objects, one per line, answered in order. A request has `do` and its arguments; an
+optional `id` is returned in the answer. An answer has `ok`; if it is false, `error` gives the reason in one line,
+and nothing was changed.
 
-`--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open.
-HOST:PORT listens on TCP, which is open to every local user and, unless on loopback, to the network:
-every peer can send all requests below. With a token (`--control-token`, or STARHIL_CONTROL_TOKEN),
-each request must carry it as `token`. With several heads, `head` in a request names the one that it is for:
-1, the default, is the first.
+`--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open. HOST:PORT
+listens on TCP, which is open to every local user and, unless on loopback, to the network: every peer can send all
+requests below. With a token (`--control-token`, or STARHIL_CONTROL_TOKEN), each request must contain it as
+`token`. With several heads, `head` in a request selects one; the default is 1, the first.
 
 ========================  =======================================================================================
 `do`                      effect, and fields of the answer
@@ -17,19 +16,18 @@ each request must carry it as `token`. With several heads, `head` in a request n
 ``truth``                 truth at `run_time_s` or `unix_s` (default: now): `quaternion_xyzw`, `ra_deg`, `dec_deg`,
                           `roll_deg`, `rate_deg_s`, `status`
 ``frames``                the last `count` (default 1) measurements, newest last, as rows of the truth log
-``set_truth``             `truth`: a table as `[truth]` of a profile; used at once
-``step``                  `seconds`: advance simulation time (stepped clock only); answered when it is done
-``fault``                 `optical`, `device`, `serial` or `can`: a table of the keys below; keys not given are off
-``clear_faults``          remove all faults
-``scenario``              `name`: run a scenario, a TOML file or a name in configs/scenarios, its times from now on
-``quit``                  end the emulator as SIGTERM does
+``set_truth``             `truth`: a table as `[truth]` in a profile; takes effect at once
+``step``                  `seconds`: advance simulation time (stepped clock only); answered when this is done
+``fault``                 `optical`, `device`, `serial` or `can`: a table of the keys below; omitted keys are off
+``clear_faults``          end all faults
+``scenario``              `name`: run a scenario, a TOML file or a name in configs/scenarios, with times from now on
+``quit``                  end the emulator, like SIGTERM
 ========================  =======================================================================================
 
-Faults: `optical` = fields of `starhil.emulator.sky.objects.SkyObjects` (false_stars, missing_stars,
-moon, …) or blocked_share; `device` = stuck (requests are neither counted nor answered), error (a name of
-the enumeration `device_error`: enter the error mode), reset (a name of `reset_cause`: restart now);
-`serial` and `can` (CANopen too) = drop, corrupt, junk (probabilities 0 … 1), delay_s, split (bytes per
-piece, serial only), gap_s.
+Keys of faults: `optical`: fields of `starhil.emulator.sky.objects.SkyObjects` (false_stars, missing_stars, moon, …)
+or blocked_share; `device`: stuck (requests are neither counted nor answered), error (a name in the enumeration
+`device_error`: enter the error mode), reset (a name in `reset_cause`: restart now); `serial` and `can` (including
+CANopen): drop, corrupt, junk (probabilities 0 … 1), delay_s, split (bytes per chunk, serial only), gap_s.
 """
 
 from __future__ import annotations
@@ -73,16 +71,16 @@ Answer = dict[str, Any]
 
 @dataclass(frozen=True)
 class ControlTarget:
-    """A head that the control channel commands.
+    """A head that the control channel controls.
 
     Attributes
     ----------
     emulation
-        Its emulation; it is open.
+        Emulation of the head; it is open.
     faults
-        Its faults.
+        Faults of the head.
     frames
-        Its last measurements.
+        Latest measurements of the head.
     """
 
     emulation: Emulation
@@ -128,7 +126,7 @@ class ControlServer:
             target.emulation.device.on_frame.append(target.frames.append)
 
     async def start(self, where: str) -> str:
-        """Listen at `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
+        """Listen on `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
 
         Raises
         ------
@@ -177,7 +175,7 @@ class ControlServer:
             writer.close()
 
     async def answer(self, line: bytes | str | None) -> Answer:
-        """Execute one request and return its answer; None: a line that was too long."""
+        """Execute one request and return its answer; None stands for a line that was too long."""
         if line is None:
             return {"ok": False, "error": f"line too long: at most {MAX_LINE} bytes"}
         try:
@@ -193,12 +191,12 @@ class ControlServer:
             return {
                 **identity,
                 "ok": False,
-                "error": "token: missing or wrong; give the one of --control-token",
+                "error": "token: missing or wrong; give the token set with --control-token",
             }
         return {**identity, **await self.execute(request)}
 
     async def execute(self, request: dict[str, Any]) -> Answer:
-        """Execute one decoded request, without `id` and `token`, and return its answer."""
+        """Execute a decoded request, without `id` and `token`, and return its answer."""
         wanted = str(request.pop("do", ""))
         action = self._actions.get(wanted)
         if action is None:
@@ -221,7 +219,7 @@ class ControlServer:
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
     def _target(self, request: dict[str, Any]) -> ControlTarget:
-        """Return the head that a request is for."""
+        """Return the head that a request selects."""
         number = request.pop("head", 1)
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(self._targets):
             raise EmulatorError(f"head: must be 1 to {len(self._targets)}, not {number!r}")
@@ -294,7 +292,7 @@ class ControlServer:
         if not isinstance(request.get("truth"), dict):
             raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
         config = _parse(_TRUTH, _Truth, request["truth"], "truth")
-        async with self._opening:  # reading a file takes time; the last request wins
+        async with self._opening:  # reading a file takes time, so the last request wins
             await target.emulation.change_truth(config)
         return {"kind": config.kind, "address": target.emulation.leader.ready_fields.get("truth", "")}
 
@@ -324,7 +322,7 @@ class ControlServer:
         _check_keys(request, "name")
         emulation = target.emulation
         if emulation.tape is not None:
-            raise EmulatorError("scenario: a recording begins with its scenario; run with --scenario")
+            raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
         scheduler, clock = emulation.device.scheduler, emulation.clock
         set_truth, folder = emulation.leader.set_truth, emulation.profile.folder
@@ -338,7 +336,7 @@ class ControlServer:
 
 
 def _note(target: ControlTarget, kind: str, **values: Any) -> None:
-    """Note a command on the tape, if there is one."""
+    """Record a command on the tape, if there is one."""
     if target.emulation.tape is not None:
         target.emulation.tape.enter(kind, **values)
 
@@ -348,7 +346,7 @@ def _state(emulation: Emulation, run_ns: int) -> TruthState:
 
 
 class _Truth(BaseModel):
-    """Names the keys in validation messages."""
+    """Model that supplies the keys for validation messages."""
 
     truth: TruthConfig = FixedConfig(kind="fixed")
 
@@ -358,7 +356,7 @@ _FAULT: Final[TypeAdapter[FaultRequest]] = TypeAdapter(FaultRequest)
 
 
 def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object, *under: str) -> Any:
-    """Validate an argument of a request, or raise the reason in one line."""
+    """Validate an argument of a request; the error message is one line."""
     try:
         return adapter.validate_json(json.dumps(value))
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""Fault injection at three levels: optical, device and wire."""
+"""Fault injection at three levels: optical, device and link."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ NO_ERROR: Final = 0
 
 
 class UpsetFault(Strict):
-    """A bit that a particle flips in the device's memory: of a parameter, or of a star's direction in the catalogue."""
+    """A bit flipped by a particle in the memory of the device: in a parameter or in a star's direction."""
 
     parameter: str | None = None
     """Name of the parameter."""
@@ -53,7 +53,7 @@ class UpsetFault(Strict):
     component: Annotated[int, Field(ge=0, le=2)] = 0
     """Component of the star's direction: 0, 1 or 2 for x, y or z."""
     bit: Annotated[int, Field(ge=0, le=63)]
-    """Bit, 0 the least significant; components of directions have 32."""
+    """Bit number, 0 for the least significant; components of directions have 32 bits."""
 
     @model_validator(mode="after")
     def _one_target(self) -> Self:
@@ -68,28 +68,28 @@ class DeviceFault(Strict):
     stuck: bool = False
     """Unresponsive: requests are neither counted nor answered; exposures continue."""
     error: str | None = None
-    """Enter the error mode with this error, a name of the enumeration `device_error`."""
+    """Enter the error mode with this error, a name in the enumeration `device_error`."""
     reset: str | None = None
-    """Restart now for this cause, a name of the enumeration `reset_cause`."""
+    """Restart now with this cause, a name in the enumeration `reset_cause`."""
     upset: UpsetFault | None = None
-    """Flip a bit in the memory; a restart, or restoring the parameters, undoes it."""
+    """Flip a bit in memory; undone by a restart or by restoring the parameters."""
 
 
 class WireFault(Strict):
-    """Faults of a wire; see `WireFaultSettings`."""
+    """Faults of a link; see `WireFaultSettings`."""
 
     drop: Probability = 0.0
     """Probability that an outgoing serial reply or CAN frame is lost."""
     corrupt: Probability = 0.0
     """Probability that one of its bits is flipped."""
     junk: Probability = 0.0
-    """Probability that random bytes, or a CAN frame with a random CAN ID, go before it."""
+    """Probability that random bytes, or a CAN frame with a random CAN ID, are sent before it."""
     delay_s: Seconds = 0.0
-    """Time by which everything sent is delayed."""
+    """Delay of everything that is sent."""
     split: Annotated[int, Field(ge=0, le=4096)] = 0
-    """Send serial replies in pieces of this many bytes; 0: whole."""
+    """Size of the chunks in which serial replies are sent; 0: not split."""
     gap_s: Seconds = 0.02
-    """Pause between these pieces."""
+    """Pause between the chunks."""
 
     def settings(self) -> WireFaultSettings:
         """Return the settings for a link."""
@@ -102,22 +102,22 @@ class FaultRequest(Strict):
     optical: SkyValues | None = None
     """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
     device: DeviceFault | None = None
-    """What goes wrong in the device."""
+    """Fault of the device."""
     serial: WireFault | None = None
-    """What goes wrong on the serial line."""
+    """Faults of the serial line."""
     can: WireFault | None = None
-    """Faults of outgoing CAN frames, CANopen included."""
+    """Faults of outgoing CAN frames, including CANopen."""
 
 
 class Faults:
-    """The faults that are injected at present.
+    """The currently injected faults.
 
     Parameters
     ----------
     device
         Device that the faults affect.
     links
-        Its open links.
+        Open links of the device.
     """
 
     def __init__(self, device: Device, links: Iterable[Link]) -> None:
@@ -181,14 +181,14 @@ class Faults:
         for name, fault in (("serial", request.serial), ("can", request.can)):
             if fault is not None and name not in there:
                 raise EmulatorError(
-                    f"{name}: this run has no such link; start it with --{name}, or leave this out"
+                    f"{name}: this run has no such link; start it with --{name}, or omit this fault"
                 )
 
     def _check_upset(self, upset: UpsetFault) -> None:
         if upset.parameter is not None:
             definition = self._device.icd.parameters.get(upset.parameter)
             if definition is None:
-                raise EmulatorError(f"device.upset.parameter: {upset.parameter!r} is no parameter")
+                raise EmulatorError(f"device.upset.parameter: {upset.parameter!r} is not a parameter")
             if upset.bit >= memory_bits(definition):
                 raise EmulatorError(
                     f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"
@@ -199,7 +199,7 @@ class Faults:
             raise EmulatorError("device.upset.star: only the algorithm geometric keeps directions in memory")
 
     def clear(self) -> None:
-        """Remove all faults; the error mode is left by telecommand only, and flipped parameters by a restart."""
+        """End all faults; the error mode ends only by telecommand, and flipped parameters by a restart."""
         self._optical = {}
         device = self._device
         device.cycle.faults = lambda _index: {}
@@ -209,7 +209,7 @@ class Faults:
             wire.settings = WireFaultSettings()
 
     def describe(self) -> dict[str, Any]:
-        """Return the present faults by level."""
+        """Return the current faults by level."""
         found: dict[str, Any] = {}
         if self._optical:
             found["optical"] = dict(self._optical)

@@ -1,6 +1,6 @@
-"""Scenario files: faults and truth changes at given simulation times, repeatable to the byte.
+"""Scenario files: faults and changes of truth at given simulation times.
 
-TOML, one `[[at]]` table per event, in any order::
+A scenario is a TOML file with one `[[at]]` table per event, in any order::
 
     name = "glare"
 
@@ -12,9 +12,9 @@ TOML, one `[[at]]` table per event, in any order::
     run_time_s = 40.0
     clear_faults = true
 
-`fault` and `truth` have the keys of the control channel's `fault` and `set_truth`. Events occur in
-simulation time, at the same exposures on any clock. Names, links and truth files are checked
-when the run starts. A scenario cannot set a live feed, as opening its socket takes time.
+`fault` and `truth` have the keys of `fault` and `set_truth` on the control channel. Events occur in simulation
+time, at the same exposures on any clock. Names, links and truth files are checked when the run starts. A scenario
+cannot set a live feed, because opening a socket takes time.
 """
 
 from __future__ import annotations
@@ -43,27 +43,27 @@ SetTruth = Callable[[TruthSource, TruthConfig], None]
 
 
 class ScenarioEvent(Strict):
-    """What changes at a simulation time."""
+    """Changes at a simulation time."""
 
     run_time_s: Annotated[float, Field(ge=0.0, le=1e9)]
-    """When: seconds of simulation time since the start."""
+    """Time of the event: simulation time since the start."""
     fault: FaultRequest | None = None
-    """Faults to inject, as in the control channel's `fault`."""
+    """Faults to inject, as in `fault` on the control channel."""
     clear_faults: bool = False
     """End all faults first."""
     truth: TruthConfig | None = None
-    """Another truth, as in the control channel's `set_truth`; not `live` or `42`."""
+    """New truth, as in `set_truth` on the control channel; not `live` or `42`."""
 
     @model_validator(mode="after")
     def _something(self) -> Self:
         if self.fault is None and self.truth is None and not self.clear_faults:
             raise ValueError("give fault, truth or clear_faults = true")
         if isinstance(self.truth, FeedConfig):
-            raise ValueError("a live feed cannot be set by a scenario; set it in the profile")  # noqa: TRY004
+            raise ValueError("a scenario cannot set a live feed; set it in the profile")  # noqa: TRY004
         return self
 
     def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path, at_s: float) -> Action:
-        """Return the action of the event at a simulation time; its files and values are read and checked now."""
+        """Return the action of the event; files and values are read and checked now."""
         if self.fault is not None:
             faults.check(self.fault)
         config = self.truth
@@ -82,7 +82,7 @@ class ScenarioEvent(Strict):
 
 
 class Scenario(Strict):
-    """A whole scenario."""
+    """A scenario."""
 
     name: str = ""
     """Name in messages."""
@@ -97,7 +97,7 @@ class Scenario(Strict):
         folder: Path,
         start_s: float = 0.0,
     ) -> None:
-        """Schedule all events; files that they need are read and checked now.
+        """Schedule all events; their files are read and checked now.
 
         Parameters
         ----------
@@ -108,14 +108,14 @@ class Scenario(Strict):
         set_truth
             Called with a new truth source and its configuration.
         folder
-            Folder that relative paths of truth files start from.
+            Folder to which relative paths of truth files refer.
         start_s
-            Simulation time from which the times of the events count, seconds.
+            Simulation time to which the times of the events are added, seconds.
 
         Raises
         ------
         EmulatorError
-            An event names a link that this run does not have, or a file that cannot be read.
+            An event refers to a link that this run does not have, or to a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             at_s = start_s + event.run_time_s

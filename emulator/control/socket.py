@@ -1,4 +1,4 @@
-"""The Unix socket of a control channel: private to its user, and removed at the end."""
+"""The Unix socket of a control channel, which is private to its user and removed at the end."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class ControlSocket:
         )
 
     def close(self) -> None:
-        """Stop listening and remove the file, if it is still this socket's."""
+        """Stop listening, and remove the file if it still belongs to this socket."""
         self.socket.close()
         self._lock.close()
         if self._file is not None:

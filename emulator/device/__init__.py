@@ -1,1 +1,1 @@
-"""The device: modes, parameters, time, frames, and the quantities and actions that rows are bound to."""
+"""The device: modes, parameters, time, frames, and the quantities and actions to which rows are bound."""

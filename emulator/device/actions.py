@@ -1,10 +1,10 @@
-"""The actions of the device: a function for each name that `configs/units/model.toml` declares.
+"""The actions of the device: one function for each name declared in `configs/units/model.toml`.
 
-`starhil.emulator.device.bindings.TelecommandBinding.execute` calls them. An action gets its arguments by
-name, range-checked and in the declared units, and returns the messages that follow the answer, if there are
-any. To answer with an error, it raises `Refused`, whose `argument` names the argument at fault. An action
-that continues in the background marks the acknowledge as continuing and ends it itself; its telecommand is
-answered at once, unless the action is in `ANSWERED_WHEN_DONE`.
+`starhil.emulator.device.bindings.TelecommandBinding.execute` calls them. An action gets its arguments by name,
+range-checked and in the declared units, and returns the messages that follow the answer, if any. To refuse the
+telecommand it raises `Refused`, whose `argument` names the invalid argument. An action that continues in the
+background marks the acknowledge as continuing and ends it itself; its telecommand is answered at once, unless the
+action is in `ANSWERED_WHEN_DONE`.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from starhil.protocol.messages import ErrorCode, Reply
 from starhil.protocol.values import MessageError, Value
 
 Arguments: TypeAlias = Mapping[str, Any]
-"""Values by argument; `parameters` holds the values of fields that name a parameter."""
+"""Values by argument; `parameters` has the values of fields that are bound to a parameter."""
 Action: TypeAlias = Callable[[Device, Arguments, Acknowledge], list[Reply] | None]
 
 PARAMETERS: Final = "parameters"
-"""Key under which an action finds the values of fields that name a parameter."""
+"""Key for the values of fields that are bound to a parameter."""
 
 SRAM_STORED: Final = 0
 """Bank of the image that save_image stored; the other bank holds the last exposure."""
@@ -39,7 +39,7 @@ def nothing(_device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -
 
 
 def reset(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
-    """Restart once the answer is sent."""
+    """Restart once the answer has been sent."""
     device.scheduler.at(device.clock.now_ns(), lambda _due_ns: device.reset("command"))
 
 
@@ -53,7 +53,7 @@ def set_clock(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -
 
 
 def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
-    """Set the parameters that the row's fields name, all or none."""
+    """Set the parameters to which the fields of the row are bound, all or none."""
     changes: Mapping[str, Value] = arguments[PARAMETERS]
     try:
         device.parameters.set(changes)
@@ -106,7 +106,7 @@ def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) 
 
 
 def set_mode(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
-    """Command a mode."""
+    """Change the mode."""
     if not device.command_mode(Mode(str(arguments["mode"]))):
         raise Refused(ErrorCode.SEQUENCE)
 
@@ -157,7 +157,7 @@ def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowle
 
 
 def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
-    """Send a list of telemetry rows unsolicited, instead of the previous list."""
+    """Send telemetry rows unsolicited; the list replaces the previous one."""
     rate_hz = float(arguments["rate"])
     wanted = []
     for name, row_id in arguments.items():
@@ -171,7 +171,7 @@ def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -
 
 
 def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
-    """Select one telemetry row and its rate by the parameters for them."""
+    """Set the parameters for one unsolicited telemetry row and its rate."""
     row_id = int(arguments["telemetry"])
     if device.icd.telemetry_row(row_id) is None:
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="telemetry")
@@ -224,4 +224,4 @@ ACTIONS: Final[dict[str, Action]] = {
 """Name → function."""
 
 ANSWERED_WHEN_DONE: Final = frozenset({"save_parameters"})
-"""Actions whose telecommands are answered with their outcome instead of their acceptance."""
+"""Actions whose telecommands are answered with the outcome instead of when they are accepted."""

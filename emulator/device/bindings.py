@@ -1,4 +1,4 @@
-"""Rows of the unit bound to the device: telemetry to quantities, telecommands to actions. Compiled once, at the start."""
+"""Bindings of rows to the device: telemetry to quantities, telecommands to actions; made once at the start."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TelemetryBinding:
         ]
 
     def encode(self, device: Device) -> bytes:
-        """Return the row's present bytes; numbers beyond a field's range are clipped, or wrap.
+        """Return the current bytes of the row; numbers beyond the range of a field are clipped, or wrap.
 
         Raises Refused if the row cannot be read now.
         """
@@ -47,7 +47,7 @@ class TelemetryBinding:
 
 
 def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
-    """Return the function that gives a field's value in its unit, or None for a field that is not bound."""
+    """Return the function that computes the value of a field in its unit, or None for an unbound field."""
     if field.telecommand is not None:
         return _accepted(field.telecommand, field.name)
     name = field.value if field.parameter is None else PARAMETER + field.parameter
@@ -63,7 +63,7 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
 
 
 def _accepted(telecommand: str, name: str) -> Getter:
-    """Return the getter of a value with which a telecommand was last accepted."""
+    """Return the getter for a last accepted value of a telecommand."""
     return lambda shot: shot.device.accepted.get(telecommand, {}).get(name)
 
 
@@ -76,7 +76,7 @@ def _scaled(getter: Getter, scale: float) -> Getter:
 
 
 def _named(getter: Getter, field: Field) -> Getter:
-    """Return a getter whose values are members of the field's enumeration, or its default."""
+    """Return a getter whose values are members of the enumeration of the field, or its default."""
     members = {} if field.enum is None else field.enum.values
     aliases = field.aliases
 
@@ -128,9 +128,9 @@ class TelecommandBinding:
                 self._index[field.parameter] = index
 
     def execute(self, device: Device, data: bytes, acknowledge: Acknowledge) -> list[Reply]:
-        """Decode and perform the telecommand; return the messages that follow the answer.
+        """Decode and execute the telecommand; return the messages that follow the answer.
 
-        Raises Refused or MessageError with the index of the field at fault.
+        Raises Refused or MessageError with the index of the invalid field.
         """
         values = self.row.decode(data)
         arguments = dict(self._fixed)
@@ -158,7 +158,7 @@ def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any
 
 
 def _plugin_action(function: Callable[[Any, Mapping[str, Any]], Any]) -> Action:
-    """Return a plugin's function as an action; bytes that it returns are the data of the answer, or of each of them."""
+    """Return a function of a plugin as an action; returned bytes become the data of one answer each."""
 
     def action(device: Device, arguments: Mapping[str, Any], _acknowledge: Acknowledge) -> list[Reply]:
         return [

@@ -24,12 +24,12 @@ _FLAG_OF_FAULT: Final[dict[FaultKind, str]] = {
 
 @dataclass
 class Counters:
-    """Counters and flags of the links since the last clear or reset."""
+    """Counters and flags of the links since they were last cleared."""
 
     telecommands: int = 0
     telemetry: int = 0
     flags: set[str] = field(default_factory=set)
-    """Names of the communication_status flags that are set."""
+    """Names of the flags in communication_status that are set."""
     faults: dict[FaultKind, int] = field(default_factory=dict)
     """Number of faults of each kind, for the log and the control channel."""
 
@@ -39,7 +39,7 @@ class Counters:
         self.flags.add(_FLAG_OF_FAULT[fault.kind])
 
     def overrun(self) -> None:
-        """Flag a telecommand that arrived before the last one was done."""
+        """Set the flag for a telecommand that arrived before the previous one was done."""
         self.flags.add("telecommand_overrun")
 
     def clear(self) -> None:
@@ -58,9 +58,9 @@ class Acknowledge:
     error: ErrorCode = ErrorCode.OK
     parameter_index: int = 0
     continues: bool = False
-    """The action continues in the background, and ends this itself."""
+    """Whether the action continues in the background; it then calls `end` itself."""
     on_end: Callable[[ErrorCode], None] | None = None
-    """Called with the outcome of a telecommand that is answered only once it is done."""
+    """Called with the outcome of a telecommand that is answered when it is done."""
 
     def end(self, error: ErrorCode = ErrorCode.OK, parameter_index: int = 0) -> None:
         """Record the outcome."""

@@ -1,11 +1,10 @@
-"""The exposure cycle: when the sensor exposes, what it requests from the pipeline, and when a result is published.
+"""The exposure cycle: start of exposures, requests to the pipeline, and publication of results.
 
-Exposures start on a grid of the update period. Read-out, detection and identification take the times
-in the profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On other
-clocks, a result that the machine delivers later is published when it arrives, and flagged as late.
-When the machine falls behind by `MAX_PENDING` requests, or at high rates by the modelled time of the
-steps, exposures are skipped: the last attitude stays valid until it is too old, and tracking continues
-from it.
+Exposures start on a grid of the update period. Read-out, detection and identification take the times in the
+profile's `[timing]`, so that on the stepped clock the same run gives the same bytes. On other clocks, a result that
+the machine delivers later is published when it arrives, and flagged as late. If the machine falls behind by
+`MAX_PENDING` requests or, at high rates, by the modelled time of the steps, exposures are skipped: the last
+attitude stays valid until it is too old, and tracking continues from it.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ log = logging.getLogger("starhil.device")
 Argument = TypeVar("Argument")
 
 MAX_PENDING: Final = 2
-"""Pending requests at which the next exposure is skipped; more if more fit into the modelled time."""
+"""Number of pending requests at which exposures are skipped; more if more fit into the modelled time."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,7 @@ class Measurement:
     Attributes
     ----------
     counter
-        Number of published measurements since start-up, this one included.
+        Number of published measurements since start-up, including this one.
     mid_ns
         Simulation time of mid-exposure, nanoseconds.
     mid_unix_ns
@@ -79,7 +78,7 @@ class Measurement:
     capture_s, detect_s, identify_s
         Modelled times of the steps, seconds.
     late
-        The machine took longer than the modelled time.
+        Whether the machine took longer than the modelled time.
     """
 
     counter: int
@@ -107,7 +106,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What the surroundings do to the detector: its temperature, °C, and particles per second."""
+    """Conditions of the detector: temperature, °C, and particles per second."""
 
     temperature_c: float | None = None
     particles_s: float = 0.0
@@ -115,7 +114,7 @@ class Conditions:
 
 @dataclass
 class _Frame:
-    """An exposure that is not published yet."""
+    """An exposure that has not been published yet."""
 
     index: int
     start_ns: int
@@ -127,15 +126,15 @@ class _Frame:
     tracking: bool
     result: FrameResult | None = None
     waiting_since_ns: int | None = None
-    """Modelled time of a result without stars, if the result is not there by then; else None."""
+    """Modelled time of a result without stars, if the result has not arrived by then; otherwise None."""
     late: bool = False
-    """The machine took longer than the modelled time."""
+    """Whether the machine took longer than the modelled time."""
     finished_ns: int | None = None
-    """Time at which its result is complete; None before."""
+    """Time at which the result is complete; None before."""
 
 
 class FrameCycle:
-    """Makes one exposure after another while it runs.
+    """Takes exposures while it is running.
 
     Parameters
     ----------
@@ -167,14 +166,14 @@ class FrameCycle:
         self._in_flight: deque[_Frame] = deque()
         self._grid_ns = 0
         self._failure = ""
-        """Error text of the last request if the pipeline failed, so that it is logged once."""
+        """Error text of the last request if the pipeline failed, so that an error is logged only once."""
         self.truth: TruthSource = FixedTruth(Attitude.identity())
         self.orbit: Orbit | None = None
-        """True orbit, for truth sources that bring none."""
+        """True orbit, for truth sources without an orbit."""
         self.start_unix_s = 0.0
         """True date at simulation time zero, Unix time."""
         self.sky_has_aberration = True
-        """Whether there is an aberration to be corrected."""
+        """Whether the sky has aberration."""
         self._warned_of_aberration = False
         self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
         self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
@@ -184,7 +183,7 @@ class FrameCycle:
         self.after_exposure: Callable[[], None] | None = None
         """Called once, when the next exposure has been sent to the pipeline."""
         self.index = 0
-        """Index of the next exposure; never reset, so that no two exposures share their noise."""
+        """Index of the next exposure; never reset, so that no two exposures have the same noise."""
         self.published = 0
         self.skipped = 0
         """Exposures skipped since start-up because the machine fell behind."""
@@ -196,7 +195,7 @@ class FrameCycle:
 
     @property
     def timing(self) -> FrameTiming:
-        """When the sensor exposes and for how long it is busy."""
+        """Timing of the exposures, for the power model."""
         tracking = self.mode() is Mode.TRACKING
         return FrameTiming(
             self.running,
@@ -206,13 +205,13 @@ class FrameCycle:
         )
 
     def start(self) -> None:
-        """Start to expose now."""
+        """Start exposures now."""
         if not self.running:
             self._grid_ns = self._now_ns()
             self._next = self._scheduler.at(self._grid_ns, self._start_exposure)
 
     def stop(self) -> None:
-        """Stop; exposures not yet published are dropped."""
+        """Stop, and drop exposures that have not been published."""
         if self._next is not None:
             self._next.cancel()
             self._next = None
@@ -220,7 +219,7 @@ class FrameCycle:
         self._in_flight.clear()
 
     def _until_stopped(self, act: Callable[[Argument], None]) -> Callable[[Argument], None]:
-        """Return an action that does nothing once the cycle has been stopped."""
+        """Return an action that has no effect once the cycle has been stopped."""
         generation = self._generation
 
         def act_unless_stopped(argument: Argument) -> None:
@@ -230,7 +229,7 @@ class FrameCycle:
         return act_unless_stopped
 
     def reset(self) -> None:
-        """Stop and discard all attitudes, as the device restarts."""
+        """Stop and discard all attitudes, because the device restarts."""
         self.stop()
         self._rates.clear()
         self.published = self.skipped = 0
@@ -252,7 +251,7 @@ class FrameCycle:
         return float(self._parameters["exposure"]) / 1000.0
 
     def _period_ns(self) -> int:
-        """Return the time between exposures; a rate rounded to single precision does not make them overlap."""
+        """Return the time between exposures, which must not overlap even if the rate is rounded to f32."""
         period_s = 1.0 / float(self._parameters["update_rate"])
         return round(max(period_s, exposure_period_s(self._parameters)) * NANOSECONDS)
 
@@ -266,7 +265,7 @@ class FrameCycle:
         return round(seconds * NANOSECONDS)
 
     def _start_exposure(self, due_ns: int) -> None:
-        """Start an exposure, and schedule the next one on the grid."""
+        """Start an exposure and schedule the next one on the grid."""
         self._grid_ns = due_ns
         period_ns = self._period_ns()
         now_ns = self._now_ns()
@@ -300,7 +299,7 @@ class FrameCycle:
             then()
 
     def _assumed_velocity(self, mid_ns: int) -> NDArray[np.float64] | None:
-        """Return the velocity by which the device corrects aberration; None under a sky that has none."""
+        """Return the velocity with which the device corrects aberration; None if the sky has none."""
         velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
         if velocity is None or self.sky_has_aberration:
             return velocity
@@ -312,7 +311,7 @@ class FrameCycle:
         return None
 
     def true_state(self, at_ns: int) -> TruthState:
-        """Return the truth, with date and orbit, at a simulation time in nanoseconds."""
+        """Return the truth with date and orbit at a simulation time in nanoseconds."""
         t_s = at_ns / NANOSECONDS
         state, unix_s = self.truth.state(t_s), self.start_unix_s + t_s
         try:
@@ -342,7 +341,7 @@ class FrameCycle:
         predicted
             Attitude to track from; None: lost in space.
         velocity
-            Velocity with which the device corrects aberration; None: it does not.
+            Velocity with which the device corrects aberration; None: no correction.
         solve
             False to render only.
         """

@@ -1,4 +1,4 @@
-"""The device: its modes, parameters, time and frames, without the requests that reach it over links."""
+"""The device: modes, parameters, time and frames; requests from links are handled in `requests`."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from starhil.protocol.values import Value
 log = logging.getLogger("starhil.device")
 
 Background: TypeAlias = Callable[[Callable[[], None], Callable[[EmulatorError | None], None]], None]
-"""Runs slow work (the first argument), then calls the second one with the error, or None."""
+"""Runs slow work (the first argument), then calls the second argument with the error or None."""
 
 PREDICTION_LIMIT_S: Final = 30.0
-"""Maximum age of an attitude from which tracking can be commanded, seconds."""
+"""Maximum age of an attitude from which tracking can start, seconds."""
 
 STALE_PERIODS: Final = 3
-"""Update periods without a new measurement after which the last attitude is no longer valid."""
+"""Number of update periods without a new measurement after which the last attitude is no longer valid."""
 
 PROCESSING_ALLOWANCE_S: Final = 2.0
 
 PIPELINE_ENDED: Final = "pipeline_ended"
-"""Name in `device_error` of the error when the pipeline has ended and is not restarted."""
+"""Name in `device_error` for a pipeline that has ended and is not restarted."""
 
 
 def outcome(work: Callable[[], None]) -> EmulatorError | None:
-    """Do some work and return the error that it raised, or None."""
+    """Run some work and return the error that it raised, or None."""
     try:
         work()
     except EmulatorError as error:
@@ -62,7 +62,7 @@ def outcome(work: Callable[[], None]) -> EmulatorError | None:
 
 
 def run_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None], None]) -> None:
-    """Run the work in the foreground: on the stepped clock nothing may depend on the speed of a disk."""
+    """Run the work in the foreground: on the stepped clock, nothing may depend on the speed of a disk."""
     done(outcome(work))
 
 
@@ -80,7 +80,7 @@ class Device:
     imager
         Renders and solves the images.
     store
-        Keeps the state that survives a restart.
+        Stores the state that survives a restart.
     truth
         Source of the true attitude.
     background
@@ -144,28 +144,28 @@ class Device:
         self.subscriptions = Subscriptions(self.scheduler, clock.now_ns)
         self.latest: Measurement | None = None
         self.reported_quaternion: Quaternion = IDENTITY
-        """The last valid quaternion that was reported, for the sign of the next."""
+        """The last valid quaternion that was reported, for the sign of the next one."""
         self.selected_parameter = next(iter(icd.parameters_by_id), 0)
         self.accepted: dict[str, Mapping[str, Value]] = {}
-        """Values with which telecommands were last accepted, of those that telemetry reports."""
+        """Last accepted values of the telecommands that telemetry reports."""
         self.boot_count = 0
         self.reset_cause = "power_on"
         self.mode_changes = 0
         self.frames_valid = 0
         self.valid_in_a_row = 0
-        """Frames with a valid attitude since the last without one."""
+        """Number of frames with a valid attitude since the last invalid one."""
         self.started_ns = clock.now_ns()
         self.warm = False
         """Whether the pipeline is ready."""
         self.on_frame: list[Callable[[Measurement], None]] = []
         self.on_mode: list[Callable[[Transition], None]] = []
         self.on_start: list[Callable[[], None]] = []
-        """Called at power-on and at each reset, when parameters and time are set for the new start."""
+        """Called at power-on and at each reset, after parameters and time have been set."""
         self.on_reset: list[Callable[[], None]] = []
         self.unresponsive = False
-        """A fault: requests are neither counted nor answered."""
+        """Whether the fault is active in which requests are neither counted nor answered."""
         self.rate_fields = rate_fields(icd)
-        """Integer fields that report a body rate: field, axis, and its unit in one rad/s."""
+        """Integer fields that report a body rate: field, axis, and factor from rad/s to the field's unit."""
         self._background = background
         self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
@@ -183,7 +183,7 @@ class Device:
         self._persist(lambda error: log.error("%s", error) if error else None)
 
     def reset(self, cause: str) -> None:
-        """Restart, for a cause named in the enumeration `reset_cause`."""
+        """Restart with a cause named in the enumeration `reset_cause`."""
         self._start(cause, self._persistent_state())
         for observer in self.on_reset:
             call_guarded("reset", observer)
@@ -213,14 +213,14 @@ class Device:
             call_guarded("start", observer)
         self._persist(lambda error: log.error("%s", error) if error else None)
         if self.store.corrupt:
-            log.warning("the stored state is corrupt and was set aside; using the defaults")
+            log.warning("the stored state is corrupt and was renamed; using the defaults")
         if self._boot_end is not None:
             self._boot_end.cancel()
         boot_ns = round(self.profile.device.boot_s * NANOSECONDS)
         self._boot_end = self.scheduler.at(self.started_ns + boot_ns, self._boot_time_over)
 
     def pipeline_ready(self, camera_constants: dict[str, Value]) -> None:
-        """Note that the pipeline is ready; camera constants become defaults unless the profile sets them."""
+        """Handle a ready pipeline; camera constants become defaults unless the profile sets them."""
         self.warm = True
         configured = self.profile.parameters  # a device may be miscalibrated on purpose
         self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in configured})
@@ -228,12 +228,12 @@ class Device:
             self._end_boot()
 
     def pipeline_lost(self) -> None:
-        """Enter the error mode, as the pipeline has ended; a mode can be commanded once it is ready again."""
+        """Enter the error mode because the pipeline has ended; it can be left once the pipeline is ready."""
         self.warm = False
         self.modes.fail("processing")
 
     def pipeline_given_up(self) -> None:
-        """Enter the error mode until a reset, as the pipeline is not restarted again."""
+        """Enter the error mode until a reset, because the pipeline is not restarted again."""
         self.modes.fail(PIPELINE_ENDED)
 
     def _boot_time_over(self, _due_ns: int) -> None:
@@ -253,7 +253,7 @@ class Device:
         self._store_parameters(dict(self.parameters), done)
 
     def forget_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
-        """Delete the stored parameters: present values stay until the next restart, then defaults apply."""
+        """Delete the stored parameters; current values apply until the next restart, then the defaults."""
         self._store_parameters({}, done)
 
     def _store_parameters(
@@ -274,11 +274,11 @@ class Device:
         self._persist(finish)
 
     def restore_parameters(self) -> None:
-        """Set all parameters to their stored values, or to their defaults where none is stored."""
+        """Set all parameters to their stored values, or to their defaults if none are stored."""
         self.parameters.restore(self._stored_parameters)
 
     def upset_parameter(self, name: str, bit: int) -> None:
-        """Flip a bit of a parameter in memory; enter the error mode if the result is not a valid setting."""
+        """Flip a bit of a parameter in memory; enter the error mode if the result is invalid."""
         log.warning("bit %d of the parameter %s flipped", bit, name)
         if not self.parameters.flip_bit(name, bit):
             self.modes.fail("parameter_store")
@@ -288,14 +288,14 @@ class Device:
         self._background(lambda: self.store.save(content), done)
 
     def _persistent_state(self) -> dict[str, object]:
-        """Return the state that survives a restart, with writes still in progress included."""
+        """Return the state that survives a restart, including writes in progress."""
         return {"boot_count": self.boot_count, "parameters": self._stored_parameters}
 
     # --- frames ---
 
     @property
     def fresh(self) -> Measurement | None:
-        """The last measurement, or None if it is out of date or the mode makes no images."""
+        """The last measurement, or None if it is outdated or no images are taken in this mode."""
         last = self.latest
         if last is None or not self.modes.mode.makes_frames:
             return None
@@ -334,7 +334,7 @@ class Device:
             call_guarded("mode", observer, transition)
 
     def command_mode(self, wanted: Mode) -> bool:
-        """Command a mode; return False if it is refused."""
+        """Change the mode by telecommand; return False if this is refused."""
         if self.modes.mode is Mode.ERROR and not self.warm:
             return False
         return self.modes.command(wanted, has_attitude=self.cycle.has_fix(PREDICTION_LIMIT_S))
@@ -352,7 +352,7 @@ class Device:
         self.thermal.set_power(self.clock.now_ns(), self.power.mean_power_w(self.cycle.timing))
 
     def _conditions(self, truth: TruthState) -> Conditions:
-        """Return what the surroundings do to the detector now."""
+        """Return the current conditions of the detector."""
         radiation = self.profile.radiation
         position_m = None if truth.orbit is None else truth.orbit.position_m
         particles_s = particle_rate(radiation.quiet_s, radiation.anomaly_s, position_m, truth.unix_s)
@@ -360,7 +360,7 @@ class Device:
 
 
 def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
-    """Return the integer fields that report a body rate, which may be beyond their range: field, axis, factor."""
+    """Return the integer fields that report a body rate, whose range it may exceed: field, axis, factor."""
     axes = {"rate.x": 0, "rate.y": 1, "rate.z": 2}
     return [
         (field, axes[str(field.value)], factor("rad/s", field.unit) or 1.0)
@@ -387,12 +387,12 @@ def orbit_of(profile: Profile) -> Orbit | None:
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
-    """Return the parameter defaults of a profile: its `[parameters]` and the settings of its `[links]`.
+    """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`.
 
     Raises
     ------
     EmulatorError
-        The table names an unknown parameter.
+        The table contains an unknown parameter.
     """
     links = profile.links
     serial, unit_serial = links.serial, icd.link.serial

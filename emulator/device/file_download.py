@@ -1,7 +1,7 @@
 """Download of files in blocks: loading, bursts of numbered packets, and the hole map of received packets.
 
-Files are the stored image as `bmp` and an `index` with 12 bytes per file: `<type u8, counter u8,
-edge u16, size u32, frame u32>`. The layout of the index is not published; it is our own definition.
+The files are the stored image as `bmp`, and an `index` with 12 bytes per file: `<type u8, counter u8, edge u16,
+size u32, frame u32>`. The layout of the index is not public; this one is ours.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ INDEX_ENTRY: Final = struct.Struct("<BBHII")
 
 
 class FileDownload:
-    """The loaded block, and which of its packets have arrived."""
+    """The loaded block, and the map of its packets that have arrived."""
 
     def __init__(self, images: ImageStore) -> None:
         self._images = images

@@ -1,6 +1,6 @@
-"""Images for download: capture, storage, and the image that is being sent.
+"""Images for download: capture, storage and transfer.
 
-A stored image stays until the next one is complete, and a download keeps the image that it opened.
+A stored image is kept until the next one is complete, and a download keeps the image that it opened.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ImageStore:
     Parameters
     ----------
     single_frame
-        Returns the request for one unsolved exposure, for a simulation time of mid-exposure.
+        Returns the request for an unsolved exposure with a given simulation time of mid-exposure.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class ImageStore:
         self.clear()
 
     def clear(self) -> None:
-        """Discard everything, as the device restarts."""
+        """Discard everything, because the device restarts."""
         self._generation += 1
         self._count = 0
         self._cycle.after_exposure = None
@@ -95,7 +95,7 @@ class ImageStore:
         self.frame = 0
 
     def save(self, edge: int) -> None:
-        """Capture and store the next exposure; in standby, make one."""
+        """Capture and store the next exposure; in standby, take one."""
         self.percent = 0
         self.status = "waiting_sensor"
 
@@ -123,7 +123,7 @@ class ImageStore:
         self._capture(lambda: self._fetch_image(0, finish))
 
     def _capture(self, then: Callable[[], None]) -> None:
-        """Call `then` when the next exposure has been sent to the pipeline; in standby, make one."""
+        """Call `then` when the next exposure has been sent to the pipeline; in standby, take one."""
         self.busy = True
         if self._cycle.running:
             self._cycle.after_exposure = then
@@ -139,7 +139,7 @@ class ImageStore:
         self._scheduler.at(start_ns + exposure_ns, expose)
 
     def cycle_stopped(self) -> None:
-        """Make one exposure for a pending capture, as the cycle makes no more."""
+        """Take an exposure for a pending capture, because the cycle takes no more."""
         then, self._cycle.after_exposure = self._cycle.after_exposure, None
         if then is not None:
             self._capture(then)
@@ -149,7 +149,7 @@ class ImageStore:
         return StoredImage(answer.width, answer.pixels, answer.frame, self._count)
 
     def open_stored(self, edge: int) -> bool:
-        """Open the stored image for download, reduced to `edge`; return False if it is not large enough."""
+        """Open the stored image for download, reduced to `edge`; return False if it is too small."""
         if self.stored is None or edge > self.stored.edge:
             return False
         self.download = self.stored.binned(edge)
@@ -157,7 +157,7 @@ class ImageStore:
         return True
 
     def open_last(self, edge: int, done: Callable[[bool], None]) -> None:
-        """Open the last exposure for download; `done` gets whether there was one."""
+        """Open the last exposure for download; call `done` with whether there was one."""
         self.busy = True
         self.download = None
 
@@ -172,7 +172,7 @@ class ImageStore:
         self._fetch_image(edge, take)
 
     def _fetch_image(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
-        """Fetch an image from the pipeline; `take` gets it after `STORE_S`, or None on failure."""
+        """Fetch an image from the pipeline; call `take` after `STORE_S` with it, or with None on failure."""
         generation = self._generation
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
         answers: list[PipelineReply] = []

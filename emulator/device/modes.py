@@ -10,9 +10,8 @@
                            ▲                               │
                            └───(tracking lost, command)────┘
 
-Standby, lost_in_space and tracking can be commanded. Tracking needs an attitude to start from, found
-since the last start and not older than `device.PREDICTION_LIMIT_S`. Boot is entered by a reset only,
-and error by a fault only.
+Standby, lost_in_space and tracking can be commanded. Tracking needs an attitude to start from, found since the
+last start and not older than `device.PREDICTION_LIMIT_S`. Only a reset leads to boot, and only a fault to error.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from typing import Final
 
 
 class Mode(StrEnum):
-    """Modes of the device, by their names in the interface definition."""
+    """Modes of the device, with their names in the interface definition."""
 
     BOOT = "boot"
     STANDBY = "standby"
@@ -34,7 +33,7 @@ class Mode(StrEnum):
 
     @property
     def makes_frames(self) -> bool:
-        """Whether the sensor exposes and solves in this mode."""
+        """Whether frames are exposed and solved in this mode."""
         return self in {Mode.LOST_IN_SPACE, Mode.TRACKING}
 
 
@@ -49,7 +48,7 @@ COMMANDED: Final[dict[Mode, frozenset[Mode]]] = {
 
 
 class Cause(StrEnum):
-    """Why the mode changed."""
+    """Cause of a mode change."""
 
     RESET = "reset"
     BOOTED = "booted"
@@ -70,7 +69,7 @@ class Transition:
 
 
 class Modes:
-    """The present mode, and the rules by which it changes.
+    """The current mode, and the rules for changing it.
 
     Parameters
     ----------
@@ -85,7 +84,7 @@ class Modes:
         self._on_change = on_change
 
     def allows(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Return whether a mode can be commanded now.
+        """Return whether a mode can be commanded.
 
         Parameters
         ----------
@@ -97,7 +96,7 @@ class Modes:
         return wanted in COMMANDED[self.mode] and (wanted is not Mode.TRACKING or has_attitude)
 
     def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Change the mode by telecommand; return False if that is not allowed."""
+        """Change the mode by telecommand; return False if this is not allowed."""
         if not self.allows(wanted, has_attitude=has_attitude):
             return False
         self._enter(wanted, Cause.COMMAND)
@@ -108,7 +107,7 @@ class Modes:
         self._enter(Mode.BOOT, Cause.RESET)
 
     def booted(self) -> None:
-        """Leave the boot mode, unless a fault came first."""
+        """Leave the boot mode, unless a fault has already done so."""
         if self.mode is Mode.BOOT:
             self._enter(Mode.STANDBY, Cause.BOOTED)
 
@@ -117,7 +116,7 @@ class Modes:
         self._enter(Mode.ERROR, Cause.FAULT, why)
 
     def solved(self, *, valid: bool, tracked: bool, tracking_enabled: bool) -> None:
-        """Change the mode by the result of an exposure.
+        """Change the mode according to the result of an exposure.
 
         Parameters
         ----------

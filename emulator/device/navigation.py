@@ -1,4 +1,4 @@
-"""The device's own velocity, from its clock and the orbit in its parameters, to correct stellar aberration."""
+"""Velocity assumed by the device, from its clock and the orbit in its parameters, to correct aberration."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -
     Parameters
     ----------
     parameters
-        The device's parameters.
+        Parameters of the device.
     unix_s
         Unix time on the device's clock.
 
@@ -37,7 +37,7 @@ def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -
 
 
 def known_orbit(parameters: Mapping[str, ParameterValue]) -> KeplerOrbit | None:
-    """Return the orbit in the device's parameters; None if there is none."""
+    """Return the orbit in the parameters of the device; None if there is none."""
     elements = {
         name: float(parameters.get(f"orbit_{name}", 0.0))
         for name in (
@@ -64,5 +64,5 @@ def known_orbit(parameters: Mapping[str, ParameterValue]) -> KeplerOrbit | None:
 
 
 def perigee_below_surface(semi_major_axis_km: float, eccentricity: float) -> bool:
-    """Whether an orbit that is known, with a semi-major axis other than 0, meets the Earth."""
+    """Return whether a known orbit (with a semi-major axis other than 0) intersects the Earth."""
     return semi_major_axis_km != 0.0 and 1e3 * semi_major_axis_km * (1.0 - eccentricity) < EARTH_RADIUS_M

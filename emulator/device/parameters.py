@@ -1,4 +1,4 @@
-"""The device's parameters: values checked against the interface definition, stored and restored."""
+"""The parameters of the device: checked against the interface definition, stored and restored."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ ORDERED: Final[tuple[tuple[str, str], ...]] = (("min_star_pixels", "max_star_pix
 """Pairs whose first parameter must not exceed the second."""
 
 ORBIT_SIZE: Final = ("orbit_semi_major_axis", "orbit_eccentricity")
-"""Parameters that determine the perigee."""
+"""Parameters on which the perigee depends."""
 
 PERIOD_ROUNDING: Final = 1e-6
-"""Fraction of a period by which rounding to single precision may shorten it."""
+"""Fraction by which rounding to single precision may shorten a period."""
 
 
 def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
@@ -59,8 +59,8 @@ def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...
     axis_km, eccentricity = (float(values.get(name, 0.0)) for name in ORBIT_SIZE)
     if perigee_below_surface(axis_km, eccentricity):
         return ORBIT_SIZE, (
-            f"orbit_semi_major_axis {axis_km:g} km and orbit_eccentricity {eccentricity:g} make an orbit that meets "
-            "the Earth; set them to a perigee above 6378 km, or the first to 0"
+            f"orbit_semi_major_axis {axis_km:g} km and orbit_eccentricity {eccentricity:g} describe an orbit that intersects "
+            "the Earth; set a perigee above 6378 km, or the semi-major axis to 0"
         )
     rate, needed_s = float(values["update_rate"]), exposure_period_s(values)
     if needed_s * rate > 1.0 + PERIOD_ROUNDING:
@@ -80,7 +80,7 @@ class Parameters(Mapping[str, ParameterValue]):
     icd
         Interface definition, with names, types and limits.
     defaults
-        Defaults of this device that differ from the definition's.
+        Defaults of this device that differ from the definition.
 
     Raises
     ------
@@ -111,7 +111,7 @@ class Parameters(Mapping[str, ParameterValue]):
         return len(self._values)
 
     def number(self, name: str) -> float:
-        """Return a parameter as the number sent on the bus."""
+        """Return a parameter as the number that is sent on the bus."""
         return self._definitions[name].to_number(self._values[name])
 
     def definition(self, name: str) -> Parameter:
@@ -119,7 +119,7 @@ class Parameters(Mapping[str, ParameterValue]):
         return self._definitions[name]
 
     def default(self, name: str) -> ParameterValue:
-        """Return the default of a parameter in this device."""
+        """Return the default of a parameter for this device."""
         return self._defaults[name]
 
     def observe(self, observer: Callable[[frozenset[str]], None]) -> None:
@@ -127,7 +127,7 @@ class Parameters(Mapping[str, ParameterValue]):
         self._observers.append(observer)
 
     def set(self, changes: Mapping[str, Value]) -> None:
-        """Set some parameters, all or none.
+        """Set parameters, all or none.
 
         Raises
         ------
@@ -137,10 +137,9 @@ class Parameters(Mapping[str, ParameterValue]):
         self._assign(self._checked(self._values, changes))
 
     def flip_bit(self, name: str, bit: int) -> bool:
-        """Flip a bit of a parameter in memory, as a particle does; return whether the result is a valid setting.
+        """Flip a bit of a parameter in memory, as a particle does; return whether the result is valid.
 
-        A setting that is not valid is replaced by the default, as the device finds it when it checks its
-        parameters.
+        An invalid value is replaced by the default, because the device checks its parameters.
         """
         definition = self._definitions[name]
         flipped = flipped_number(self.number(name), memory_format(definition), bit)
@@ -156,7 +155,7 @@ class Parameters(Mapping[str, ParameterValue]):
         self._assign(self._defaults)
 
     def adopt_defaults(self, defaults: Mapping[str, Value]) -> None:
-        """Replace some defaults, and the values that are still at their default."""
+        """Replace some defaults, and values that are still at their default."""
         checked = self._checked(self._defaults, defaults)
         follow = {
             name: value for name, value in checked.items() if self._values[name] == self._defaults[name]
@@ -165,10 +164,10 @@ class Parameters(Mapping[str, ParameterValue]):
         self._assign(follow)
 
     def restore(self, stored: Mapping[str, object]) -> list[str]:
-        """Set all parameters to stored values, or to their defaults; return the stored names that were ignored.
+        """Set all parameters to stored values, or to their defaults; return the ignored names.
 
-        Unknown parameters and invalid values are ignored. Contradictions are checked for the stored
-        values as a whole, and observers are called once.
+        Unknown parameters and invalid values are ignored. Contradictions are checked for all stored values
+        together, and observers are called once.
         """
         allowed: dict[str, Value] = {}
         for name, value in stored.items():
@@ -178,7 +177,7 @@ class Parameters(Mapping[str, ParameterValue]):
         accepted: dict[str, ParameterValue] = {}
         try:
             accepted = self._checked(self._defaults, allowed)
-        except MessageError:  # two values contradict each other: the later one is ignored
+        except MessageError:  # if two values contradict each other, the later one is ignored
             for name, value in allowed.items():
                 with contextlib.suppress(MessageError):
                     accepted |= self._checked({**self._defaults, **accepted}, {name: value})
@@ -187,12 +186,12 @@ class Parameters(Mapping[str, ParameterValue]):
         return [name for name in stored if name not in accepted]
 
     def mark_stored(self, stored: Mapping[str, ParameterValue]) -> None:
-        """Remember the values that are stored."""
+        """Record the stored values."""
         self._stored = dict(stored)
 
     @property
     def differ_from_store(self) -> bool:
-        """Whether a restart would change any value."""
+        """Return whether a restart would change any value."""
         return {**self._defaults, **self._stored} != self._values
 
     def _checked(

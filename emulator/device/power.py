@@ -1,4 +1,4 @@
-"""Power and temperature of the unit: the phases of a frame's cycle, what each draws, and how that warms the unit."""
+"""Power and temperature of the unit: phases of the frame cycle, their currents, and the resulting heating."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MILLI: Final = 1e-3
 
 
 class Phase(StrEnum):
-    """Phases of the cycle of a frame, by their names in the interface definition."""
+    """Phases of the frame cycle, with their names in the interface definition."""
 
     IDLE = "idle"
     IMAGER_ON = "imager_on"
@@ -24,18 +24,18 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """When the unit exposes.
+    """Timing of the frames.
 
     Attributes
     ----------
     running
-        Whether it makes frames.
+        Whether frames are taken.
     start_ns
         Start of the last exposure, simulation time.
     busy_s
-        From the start of an exposure to the end of its processing, seconds.
+        Time from the start of an exposure to the end of its processing, seconds.
     period_s
-        From exposure to exposure, seconds.
+        Time from exposure to exposure, seconds.
     """
 
     running: bool
@@ -45,11 +45,11 @@ class FrameTiming:
 
 
 class PowerModel:
-    """What the unit draws, phase by phase.
+    """Current and power of the unit in each phase.
 
-    The imager is switched on before an exposure; exposure and processing follow, then the transfer of the
-    result, and the unit idles until the imager is switched on for the next frame. Where the period is too
-    short for all of them, idling is shortened first, then the transfer.
+    The imager is switched on before an exposure. After exposure and processing, the result is transferred,
+    and the unit is idle until the imager is switched on for the next frame. If the period is too short for
+    all phases, idle is shortened first, then the transfer.
     """
 
     def __init__(self, config: PowerConfig) -> None:
@@ -62,7 +62,7 @@ class PowerModel:
         }
 
     def durations_s(self, timing: FrameTiming) -> dict[Phase, float]:
-        """Return how long each phase lasts in a period, from the start of the exposure on."""
+        """Return the duration of each phase in a period, beginning with the exposure."""
         if not timing.running:
             return {Phase.IDLE: timing.period_s}
         left = timing.period_s
@@ -105,9 +105,9 @@ class PowerModel:
 
 
 class ThermalModel:
-    """Temperature of the unit: its mounting, which follows the orbit, and what its own power adds.
+    """Temperature of the unit: the mounting's temperature, which follows the orbit, plus heating by power.
 
-    The rise above the mounting follows the mean power with one time constant.
+    The heating follows the mean power with one time constant.
     """
 
     def __init__(self, config: ThermalConfig) -> None:
@@ -117,13 +117,13 @@ class ThermalModel:
         self._since_ns = 0
 
     def start(self, now_ns: int, power_w: float) -> None:
-        """Begin at the temperature of the mounting."""
+        """Start at the temperature of the mounting."""
         self._rise_c = 0.0
         self._since_ns = now_ns
         self._towards_c = power_w * self._config.heating_c_w
 
     def set_power(self, now_ns: int, power_w: float) -> None:
-        """Let the mean power be another from now on."""
+        """Change the mean power."""
         self._rise_c = self._rise(now_ns)
         self._since_ns = now_ns
         self._towards_c = power_w * self._config.heating_c_w

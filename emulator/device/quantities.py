@@ -1,7 +1,7 @@
-"""The quantities of the device: a function for each name that `configs/units/model.toml` declares.
+"""The quantities of the device: one function for each name declared in `configs/units/model.toml`.
 
-A function returns the value in the declared unit, or None where there is none: the field then has its
-default, or 0. The function of a numbered quantity, such as `stars[n].x`, also takes the number.
+A function returns the value in the declared unit, or None if there is none; the field then has its default or 0.
+The function of a numbered quantity, such as `stars[n].x`, also takes the number.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Getter: TypeAlias = Callable[[Snapshot], Value | None]
 UINT32: Final = 0xFFFF_FFFF
 
 QUANTITIES: Final[dict[str, Callable[..., Value | None]]] = {}
-"""Name → function of the snapshot, and of the number where the name has one."""
+"""Name → function of the snapshot, and of the number if the name has one."""
 
 Function = TypeVar("Function", bound=Callable[..., Value | None])
 
@@ -42,7 +42,7 @@ def _quantity(name: str) -> Callable[[Function], Function]:
 
 
 def getter_of(name: str) -> Getter:
-    """Return the function of a quantity of the device model, such as `attitude.w`, `stars[3].x` or `parameter.exposure`."""
+    """Return the function of a quantity such as `attitude.w`, `stars[3].x` or `parameter.exposure`."""
     if name.startswith(PARAMETER):
         parameter = name.removeprefix(PARAMETER)
         return lambda shot: shot.device.parameters[parameter]
@@ -82,7 +82,7 @@ def _confidence(shot: Snapshot) -> float | None:
 
 @_quantity("rate.clipped")
 def _rate_clipped(shot: Snapshot) -> bool:
-    """Whether a rate is beyond the range of an integer field that reports it."""
+    """Return whether a rate is beyond the range of an integer field that reports it."""
     if shot.frame is None:
         return False
     rates = shot.reported.rate_rad_s

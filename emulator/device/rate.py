@@ -1,4 +1,4 @@
-"""Estimation of the body rate from the last attitudes."""
+"""Estimation of the body rate from recent attitudes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ RATE_SPAN_S: Final = 2.0
 
 
 class RateEstimator:
-    """Estimates the body rate from the last valid attitudes."""
+    """Estimates the body rate from recent valid attitudes."""
 
     def __init__(self) -> None:
         self._fixes: deque[tuple[int, Attitude]] = deque(maxlen=HISTORY)
@@ -29,7 +29,7 @@ class RateEstimator:
 
     @property
     def last(self) -> tuple[int, Attitude] | None:
-        """Time (simulation time, nanoseconds) and value of the last attitude, or None."""
+        """Simulation time in nanoseconds and value of the last attitude, or None."""
         return self._fixes[-1] if self._fixes else None
 
     def add(self, mid_ns: int, attitude: Attitude, period_s: float) -> None:
@@ -39,7 +39,7 @@ class RateEstimator:
         self._fixes.append((mid_ns, attitude))
 
     def rate(self, window: int) -> Triple | None:
-        """Return the least-squares rate over the last `window` attitudes, rad/s; None from fewer than two."""
+        """Return the least-squares rate over the last `window` attitudes, rad/s; None for fewer than two."""
         if len(self._fixes) < 2:
             return None
         newest_ns, newest = self._fixes[-1]

@@ -1,4 +1,4 @@
-"""The exception by which an action or quantity refuses a request."""
+"""The exception with which an action or quantity refuses a request."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ class Refused(Exception):  # noqa: N818 (an answer on the bus, not an error of t
     code
         The error.
     argument
-        Name of the argument or parameter at fault, if it is one.
+        Name of the invalid argument or parameter, if any.
     index
-        Index of the telecommand field at fault, for the acknowledge telemetry.
+        Index of the invalid telecommand field, for the telemetry row `acknowledge`.
     """
 
     def __init__(self, code: ErrorCode, argument: str | None = None) -> None:

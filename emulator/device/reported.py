@@ -1,4 +1,4 @@
-"""The attitude as the device reports it: in the mounting frame, with validity and time."""
+"""The reported attitude: in the mounting frame, with validity and time."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from starid.attitude import Attitude
 
 @dataclass(frozen=True)
 class Reported:
-    """Attitude and rate as reported.
+    """Reported attitude and rate.
 
     Attributes
     ----------
     valid, reason
         Whether the attitude is valid, and the reason if not.
     quaternion_xyzw
-        ICRS → reported frame in the unit's convention, scalar last; zeros where invalid.
+        ICRS → reported frame in the convention of the unit, scalar last; zeros if invalid.
     rate_rad_s
-        Body rate in the reported frame, rad/s; zeros where unknown.
+        Body rate in the reported frame, rad/s; zeros if unknown.
     mid_unix_s
         Unix time of mid-exposure on the device's clock, seconds.
     """
@@ -42,7 +42,7 @@ class Reported:
 
 
 def reported(device: Device) -> Reported:
-    """Return the attitude that the device reports now, in the conventions of its unit."""
+    """Return the currently reported attitude, in the conventions of the unit."""
     last = device.fresh
     if last is None:
         running = device.modes.mode.makes_frames
@@ -69,7 +69,7 @@ def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
 
 
 def _in_convention(attitude: Attitude, device: Device) -> Quaternion:
-    """Return a quaternion in direction and sign of the unit's convention."""
+    """Return a quaternion with the direction and sign of the unit's convention."""
     conventions = device.icd.conventions
     x, y, z, w = as_quaternion(attitude)
     if conventions.quaternion == "attitude":
@@ -90,7 +90,7 @@ def _turns(device: Device) -> list[np.ndarray]:
 
 @cache
 def axes_turns(conventions: Conventions) -> list[np.ndarray]:
-    """Return the rotation vector from the sensor's axes to the reported frame's, radians."""
+    """Return the rotation vector from sensor axes to reported axes, radians."""
     matrix = np.array(conventions.rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
     sine = float(np.linalg.norm(axis))
@@ -98,10 +98,10 @@ def axes_turns(conventions: Conventions) -> list[np.ndarray]:
 
 
 def mounting_turns(parameters: Parameters) -> list[np.ndarray]:
-    """Return the rotation vectors from the sensor frame to the reported frame, radians; zero angles are omitted.
+    """Return the rotation vectors from sensor frame to reported frame, radians; zero angles are omitted.
 
-    The reported frame is the sensor frame turned by alpha about x, then by beta about its new y, then by
-    gamma about its new z.
+    The reported frame is the sensor frame turned by alpha about x, then by beta about the new y, then by
+    gamma about the new z.
     """
     turns = []
     for axis, name in enumerate(("mounting_alpha", "mounting_beta", "mounting_gamma")):

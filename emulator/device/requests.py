@@ -1,4 +1,4 @@
-"""The one way into the device: requests from every link, and the telemetry that it sends unsolicited."""
+"""Requests from all links to the device, and unsolicited telemetry."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from starhil.protocol.values import MessageError
 log = logging.getLogger("starhil.device")
 
 BY_PARAMETERS = "parameters"
-"""Origin of the subscription that the parameters unsolicited_selection and unsolicited_rate make."""
+"""Origin of the subscription made by the parameters unsolicited_selection and unsolicited_rate."""
 
 
 class Requests:
@@ -31,7 +31,7 @@ class Requests:
     Parameters
     ----------
     device
-        The device that the requests act on.
+        The device that executes the requests.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Requests:
         self._stamped = serial is not None and any(
             item.role in ("ticks", "time") for item in serial.reply_header
         )
-        """Whether replies carry the time."""
+        """Whether replies contain the time."""
         device.subscriptions.send = self._send_unsolicited
         device.on_start.append(self._restart_subscriptions)
         device.on_frame.append(lambda _measurement: device.subscriptions.frame_published())
@@ -67,8 +67,8 @@ class Requests:
         request
             The request as received.
         later
-            Called with the answer to a telecommand that is answered only once it is done; `handle` then
-            returns None.
+            Called with the answer to a telecommand that is answered when it is done; `handle` then returns
+            None.
         """
         device = self.device
         if device.unresponsive:
@@ -103,7 +103,7 @@ class Requests:
             self.device.counters.count_fault(fault)
 
     def telemetry(self, name: str) -> bytes:
-        """Return the present data of a telemetry row.
+        """Return the current data of a telemetry row.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class Requests:
             raise Refused(ErrorCode.INTERNAL) from error
 
     def _replies(self, request: Request, row: Row | None, reply: Reply) -> list[Reply]:
-        """Return the answers of a row in their order, with its reply, or its refusal, among them."""
+        """Return the answers of a row in order, including its reply or refusal."""
         if row is None or row.answers == ("reply",):
             return [reply]
         replies: list[Reply] = []
@@ -137,7 +137,7 @@ class Requests:
         return [replace(item, final=item is replies[-1]) for item in replies]
 
     def _answers_with_data(self, request: Request, replies: Sequence[Reply]) -> list[Reply]:
-        """Return the answers whose data an action of a plugin has made; no ID says that they are answers."""
+        """Return answers with data made by an action of a plugin, which are marked by having no ID."""
         data = [reply.data for reply in replies if reply.id is None]
         return [
             replace(self._reply(request, ReplyKind.ACK, item), final=number == len(data))
@@ -185,7 +185,7 @@ class Requests:
         return uptime_ns, device.icd.conventions.reported_ns(device.time.unix_ns())
 
     def _execute(self, request: Request, row: Row | None) -> tuple[ErrorCode | None, Sequence[Reply]]:
-        """Execute a telecommand and record its outcome; the code is None while the outcome is open."""
+        """Execute a telecommand and record its outcome; the code is None while the outcome is pending."""
         device = self.device
         if not device.acknowledge.processed:
             device.counters.overrun()

@@ -1,7 +1,7 @@
 """A queue of events in simulation time.
 
-The real clock sleeps until the next event; the stepped clock jumps from event to event. Both run the
-same actions in the same order.
+A real clock sleeps until the next event, the stepped clock jumps from event to event. Both run the same actions in
+the same order.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Action: TypeAlias = Callable[[int], None]
 
 @dataclass(order=True)
 class Event:
-    """An action at a simulation time; events of equal time run in the order in which they were added."""
+    """An action at a simulation time; simultaneous events run in the order in which they were added."""
 
     due_ns: int
     order: int
@@ -37,7 +37,7 @@ class Scheduler:
         self._queue: list[Event] = []
         self._order = itertools.count()
         self.on_add: Callable[[], None] | None = None
-        """Called when an event was added, so that a sleeping loop can wake up earlier."""
+        """Called when an event has been added, so that a sleeping loop can wake up earlier."""
 
     def at(self, due_ns: int, action: Action) -> Event:
         """Schedule an action at a simulation time, nanoseconds."""

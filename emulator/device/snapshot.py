@@ -1,4 +1,4 @@
-"""One look at the device for one row: what several of its quantities share is computed once."""
+"""State of the device for one row; values shared by several quantities are computed once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Result = TypeVar("Result")
 
 
 class once(Generic[Result]):  # noqa: N801 (used like a function)
-    """A property that is computed at first use; `functools.cached_property` takes a lock each time, until Python 3.12."""
+    """A property computed at first use; before Python 3.12, `functools.cached_property` takes a lock."""
 
     def __init__(self, function: Callable[[Any], Result]) -> None:
         self._function = function
@@ -45,7 +45,7 @@ class Snapshot:
 
     @once
     def frame(self) -> Measurement | None:
-        """The last measurement, or None if it is out of date or the mode makes no images."""
+        """The last measurement, or None if it is outdated or no images are taken in this mode."""
         return self.device.fresh
 
     @once
@@ -65,13 +65,13 @@ class Snapshot:
 
     @once
     def exposure_ns(self) -> int | None:
-        """Middle of the exposure on the device's clock since the unit's epoch, nanoseconds; None without a frame."""
+        """Middle of the exposure on the device clock since the unit's epoch, ns; None without a frame."""
         frame = self.frame
         return None if frame is None else self.device.icd.conventions.reported_ns(frame.mid_unix_ns)
 
     @once
     def phase(self) -> Phase:
-        """The phase of the cycle of a frame."""
+        """The phase of the frame cycle."""
         return self.device.power.phase(self.device.cycle.timing, self.device.clock.now_ns())
 
     @once

@@ -1,8 +1,8 @@
 """The state that survives a restart (parameters and boot count), written atomically.
 
-The file is JSON with a checksum over its content. It is written under a temporary name, flushed to
-disk and renamed over the old file, so that a reader finds the old state or the new one even if the
-writer is killed. A corrupt file is set aside under another name, and the device uses its defaults.
+The file is JSON with a checksum over its content. It is written under a temporary name, flushed to disk and renamed
+over the old file, so that a reader finds either the old or the new state even if the writer is killed. A corrupt
+file is renamed, and the device uses its defaults.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ class StateStore(Protocol):
     """Stores the state that survives a restart."""
 
     corrupt: bool
-    """The stored state could not be read and was set aside."""
+    """Whether the stored state could not be read and was renamed."""
 
     def load(self) -> dict[str, Any]:
-        """Return the last saved state; empty if there is none or it is corrupt."""
+        """Return the last saved state, empty if there is none or it is corrupt."""
 
     def save(self, content: dict[str, Any]) -> None:
-        """Save the whole content, or none of it."""
+        """Save the complete content, or none of it."""
 
     def close(self) -> None:
         """Release the store for another process."""
@@ -61,7 +61,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """State in a folder that one process uses at a time.
+    """State in a folder, which only one process at a time can use.
 
     Raises
     ------
@@ -88,7 +88,7 @@ class FileStore:
             raise EmulatorError(f"state folder {folder}: {why}; choose another with --state-dir") from None
 
     def load(self) -> dict[str, Any]:
-        """Return the last saved state; a corrupt file is set aside as `device.json.corrupt`."""
+        """Return the last saved state; a corrupt file is renamed `device.json.corrupt`."""
         try:
             content = _decode(read_user_file(self.path, MAX_BYTES))
         except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Telemetry that the device sends unasked: lists of rows, each at its rate or with each frame."""
+"""Unsolicited telemetry: lists of rows, each sent at a rate or with each frame."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from starhil.protocol.codec import Row
 
 @dataclass(frozen=True)
 class Subscription:
-    """A telemetry row and its rate, Hz; None: once with each frame."""
+    """A telemetry row and its rate, Hz; None: with each frame."""
 
     row: Row
     rate_hz: float | None
 
 
 class Subscriptions:
-    """The rows that are sent unasked, and when.
+    """Schedule of the rows that are sent unsolicited.
 
     Attributes
     ----------
     send
-        Sends a row now.
+        Sends a row.
     """
 
     def __init__(self, scheduler: Scheduler, now_ns: Callable[[], int]) -> None:
@@ -35,7 +35,7 @@ class Subscriptions:
         self.send: Callable[[Row], None] = lambda _row: None
 
     def replace(self, origin: str, subscriptions: Sequence[Subscription]) -> None:
-        """Replace the list of one origin (a telecommand, or the parameters for it); rates begin now."""
+        """Replace the list of one origin (a telecommand, or parameters) from now on."""
         for key in [key for key in self._events if key[0] == origin]:
             self._events.pop(key).cancel()
         self._lists[origin] = subscriptions
@@ -44,12 +44,12 @@ class Subscriptions:
                 self._schedule((origin, number), subscription.row, subscription.rate_hz, self._now_ns())
 
     def clear(self) -> None:
-        """Forget all lists, as the device restarts."""
+        """Discard all lists, because the device restarts."""
         for origin in list(self._lists):
             self.replace(origin, ())
 
     def frame_published(self) -> None:
-        """Send the rows that go with each frame."""
+        """Send the rows that are due with each frame."""
         for subscriptions in list(self._lists.values()):
             for subscription in subscriptions:
                 if subscription.rate_hz is None:

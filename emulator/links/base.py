@@ -1,4 +1,4 @@
-"""The base of the links: passes requests from a transport to the device, and replies back."""
+"""Base of the links: passes requests from a transport to the device, and replies back."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ Style = TypeVar("Style")
 log = logging.getLogger("starhil.link")
 
 FLUSH_S: Final = 0.51
-"""Delay after which an incomplete message is dropped, seconds: just above the receivers' timeout of 0.5 s."""
+"""Delay after which an incomplete message is dropped, seconds; just above the receivers' timeout, 0.5 s."""
 
 
 class Link(Protocol):
     """An open link of any kind."""
 
     bus: ClassVar[str]
-    """Name of the bus, `serial` or `can`: a wire fault affects every link on its bus."""
+    """Name of the bus, `serial` or `can`; a link fault affects every link on its bus."""
 
     @property
     def transport(self) -> Transport[Any]:
@@ -39,7 +39,7 @@ class Link(Protocol):
 
     @property
     def wire(self) -> WireFaults[Any]:
-        """Outgoing side of the wire, with its faults."""
+        """Outgoing side of the link, with its faults."""
 
     async def start(self) -> str:
         """Open the transport; return its port or bus."""
@@ -54,13 +54,13 @@ class DeviceLink(ABC, Generic[Item, Style]):
     Parameters
     ----------
     requests
-        The device's handling of requests.
+        Request handling of the device.
     transport
         Transport of bytes or CAN frames.
     damage
-        Damages items for wire faults.
+        Corrupts items for link faults.
     seed
-        Seed of the wire faults.
+        Seed of the link faults.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
         self._held_input: deque[Request | LinkFault] = deque()
-        """Input that arrived while a reply is pending: replies leave in the order of the requests."""
+        """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
         self._pending_request: Request | None = None
         self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
         requests.unsolicited_receivers.append(self._send_unsolicited)
@@ -86,7 +86,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     @abstractmethod
     def _reply_style(self) -> Style:
-        """Return the present format of replies: dialect or source address."""
+        """Return the current format of replies: dialect or source address."""
 
     @abstractmethod
     def _send(self, reply: Reply, style: Style) -> None:
@@ -108,7 +108,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         await self.transport.close()
 
     def _now(self) -> float:
-        """Return the simulation time, seconds; incomplete messages time out in it."""
+        """Return the simulation time, seconds, which also applies to time-outs of messages."""
         return self._device.clock.now_ns() / NANOSECONDS
 
     def _receive(self, item: Item) -> None:
@@ -124,7 +124,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         if isinstance(event, LinkFault):
             self._requests.count_fault(event)
             return
-        style = self._reply_style()  # the answer to a change of format is still sent in the old one
+        style = self._reply_style()  # a change of format is answered in the old format
 
         def answer_later(reply: Reply) -> None:
             self._answer(reply, style)
@@ -140,7 +140,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._answer(reply, style)
 
     def _answer(self, reply: Reply, style: Style) -> None:
-        """Send an answer, with the unit's own number of an error."""
+        """Send an answer, with the unit's code for an error."""
         if isinstance(reply.code, ErrorCode):
             reply = replace(reply, code=self._device.icd.error_number(reply.code))
         self._send(reply, style)
@@ -158,7 +158,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._schedule_flush()
 
     def _reset_receiver(self) -> None:
-        """Discard incomplete and pending input, as the device has restarted."""
+        """Discard incomplete and pending input, because the device has restarted."""
         self._receiver = self._new_receiver()
         self._held_input.clear()
         self._pending_request = None

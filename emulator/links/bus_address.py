@@ -36,10 +36,10 @@ class BusAddress:
         self._bus = ""
         self.number = 0
         self.seen_elsewhere = False
-        """Whether a CAN frame from another node with this address was reported."""
+        """Whether a CAN frame from another node with this address has been reported."""
 
     def take(self, bus: str, number: int) -> None:
-        """Use an address on a bus instead of the previous one; warn if another emulator uses it."""
+        """Use a new address on a bus; warn if another emulator uses it."""
         self.release()
         self._bus, self.number, self.seen_elsewhere = bus, number, False
         if not number or bus.startswith(OWN_PROCESS):
@@ -50,7 +50,7 @@ class BusAddress:
             self._warn(str(error))
 
     def report_elsewhere(self) -> None:
-        """Warn, once per address, that a CAN frame came from another node with this address."""
+        """Warn, once per address, of a CAN frame from another node with this address."""
         if not self.seen_elsewhere:
             self.seen_elsewhere = True
             self._warn("also used by another node, whose frames arrive here")
@@ -64,6 +64,6 @@ class BusAddress:
     def _warn(self, why: str) -> None:
         other = self.number % HIGHEST + 1
         log.warning(
-            "CAN %s: %s %d: %s; give one of them another: --set %s=%d",
+            "CAN %s: %s %d: %s; change one of them: --set %s=%d",
             *(self._bus, self._what, self.number, why, self._setting, other),
         )

@@ -26,12 +26,12 @@ from starhil.protocol.transports.base import Transport
 
 
 class CanDamage:
-    """Damages CAN frames: a corrupted frame is another valid frame, as the CRC of the bus rejects all others.
+    """Corrupts CAN frames; the result is a valid frame, because the CRC of the bus rejects any other.
 
     Parameters
     ----------
     extended
-        Frames have 29-bit CAN IDs (CAN 2.0B); otherwise 11-bit.
+        Whether frames have 29-bit CAN IDs (CAN 2.0B) or 11-bit ones.
     """
 
     def __init__(self, *, extended: bool) -> None:
@@ -39,7 +39,7 @@ class CanDamage:
         self._max_id = MAX_EXTENDED_ID if extended else MAX_STANDARD_ID
 
     def corrupt(self, item: CanFrame, rng: random.Random) -> CanFrame:
-        """Flip one bit of the data, or of the CAN ID where there is no data."""
+        """Flip one bit of the data, or of the CAN ID if there is no data."""
         if not item.data:
             return replace(item, id=item.id ^ 1 << rng.randrange(self._max_id.bit_length()))
         damaged = bytearray(item.data)
@@ -47,22 +47,22 @@ class CanDamage:
         return replace(item, data=bytes(damaged))
 
     def junk(self, rng: random.Random) -> CanFrame:
-        """Make a frame with a random CAN ID and random data."""
+        """Return a frame with a random CAN ID and random data."""
         can_id = rng.randint(0, self._max_id)
         return CanFrame(can_id, rng.randbytes(rng.randint(0, MAX_FRAME_DATA)), extended=self._extended)
 
     def split(self, item: CanFrame, _size: int) -> Sequence[CanFrame]:
-        """Return the frame whole: CAN frames are not split."""
+        """Return the frame unchanged, because CAN frames cannot be split."""
         return [item]
 
 
 class CanLink(DeviceLink[CanFrame, int]):
-    """Connects a device to a CAN transport, at the address in its parameter `can_address`.
+    """Connects a device to a CAN transport, with the address in its parameter `can_address`.
 
     Parameters
     ----------
     frame_gap_s
-        Minimum time between two frames that the device sends, seconds.
+        Minimum time between two sent frames, seconds.
     """
 
     bus: ClassVar[str] = "can"

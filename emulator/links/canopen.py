@@ -40,10 +40,10 @@ log = logging.getLogger("starhil.canopen")
 MILLISECOND_NS: Final = NANOSECONDS // 1000
 STORAGE_FILE: Final = "canopen.json"
 DEVICE_ERROR: Final = 0xFF00
-"""Base of the EMCY error codes of the error mode; the number of `device_error` is added."""
+"""Base of the EMCY error codes for the error mode; the number in `device_error` is added."""
 FRAME_QUANTITIES: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
-"""How the names of quantities begin that change with each exposure: TPDOs that map a row with one are
-triggered then."""
+"""Prefixes of the names of quantities that change with each exposure; it triggers TPDOs that map a row with
+one of them."""
 STATUS_QUANTITY: Final = "mode"
 """TPDOs that map a row with this quantity are triggered when it or the validity of the attitude changes."""
 
@@ -51,7 +51,7 @@ Action: TypeAlias = Callable[[float], list[CanFrame]]
 
 
 def rows_reporting(icd: InterfaceDefinition, prefixes: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the telemetry rows with a quantity whose name begins with one of these."""
+    """Return the telemetry rows with a quantity whose name has one of these prefixes."""
     return tuple(
         row.name
         for row in icd.telemetry.values()
@@ -62,14 +62,14 @@ def rows_reporting(icd: InterfaceDefinition, prefixes: tuple[str, ...]) -> tuple
 def not_before(deadline: float) -> int:
     """Return the first whole nanosecond that is not before a deadline in seconds.
 
-    Exact arithmetic: on the stepped clock, a wake-up one nanosecond early would repeat without end.
+    The arithmetic is exact: on the stepped clock, a wake-up one nanosecond early would repeat forever.
     """
     numerator, denominator = deadline.as_integer_ratio()
     return -(-numerator * NANOSECONDS // denominator)
 
 
 class DeviceApplication:
-    """The device behind the object dictionary: implements `starhil.protocol.canopen.application.Application`.
+    """The application of the object dictionary, `starhil.protocol.canopen.application.Application`.
 
     Parameters
     ----------
@@ -86,11 +86,11 @@ class DeviceApplication:
         self._last_image: GreyImage | None = None
 
     def clear(self) -> None:
-        """Discard the captured image, as the device has restarted."""
+        """Discard the captured image, because the device has restarted."""
         self._last_image = None
 
     def telemetry(self, row: Row) -> bytes:
-        """Return the present bytes of a telemetry row."""
+        """Return the current bytes of a telemetry row."""
         try:
             return self._requests.telemetry(row.name)
         except Refused as refused:
@@ -98,7 +98,7 @@ class DeviceApplication:
             raise
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
-        """Execute a telecommand; it is counted and acknowledged as on the other links."""
+        """Execute a telecommand, which is counted and acknowledged as on the other links."""
         deferred = Deferred()
 
         def done(reply: Reply) -> None:
@@ -117,7 +117,7 @@ class DeviceApplication:
         return None
 
     def parameter(self, name: str) -> Value:
-        """Return a parameter's value in its unit."""
+        """Return the value of a parameter in its unit."""
         return self._device.parameters[name]
 
     def set_parameter(self, name: str, value: Value) -> None:
@@ -158,7 +158,7 @@ class DeviceApplication:
         return deferred
 
     def save(self) -> Deferred:
-        """Save the device's parameters (1010h); the write is answered when they are on disk."""
+        """Save the parameters of the device (1010h); the write is answered when they are on disk."""
         return self._deferred(self._device.save_parameters)
 
     def restore(self) -> Deferred:
@@ -191,7 +191,7 @@ class CanopenLink:
     seed
         Seed of the wire faults.
 
-    The node ID is the device's parameter `canopen_node`, unless LSS has stored another one.
+    The node ID is the parameter `canopen_node` of the device, unless LSS has stored another one.
     """
 
     bus: ClassVar[str] = "can"
@@ -278,7 +278,7 @@ class CanopenLink:
         self._schedule_tick()
 
     def _schedule_tick(self) -> None:
-        """Schedule the slave's next deadline; an earlier tick that is already scheduled stays."""
+        """Schedule a tick at the next deadline of the slave, unless an earlier one is already scheduled."""
         deadline = self.slave.next_deadline()
         if deadline is None:
             return
@@ -307,7 +307,7 @@ class CanopenLink:
         return self.slave.clear_emergency(code, now=now)
 
     def _handle_event(self, event: SlaveEvent) -> None:
-        """Handle an event that the slave reports."""
+        """Handle an event reported by the slave."""
         match event.kind:
             case EventKind.TIME:
                 self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)
@@ -317,7 +317,7 @@ class CanopenLink:
                 log.debug("%s %g %s", event.kind, event.value, event.detail)
 
     def _reset_device(self) -> int:
-        """Reset the device because NMT reset the node; return the node ID to start with."""
+        """Reset the device after an NMT reset of the node; return the node ID for the restart."""
         self._resetting = True
         try:
             self._device.reset("command")
@@ -380,6 +380,6 @@ class CanopenLink:
 def open_canopen(
     requests: Requests, transport: Transport[CanFrame], state_dir: Path | None, seed: int
 ) -> CanopenLink:
-    """Make a link that stores its parameters in `state_dir`, or in memory if that is None."""
+    """Return a link that stores its parameters in `state_dir`, or in memory if this is None."""
     storage = MemoryStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
     return CanopenLink(requests, transport, storage, seed)

@@ -1,4 +1,4 @@
-"""The serial link: passes requests from a serial line to the device and sends replies, as the unit frames them."""
+"""The serial link: passes requests from a serial line to the device and sends replies, in the unit's framing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ JUNK_BYTES: Final = 8
 
 
 class SerialDamage:
-    """Damages bytes on a serial line."""
+    """Corrupts bytes on a serial line."""
 
     def corrupt(self, item: bytes, rng: random.Random) -> bytes:
         """Flip one bit of one byte."""
@@ -31,14 +31,14 @@ class SerialDamage:
         return rng.randbytes(rng.randint(1, JUNK_BYTES))
 
     def split(self, item: bytes, size: int) -> Sequence[bytes]:
-        """Split into pieces of `size` bytes."""
+        """Split into chunks of `size` bytes."""
         return [item[start : start + size] for start in range(0, len(item), size)]
 
 
 class SerialLink(DeviceLink[bytes, Dialect | None]):
     """Connects a device to a serial transport, at the bit rate in its parameter `serial_baud`.
 
-    The CubeSpace family has three dialects of replies, of which only c carries unsolicited telemetry.
+    The CubeSpace family has three dialects of replies, of which only c has unsolicited telemetry.
     """
 
     bus: ClassVar[str] = "serial"
@@ -54,7 +54,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         return int(self._device.parameters["serial_baud"])
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
-        if "serial_baud" in names:  # the acknowledge is still sent at the old rate
+        if "serial_baud" in names:  # the change is acknowledged at the old rate
             self._loop.call_soon(self._change_rate)
 
     def _change_rate(self) -> None:
@@ -67,7 +67,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
 
     @property
     def dialect(self) -> Dialect | None:
-        """The present dialect of replies; None for a unit that has no dialects."""
+        """The current dialect of replies; None for a unit without dialects."""
         if not isinstance(self._stack, CubeSpaceStack):
             return None
         return self._stack.dialect or Dialect(str(self._device.parameters["serial_dialect"]))

@@ -1,4 +1,4 @@
-"""Wire faults between a link and its transport: delay, loss, corruption, splitting and junk."""
+"""Faults between a link and its transport: delay, loss, corruption, splitting and junk."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class WireFaultSettings:
-    """Faults of a wire.
+    """Faults of a link.
 
     Attributes
     ----------
@@ -25,9 +25,9 @@ class WireFaultSettings:
     delay_s
         Delay of every outgoing item, seconds.
     split
-        Size of the pieces, in bytes, in which a serial reply is sent; 0 sends it whole.
+        Size of the chunks in which a serial reply is sent, bytes; 0: not split.
     gap_s
-        Pause between the pieces of a split reply, seconds.
+        Pause between the chunks of a split reply, seconds.
     junk
         Probability that random bytes (serial) or a random frame (CAN) are sent before an item.
     """
@@ -46,7 +46,7 @@ class WireFaultSettings:
 
 
 class Damage(Protocol[Item]):
-    """Damages items of one kind of wire."""
+    """Corrupts items of one kind of link."""
 
     def corrupt(self, item: Item, rng: random.Random) -> Item:
         """Return the item with one bit flipped."""
@@ -55,20 +55,20 @@ class Damage(Protocol[Item]):
         """Return a random item."""
 
     def split(self, item: Item, size: int, /) -> Sequence[Item]:
-        """Split into pieces of `size` bytes, where the wire allows it."""
+        """Split into chunks of `size` bytes, if the link allows it."""
 
 
 class WireFaults(Generic[Item]):
-    """The outgoing side of a wire, with its faults. Items never overtake each other.
+    """The outgoing side of a link, with its faults; items stay in order.
 
     Parameters
     ----------
     send
         Sends an item on the transport.
     damage
-        Damages items of this wire.
+        Corrupts items of this link.
     clock, scheduler
-        Clock and scheduler of the device: delays pass in simulation time.
+        Clock and scheduler of the device; delays are in simulation time.
     seed
         Seed of the random faults.
     """
@@ -84,7 +84,7 @@ class WireFaults(Generic[Item]):
         self.settings = WireFaultSettings()
         self.dropped = self.corrupted = 0
         self.listener: Callable[[Item], None] | None = None
-        """Called with each item as it goes out."""
+        """Called with each item that is sent."""
         self._transmit = send
         self._damage = damage
         self._clock = clock
@@ -96,7 +96,7 @@ class WireFaults(Generic[Item]):
         self._release_scheduled = False
 
     def send(self, item: Item) -> None:
-        """Send an item, subject to the faults that are set."""
+        """Send an item, subject to the current faults."""
         settings, rng = self.settings, self._rng
         if settings.none:
             if self._held:
@@ -115,13 +115,13 @@ class WireFaults(Generic[Item]):
         self._send_or_hold(self._damage.split(item, settings.split) if settings.split else [item], settings)
 
     def _send(self, item: Item) -> None:
-        """Hand an item to the transport."""
+        """Pass an item to the transport."""
         if self.listener is not None:
             self.listener(item)
         self._transmit(item)
 
     def _send_or_hold(self, pieces: Sequence[Item], settings: WireFaultSettings) -> None:
-        """Send the pieces of one item, now or later, after all that was sent before."""
+        """Send the chunks of an item, after all earlier ones, now or with a delay."""
         now_ns = self._clock.now_ns()
         at_ns = max(now_ns + round(settings.delay_s * NANOSECONDS), self._free_ns)
         gap_ns = round(settings.gap_s * NANOSECONDS) if len(pieces) > 1 else 0

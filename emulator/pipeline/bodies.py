@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Final
 
 from starhil.emulator.pipeline.messages import FrameResult
-from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
@@ -20,17 +18,10 @@ def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tupl
     """Return which of `sun`, `moon` and `earth` are in the field of view, with any part of their discs; none behind a cover."""
     if sky.blank:
         return ()
-    bodies: tuple[tuple[str, float, float, float], ...] = ()
-    if sky.sun is not None:
-        bodies += (("sun", sky.sun.ra_deg, sky.sun.dec_deg, 0.0),)
-    if sky.moon is not None:
-        bodies += (("moon", sky.moon.ra_deg, sky.moon.dec_deg, sky.moon.diameter_deg / 2.0),)
-    if sky.earth is not None:
-        bodies += (("earth", sky.earth.ra_deg, sky.earth.dec_deg, sky.earth.radius_deg),)
     return tuple(
         name
-        for name, ra, dec, radius in bodies
-        if disc_in_field(attitude.to_sensor(icrs_vector(ra, dec)), math.radians(radius), camera)
+        for name, body in (("sun", sky.sun), ("moon", sky.moon), ("earth", sky.earth))
+        if body is not None and disc_in_field(attitude.to_sensor(body.direction), body.radius_rad, camera)
     )
 
 

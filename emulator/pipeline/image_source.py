@@ -28,18 +28,18 @@ class ImageSource(Protocol):
         Raises
         ------
         EmulatorError, StaridError
-            There is none; one line.
+            There is no such image; one line.
         """
         ...
 
 
 class FolderImages:
-    """The images of a folder in the order of their names, one for each exposure.
+    """The images in a folder in the order of their names, one for each exposure.
 
     Raises
     ------
     EmulatorError
-        The folder does not exist or holds no image.
+        The folder does not exist or contains no images.
     """
 
     def __init__(self, folder: Path, *, repeat: bool) -> None:
@@ -57,14 +57,14 @@ class FolderImages:
         """Return the image of an exposure; colour is converted to grey."""
         if index >= len(self._files) and not self._repeat:
             raise EmulatorError(
-                f"images.folder: the {len(self._files)} images of {self._folder} are used up; "
-                "set images.repeat = true to begin again"
+                f"images.folder: the {len(self._files)} images in {self._folder} have been used; "
+                "set images.repeat = true to repeat them"
             )
         return read_image(self._files[index % len(self._files)], allow_colour=True)
 
 
 class CapturedImages:
-    """Images of a camera or a video, as OpenCV captures them.
+    """Images from a camera or a video, captured by OpenCV.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class CapturedImages:
 
 
 class CheckedImages:
-    """Images of the size of a camera, less a dark frame."""
+    """Images whose size is checked and from which a dark frame is subtracted."""
 
     def __init__(self, source: ImageSource, camera: Camera, dark: Path | None) -> None:
         self._source = source
@@ -111,12 +111,12 @@ class CheckedImages:
 
 
 def open_images(settings: Mapping[str, Any], camera: Camera) -> ImageSource | None:
-    """Open the images that a profile's `[images]` names; None if it names none.
+    """Open the images named in `[images]` of a profile; None if there are none.
 
     Raises
     ------
     EmulatorError, StaridError
-        They cannot be opened.
+        The images cannot be opened.
     """
     folder, capture, dark = (str(settings.get(key, "")) for key in ("folder", "capture", "dark"))
     source: ImageSource

@@ -1,7 +1,7 @@
 """The device's access to the image pipeline: a process or thread that handles requests in order.
 
-The device never waits: it submits a request and is called back in the event loop. The stepped clock
-uses `settle` to wait for all pending results before it advances.
+The device does not wait: it submits a request and is called back in the event loop. The stepped clock uses
+`settle` to wait for all pending results before it advances.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ ReplyCallback: TypeAlias = Callable[[PipelineReply], None]
 
 
 class Imager(Protocol):
-    """What the device needs of an image pipeline."""
+    """Interface of the image pipeline for the device."""
 
     @property
     def pending(self) -> int:
-        """Number of requests without a result yet."""
+        """Number of requests without a result."""
         ...
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
@@ -51,7 +51,7 @@ class Imager(Protocol):
         ...
 
     async def settle(self) -> None:
-        """Wait until nothing is pending."""
+        """Wait until no requests are pending."""
         ...
 
 
@@ -64,17 +64,16 @@ class _RequestQueue:
         self._idle.set()
         self._started: asyncio.Future[PipelineReady] = asyncio.get_running_loop().create_future()
         self.on_failure: Callable[[str], None] | None = None
-        """Called with the reason if the pipeline ends after it was ready; if the start fails, `start`
-        raises."""
+        """Called with the reason if the pipeline ends after it was ready; a failed start raises instead."""
         self.watchers: set[object] = set()
-        """Who looks at the frames: unless this is empty, they come with a preview."""
+        """Viewers of the frames; frames come with a preview unless this is empty."""
 
     @property
     def pending(self) -> int:
         return len(self._waiting)
 
     async def settle(self) -> None:
-        """Wait until nothing is pending."""
+        """Wait until no requests are pending."""
         await self._idle.wait()
 
     def _with_preview(self, request: PipelineRequest) -> PipelineRequest:
@@ -102,7 +101,7 @@ class _RequestQueue:
             self._started.set_exception(EmulatorError(text))
 
     def _pipeline_ended(self, text: str) -> None:
-        """Fail all pending requests and report the end to the caller of `start`, or else to `on_failure`."""
+        """Let all pending requests fail, and report the end to the caller of `start` or to `on_failure`."""
         started = self._started
         was_ready = started.done() and not started.cancelled() and started.exception() is None
         self._start_failed(text)
@@ -114,7 +113,7 @@ class _RequestQueue:
                 call_guarded("end of the image pipeline", self.on_failure, text)
 
     def _mark_start_failure_retrieved(self) -> None:
-        """Keep asyncio from reporting a failed start again at exit."""
+        """Prevent asyncio from reporting a failed start again at exit."""
         if self._started.done() and not self._started.cancelled():
             self._started.exception()
 
@@ -122,7 +121,7 @@ class _RequestQueue:
 class ProcessImager(_RequestQueue):
     """The pipeline in a separate worker process, connected by a socket pair.
 
-    Keeps numerics out of the emulator's process, whose replies on the bus then never wait for the
+    Numerics do not run in the emulator's process, so that its replies on the bus never wait for the
     interpreter lock.
     """
 
@@ -145,7 +144,7 @@ class ProcessImager(_RequestQueue):
         Raises
         ------
         EmulatorError
-            The start failed: the worker's one-line reason.
+            The start failed; the text is the worker's reason in one line.
         """
         self._started = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
@@ -216,7 +215,7 @@ class ProcessImager(_RequestQueue):
 
 
 class ThreadImager(_RequestQueue):
-    """The pipeline in a thread: less memory than a process, but it shares the interpreter lock with the links."""
+    """The pipeline in a thread: takes less memory, but shares the interpreter lock with the links."""
 
     def __init__(self, setup: PipelineSetup) -> None:
         super().__init__()
@@ -224,7 +223,7 @@ class ThreadImager(_RequestQueue):
         self._loop = asyncio.get_running_loop()
         self._requests: queue.SimpleQueue[PipelineRequest | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
-        """None before the start and after an unexpected end."""
+        """Queue of requests; None before the start and after an unexpected end."""
 
     async def start(self) -> PipelineReady:
         """Wait until the pipeline is ready.
@@ -253,7 +252,7 @@ class ThreadImager(_RequestQueue):
         return await self.start()
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
-        """Hand a request to the thread."""
+        """Pass a request to the thread."""
         if self._thread is None:
             done(Failure("pipeline thread: not running"))
             return

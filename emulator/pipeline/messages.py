@@ -1,6 +1,6 @@
-"""Requests to the image pipeline and its results.
+"""Requests to the image pipeline, and its results.
 
-Plain values only, so that they can be pickled between processes and compared in tests.
+They consist of plain values, so that they can be pickled between processes and compared in tests.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ class PipelineSetup:
     seed
         Seed of all noise.
     build_in_background
-        Solve with the current star index while another is built. If false, frames wait for the new index, so
-        that a run on the stepped clock is reproducible byte for byte.
+        Whether frames are solved with the current star index while another is being built. If false, frames
+        wait for the new index, so that a run on the stepped clock is reproducible byte for byte.
     previews
-        Somebody may look at the frames: be ready to make previews.
+        Whether frames may be displayed, so that previews must be possible.
     dark_frames
-        Frames averaged into the dark frame that is subtracted from each image; 0: none.
+        Number of frames averaged into the dark frame that is subtracted from each image; 0: none.
     images
-        Source of images instead of rendered ones: keys of a profile's `[images]`.
+        Source of images instead of rendering: keys of `[images]` in a profile.
     """
 
     camera: dict[str, Any]
@@ -87,7 +87,7 @@ class SolverSettings:
 
 
 DIRECTION_BITS: Final = 32
-"""Bits of a component of a star's direction in the unit's memory."""
+"""Number of bits of a component of a star's direction in the unit's memory."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class CatalogUpset:
     hip
         Hipparcos number of the star.
     component
-        Component of its direction: 0, 1 or 2 for x, y or z.
+        Component of the direction: 0, 1 or 2 for x, y or z.
     bit
         Bit of the component in single precision, 0 the least significant.
     """
@@ -111,39 +111,39 @@ class CatalogUpset:
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """Render one exposure and, if requested, solve it.
+    """Request to render an exposure and, optionally, to solve it.
 
     Attributes
     ----------
     index
-        Number of the frame since the start of the run; together with the seed it determines the noise.
+        Number of the frame since the start of the run, which together with the seed determines the noise.
     attitude_xyzw, rate_rad_s
         Truth at mid-exposure: quaternion ICRS→sensor, body rate in the sensor frame.
     exposure_s, gain
         Exposure in seconds and analog gain.
     solve
-        Detect and identify stars; if false, the image is only rendered and kept for download.
+        Whether to detect and identify stars; if false, the image is only rendered and kept for download.
     predicted_xyzw
-        Attitude predicted for mid-exposure, to track from; None: lost in space.
+        Predicted attitude at mid-exposure, for tracking; None: lost in space.
     settings
         Parameters of detection and identification.
     faults
-        Fields of the sky objects that the control channel overrides.
+        Fields of the sky objects that are overridden by the control channel.
     temperature_c
-        Temperature of detector and lens, °C; None: the sensor model's.
+        Temperature of detector and lens, °C; None: as in the sensor model.
     particles_s
-        Particles per second that hit the detector, in addition to the sky's.
+        Particles per second that hit the detector, in addition to the sky's particles.
     upsets
-        Bits that radiation has flipped in the unit's star catalogue.
+        Bits flipped by radiation in the unit's star catalogue.
     unix_s
-        True date of mid-exposure, Unix time; None leaves the sky undated.
+        True date of mid-exposure, Unix time; None: no date.
     position_m, velocity_m_s
         True position and velocity of the sensor relative to the Earth's centre, GCRS; None: at the centre.
     observer_velocity
-        Velocity of the sensor relative to the barycentre as the device believes it, ICRS, m/s, to correct
+        Velocity of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct
         aberration; None: no correction.
     preview
-        Return the image too, compressed for display.
+        Whether to return the image too, compressed for display.
     """
 
     index: int
@@ -172,9 +172,9 @@ class Preview:
     Attributes
     ----------
     jpeg
-        The image, 8 bits, faint stars raised.
+        The image, 8 bits, stretched so that faint stars are visible.
     overlay
-        What is drawn over it: a JSON object, made in the worker so that it costs the links no time.
+        The overlay: a JSON object, made in the worker so that it takes no time on the links.
     """
 
     jpeg: bytes
@@ -212,31 +212,32 @@ class FrameResult:
     Attributes
     ----------
     valid, reason
-        Whether the attitude is valid, and why not, as named in the interface definition.
+        Whether the attitude is valid, and the reason if not, as named in the interface definition.
     tracked
-        True if solved from the prediction.
+        Whether the frame was solved from the prediction.
     quaternion_xyzw
-        Attitude ICRS→sensor at mid-exposure; zeros where invalid.
+        Attitude ICRS→sensor at mid-exposure; zeros if invalid.
     sigma_cross_arcsec, sigma_roll_arcsec
-        One sigma per axis across the boresight, and about it.
+        Standard deviation about an axis across the boresight, and about the boresight.
     rate_rad_s
         Body rate, if the algorithm estimates one.
     detected, refused, matched
-        Number of stars found, of detections rejected as not stars, of stars identified.
+        Number of detected stars, of rejected detections, and of identified stars.
     stars
         The brightest identified stars, brightest first.
     probability_false, rms_px
         As in `starid.solution.Solution`.
     index_pending
-        True if solved with the star index of earlier settings, while the index for these is being built.
+        Whether the frame was solved with the star index of earlier settings, because a new one is being
+        built.
     background_dn, noise_dn
         Level and noise of the background, counts.
     in_field
         Bodies in or at the field of view: `sun`, `moon`, `earth`.
     render_s, detect_s, identify_s
-        Wall time of each step, for the log; never in telemetry.
+        Wall time of each step, for the log but not for telemetry.
     preview
-        The image, if the request asked for it.
+        The image, if requested.
     """
 
     index: int
@@ -266,14 +267,14 @@ class FrameResult:
 
 @dataclass(frozen=True)
 class ImageRequest:
-    """Return the last image at 8 bits, scaled to a square of `edge` pixels; `edge` 0: unscaled."""
+    """Request for the last image at 8 bits, scaled to a square of `edge` pixels; `edge` 0: unscaled."""
 
     edge: int
 
 
 @dataclass(frozen=True)
 class ImageResult:
-    """An 8-bit image, row by row; `frame` is the number of its exposure, or -1 if there is none yet."""
+    """An 8-bit image, row by row; `frame` is the number of the exposure, or -1 if there is no image yet."""
 
     width: int
     height: int
@@ -283,7 +284,7 @@ class ImageResult:
 
 @dataclass(frozen=True)
 class PipelineReady:
-    """The pipeline is ready.
+    """Message that the pipeline is ready.
 
     Attributes
     ----------
@@ -302,6 +303,6 @@ class PipelineReady:
 
 @dataclass(frozen=True)
 class Failure:
-    """A request, or the start of the pipeline, failed."""
+    """Message that a request, or the start of the pipeline, failed."""
 
     text: str

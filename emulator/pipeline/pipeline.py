@@ -1,4 +1,4 @@
-"""The image pipeline: renders what the sensor sees, detects stars and identifies them."""
+"""The image pipeline: renders images, detects stars and identifies them."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ from starid.interface import StarIdentifier
 from starid.solution import Reason, Solution
 
 STARS_SENT: Final = 16
-"""Number of identified stars returned to the device, the brightest."""
+"""Number of identified stars returned to the device; the brightest ones."""
 
 DOWNLOAD_BITS: Final = 8
 """Bits per pixel of an image for download."""
@@ -73,11 +73,11 @@ _WARM_UP_BODIES: Final = SkyObjects(
 """Bodies in and near the field of the identity attitude."""
 
 _WARM_UP_RATES_RAD_S: Final = ((1e-3, 0.0, 0.0), (0.03, 0.0, 0.0))
-"""Rates at which stars in a default exposure are round, and at which they leave trails of a few pixels."""
+"""Rates at which stars in a default exposure are round, or leave trails of a few pixels."""
 
 
 def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Failure:
-    """Make a pipeline and warm it up; a failure holds the reason in one line."""
+    """Make a pipeline and warm it up; on failure, return the reason in one line."""
     begin = time.perf_counter()
     try:
         pipeline = Pipeline(setup)
@@ -96,9 +96,9 @@ def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Fail
 
 @dataclass(frozen=True)
 class _Exposure:
-    """An image, the number of bits it uses, the number of its exposure, and the bodies in its field.
+    """An image, its number of bits, the number of its exposure, and the bodies in its field.
 
-    A rendered one has its truth too: the frame and the objects of the sky.
+    A rendered image also has its truth: the frame and the objects of the sky.
     """
 
     image: NDArray[Any]
@@ -124,13 +124,14 @@ class Pipeline:
         self._sky = Sky(setup.sky)
         self._last: _Exposure | None = None
         self.images: ImageSource | None = None
-        """Where images come from; None: they are rendered."""
+        """Source of images; None: they are rendered."""
         self._dark: DarkMap | None = None
 
     def warm_up(self) -> None:
         """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
 
-        Compiling a kernel during a run would stop the frames for seconds, so some of these have star trails.
+        Compiling a kernel during a run would interrupt frames for seconds, so some frames here have star
+        trails.
         """
         camera = self.camera
         k1, k2, p1, p2, _ = camera.distortion
@@ -167,7 +168,7 @@ class Pipeline:
         self._last = None
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
-        """Process one request; return a failure if the settings make it impossible."""
+        """Process a request; return a failure if the settings make it impossible."""
         try:
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
@@ -209,12 +210,12 @@ class Pipeline:
         found: Detections | None = None,
         solution: Solution | None = None,
     ) -> Preview:
-        """Return the preview of an image; of one from elsewhere, without its truth."""
+        """Return the preview of an image; without truth if the image was not rendered."""
         frame = exposure.frame or frame_without_truth(exposure.image, exposure.index)
         return make_preview(frame, self.camera, sensor, exposure.objects, found, solution)
 
     def _expose(self, request: FrameRequest) -> _Exposure:
-        """Take the next image: from elsewhere, or rendered."""
+        """Take the next image from its source, or render it."""
         if self.images is not None:
             image = self.images.image(request.index)
             return _Exposure(image, used_bits(image), request.index)
@@ -274,7 +275,7 @@ class Pipeline:
         return solution
 
     def _identifier_setup(self, request: FrameRequest) -> StarIdentifierSetup:
-        """Return the setup of the star identifier for these parameters and the calibrated camera."""
+        """Return the setup of the star identifier for the parameters and the calibrated camera."""
         setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}
         options.setdefault("limiting_magnitude", settings.limiting_magnitude)
@@ -365,7 +366,7 @@ def _within_margin(
 
 
 def detection_settings(known: DetectionSettings, settings: SolverSettings) -> DetectionSettings:
-    """Return statistics of the image, with the thresholds in the device's parameters."""
+    """Return the known detection settings, with the thresholds in the parameters of the device."""
     return replace(
         known,
         threshold_sigma=settings.detection_threshold,
@@ -376,7 +377,7 @@ def detection_settings(known: DetectionSettings, settings: SolverSettings) -> De
 
 
 def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
-    """Return the camera as calibrated in the device's parameters; constants they lack come from the optics."""
+    """Return the camera as calibrated in the device parameters; other constants come from the optics."""
     return Camera(
         optics.width,
         optics.height,
@@ -388,12 +389,12 @@ def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
 
 
 def tracking_window(settings: SolverSettings) -> float:
-    """Largest distance of a star from its prediction, pixels: the margin, limited by search and read windows."""
+    """Return the largest distance of a star from its prediction, pixels, limited by the windows."""
     return float(min(settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0))
 
 
 def measured_magnitude(electrons: float, sensor: SensorModel) -> float:
-    """Magnitude of a star from its electrons in one exposure."""
+    """Return the magnitude of a star from its electrons in one exposure."""
     return -2.5 * math.log10(max(electrons, 1.0) / (sensor.zero_magnitude_e_s * sensor.exposure_s))
 
 

@@ -1,7 +1,7 @@
-"""Compile the star identifier's kernels in a second process, in parallel with the pipeline's own.
+"""Compilation of the star identifier's kernels in a second process, in parallel with the pipeline's kernels.
 
-Kernels are compiled once after an installation or a change and cached on disk. This takes most of a minute on
-one processor, and little more than half of that with two processes on two.
+Kernels are compiled once after an installation or a change, and cached on disk. This takes most of a minute on one
+processor, and little more than half of that with two processes on two processors.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from starid.projection import back_project_kernel
 
 
 def kernel_cache_was_cold() -> bool:
-    """Whether this process had to compile the projection, so that the other kernels are missing on disk too."""
+    """Return whether this process had to compile the projection; the other kernels are then missing too."""
     kernel: Any = back_project_kernel
     return bool(kernel.stats.cache_misses)
 

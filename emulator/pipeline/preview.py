@@ -1,4 +1,4 @@
-"""Previews: a frame compressed for display, with the stars, bodies and covers in it."""
+"""Previews: frames compressed for display, with an overlay of stars, bodies and covered areas."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from starid.solution import Solution
 
 JPEG_QUALITY: Final = 72
 FAINTEST_V: Final = 6.5
-"""Faintest catalogue star that a preview names."""
+"""Magnitude of the faintest catalogue star that is named in a preview."""
 BLACK_SIGMA: Final = 1.5
-"""Level of black above the background, in sigma of its noise: the noise costs bytes and shows nothing."""
+"""Black level above the background, in sigma of its noise: noise takes bytes without showing anything."""
 KNEE_SIGMA: Final = 4.0
 """Level above black up to which brightness is nearly linear, in sigma of the noise."""
 OUTLINE_POINTS: Final = 96
@@ -33,16 +33,17 @@ OUTLINE_POINTS: Final = 96
 
 @dataclass(frozen=True)
 class Body:
-    """A body of the sky as a viewer sees it.
+    """A body in the sky, for display.
 
     Attributes
     ----------
     name
         `sun`, `moon`, `earth`, or the name of a planet.
     ra_deg, dec_deg, radius_deg
-        Direction of its centre, ICRS, and its angular radius; 0 for a point.
+        Direction of the centre, ICRS, and angular radius; 0 for a point.
     outline_px
-        Outline of its disc as pairs of pixels; None where the lens maps no direction. One pair for a point.
+        Outline of the disc as pairs of pixel coordinates; None where the lens maps no direction. A point has
+        one pair.
     """
 
     name: str
@@ -54,7 +55,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Overlay:
-    """What is drawn over an image.
+    """Marks that are drawn over an image.
 
     Attributes
     ----------
@@ -71,7 +72,7 @@ class Overlay:
     bodies
         Sun, Moon, Earth and planets.
     covered
-        Polygons, pixels, of the areas that something near the lens covers.
+        Polygons, pixels, of the areas that are covered by something near the lens.
     """
 
     width: int
@@ -92,7 +93,7 @@ def make_preview(
     found: Detections | None = None,
     solution: Solution | None = None,
 ) -> Preview:
-    """Make the preview of a frame; without detections if it was not solved.
+    """Make the preview of a frame, without detections if it was not solved.
 
     Raises
     ------
@@ -141,7 +142,7 @@ def make_overlay(
 def compress(
     image: NDArray[np.uint8] | NDArray[np.uint16], background: float, noise: float, bits: int
 ) -> bytes:
-    """Compress an image (h, w) as JPEG, on a scale that is linear for faint and logarithmic for bright pixels.
+    """Compress an image (h, w) as JPEG, on a scale linear for faint and logarithmic for bright pixels.
 
     Raises
     ------
@@ -163,7 +164,7 @@ def compress(
 def _detections(
     found: Detections, solution: Solution | None, sensor: SensorModel
 ) -> tuple[list[tuple[float, float, float, float]], list[int]]:
-    """Return the detections, and the Hipparcos number of each."""
+    """Return the detections with their Hipparcos numbers."""
     zero = sensor.zero_magnitude_e_s * sensor.exposure_s
     magnitude = -2.5 * np.log10(np.maximum(found.flux, 1.0) / zero)
     snr = found.flux / found.flux_sigma
@@ -177,7 +178,7 @@ def _detections(
 
 
 def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:
-    """Return the bodies of a sky, in the image or not."""
+    """Return the bodies in a sky, inside or outside the image."""
     found = []
     if sky.sun is not None:
         found.append(_body("sun", sky.sun.ra_deg, sky.sun.dec_deg, 0.2666, camera, attitude))
@@ -214,7 +215,7 @@ def _body(
 
 
 def _covered(obstruction: Obstruction, width: int, height: int) -> list[tuple[float, float]]:
-    """Return the polygon, pixels, that an obstruction covers."""
+    """Return the polygon, pixels, covered by an obstruction."""
     if obstruction.polygon_px:
         return list(obstruction.polygon_px)
     if obstruction.share <= 0.0:

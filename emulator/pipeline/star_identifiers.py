@@ -1,4 +1,4 @@
-"""The star identifier in use, and the building of another in the background when parameters change.
+"""The current star identifier, and building of a new one in the background when parameters change.
 
 A new limiting magnitude or camera needs a new star index, which takes seconds to build. Until it is
 ready, frames are solved with the current identifier.
@@ -50,7 +50,7 @@ class StarIdentifierSetup:
     options
         Keyword arguments of the algorithm's class, sorted by name.
     upsets
-        Bits flipped in the directions of its stars; geometric algorithm only.
+        Bits flipped in the directions of the stars; geometric algorithm only.
     """
 
     algorithm: str
@@ -60,12 +60,12 @@ class StarIdentifierSetup:
     upsets: tuple[CatalogUpset, ...] = ()
 
     def make(self, catalog: StarCatalog) -> StarIdentifier:
-        """Make the star identifier; takes seconds if its index is not cached on disk.
+        """Make the star identifier, which takes seconds if its index is not cached on disk.
 
         Raises
         ------
         EmulatorError, StaridError
-            Unknown option, or no index can be built from these values.
+            An option is unknown, or no index can be built from these values.
         """
         options = dict(self.options)
         self._check_options(options)
@@ -87,7 +87,7 @@ class StarIdentifierSetup:
         for option, value in options.items():
             if option not in known:
                 raise EmulatorError(
-                    f"identifier.{option}: no option of the algorithm {self.algorithm}; known: {', '.join(sorted(known))}"
+                    f"identifier.{option}: not an option of the algorithm {self.algorithm}; known: {', '.join(sorted(known))}"
                 )
             allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
             if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
@@ -97,7 +97,7 @@ class StarIdentifierSetup:
 
 
 def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:
-    """Return the identifier with one bit of a star's direction flipped; itself if it does not hold the star."""
+    """Return the identifier with one bit of a star's direction flipped; unchanged if it lacks the star."""
     rows = np.flatnonzero(identifier.stars.hip == upset.hip)
     if len(rows) == 0:
         return identifier
@@ -109,7 +109,7 @@ def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:
 
 
 def _known_options(algorithm: type) -> dict[str, str]:
-    """Return the type of each option of an algorithm's class: its keywords, and the fields of `options`."""
+    """Return the type of each option of an algorithm: keywords of its class, and fields of `options`."""
     types = {name: str(item.annotation) for name, item in inspect.signature(algorithm).parameters.items()}
     for held in get_args(get_type_hints(inspect.getattr_static(algorithm, "__init__")).get("options")):
         if is_dataclass(held):
@@ -130,14 +130,14 @@ class _Build:
 
 
 class StarIdentifiers:
-    """Provides the star identifier for a setup, or the previous one while that is being built.
+    """Provides the star identifier for a setup, or the previous one while it is being built.
 
     Parameters
     ----------
     make
         Makes a star identifier.
     in_background
-        Build in a thread; otherwise `get` blocks until the build is done.
+        Whether to build in a thread; otherwise `get` blocks until the build is done.
     """
 
     def __init__(self, make: Callable[[StarIdentifierSetup], StarIdentifier], *, in_background: bool) -> None:
@@ -153,7 +153,7 @@ class StarIdentifiers:
         Raises
         ------
         EmulatorError, StaridError
-            None can be made for this setup; raised again at each call.
+            No identifier can be made for this setup; raised at each call.
         """
         self._adopt_finished_build()
         if self._current is None or not self._in_background:
@@ -171,7 +171,7 @@ class StarIdentifiers:
         return identifier, False
 
     def _adopt_finished_build(self) -> None:
-        """Switch to a finished build, even if the setup has changed since: the next one replaces it."""
+        """Switch to a finished build, even if the setup has changed since; the next one will replace it."""
         if self._build is None or not self._build.future.done():
             return
         build, self._build = self._build, None

@@ -13,7 +13,7 @@ from starhil.emulator.parent_death_signal import end_with_parent
 from starhil.emulator.pipeline.messages import LENGTH, Failure
 
 NICE: Final = 5
-"""Niceness of the worker: the emulator's links have priority on a busy machine."""
+"""Niceness of the worker, so that the links have priority on a busy machine."""
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Starts and ends the pipeline worker process.
+"""Start and end of the pipeline worker process.
 
 `starhil run` starts the worker before its own imports, so that both processes start up in parallel.
 """
@@ -41,7 +41,7 @@ _ahead: Final[list[WorkerProcess]] = []
 
 
 def start_ahead() -> None:
-    """Start a worker for the run that this process is about to set up."""
+    """Start a worker for the run that this process is going to set up."""
     _ahead.append(WorkerProcess())
 
 

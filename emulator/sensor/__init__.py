@@ -1,1 +1,1 @@
-"""The sensor's camera: optics, detector, noise, fixed pattern, and the renderer of its images."""
+"""The camera of the sensor: optics, detector, noise, fixed pattern, and the renderer."""

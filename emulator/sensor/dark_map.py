@@ -1,4 +1,4 @@
-"""The unit's own dark frame: measured on the ground, and scaled to each image."""
+"""The dark frame of the unit, which is measured on the ground and scaled to each image."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _LONGEST_S: Final = 1.0
 
 @dataclass(frozen=True)
 class DarkMap:
-    """The dark signal of each pixel above the typical one.
+    """The dark signal of each pixel above the typical dark signal.
 
     Attributes
     ----------
     sensor : SensorModel
-        The sensor it belongs to.
+        The sensor.
     rate_dn_s : ndarray (h, w), float32
         Counts/s at gain 1 and the sensor's `reference_c`.
     """
@@ -43,7 +43,7 @@ class DarkMap:
 def measure_dark_map(sensor: SensorModel, height: int, width: int, frames: int, seed: int) -> DarkMap:
     """Average exposures with the lens covered, at gain 1 and `reference_c`.
 
-    The exposure, at most 1 s, lets the mean dark signal fill half of the converter's range.
+    The exposure, at most 1 s, is chosen so that the mean dark signal fills half of the converter's range.
 
     Parameters
     ----------

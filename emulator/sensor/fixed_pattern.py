@@ -38,8 +38,8 @@ def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPat
     """Draw the fixed pattern of a pixel array from the sensor's `pattern_seed`.
 
     Dark currents are gamma-distributed (never negative, with the long upper tail of silicon), sensitivities
-    normal, hot pixels log-normal. No pixel is both hot and dead. The last two patterns are cached, since
-    changes of exposure or gain do not affect them.
+    are normal, hot pixels log-normal. No pixel is both hot and dead. The last two patterns are cached,
+    because exposure and gain do not affect them.
     """
     pixels = (sensor.hot_pixels, sensor.dead_pixels)
     spreads = (sensor.prnu, sensor.dsnu, sensor.dark_e_s, sensor.hot_e_s)

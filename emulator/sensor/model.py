@@ -1,4 +1,4 @@
-"""The parameters of lens, pixels and converter, and the signal of a star of a given magnitude."""
+"""Parameters of lens, pixels and converter, and the signal from a star of a given magnitude."""
 
 from __future__ import annotations
 
@@ -54,12 +54,13 @@ _RANGES: Final[dict[str, tuple[float, float, str]]] = {
 
 @dataclass(frozen=True)
 class SensorModel:
-    """A star sensor's optics and detector; the defaults are of the CubeStar class.
+    """Optics and detector of a star sensor; the defaults match the CubeStar class.
 
     A 12 mm f/1.2 lens of 14.6 mm focal length images 42° onto 937 pixels of 12 µm. A star of V = 0 and solar
-    colour yields 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8 photons/s/m²/nm
-    (Bessell 1979), of which the photon spectrum of a G2 star averages 0.92 over the 500 nm. With a transmission of
-    0.75 and a quantum efficiency of 0.45 this gives 1.8e6 electrons/s, or 1 400 in 0.2 s for V = 6.
+    colour yields 4.6e10 photons/s/m² between 400 and 900 nm: 3.63e-11 W/m²/nm at 550 nm are 1.0e8
+    photons/s/m²/nm (Bessell 1979), of which the photon spectrum of a G2 star averages 0.92 over the 500 nm.
+    With a transmission of 0.75 and a quantum efficiency of 0.45 this gives 1.8e6 electrons/s, or 1 400 in 0.2
+    s for V = 6.
 
     Attributes
     ----------
@@ -72,10 +73,11 @@ class SensorModel:
     zero_point_photons_s_m2 : float
         Photons/s/m² in the band from a star of V = 0 and solar colour.
     colour_term : float
-        The sensor's magnitude is V − colour_term·(B−V − 0.65); silicon sees red stars brighter (about 0.4).
+        The sensor's magnitude is V − colour_term·(B−V − 0.65); about 0.4 for silicon, which favours red
+        stars.
     psf_sigma_px : float
-        Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot that
-        can be fitted without pixel-phase error.
+        Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot
+        that can be fitted without pixel-phase error.
     psf_growth : float
         Relative increase of the spot width from the image centre to the edge: along x with the square of x,
         along y with the square of y.
@@ -94,11 +96,11 @@ class SensorModel:
     dark_e_s : float
         Mean dark current at `reference_c`, electrons/s.
     temperature_c : float
-        Temperature of detector and lens, °C, where no other is given for a frame.
+        Temperature of detector and lens, °C, unless another is given for a frame.
     reference_c : float
         Temperature at which dark currents, lens and mounting have their stated values, °C.
     dark_doubling_c : float
-        Rise of the temperature that doubles the dark current, °C; 5 to 8 for silicon.
+        Temperature rise that doubles the dark current, °C; 5 to 8 for silicon.
     row_time_s : float
         Time from the exposure of one row to the next, seconds: 0 for a global shutter, which exposes all rows
         at once. The middle row of a rolling shutter is exposed at the time of the frame.
@@ -109,13 +111,14 @@ class SensorModel:
     k1_drift : float
         Change of the distortion k1, 1/°C.
     sky_mag_arcsec2 : float
-        Brightness of the empty sky (zodiacal light and unresolved stars), V magnitudes/arcsec².
+        Brightness of the sky background (zodiacal light and unresolved stars), V magnitudes/arcsec².
     dsnu, prnu : float
         Standard deviation between pixels of the dark current and of the sensitivity, relative to their means.
     hot_pixels, dead_pixels : int
         Number of pixels with excessive dark current, and without signal.
     hot_e_s : float
-        Median dark current of hot pixels at `reference_c`, electrons/s; log-normal with a factor of 2.7 per sigma.
+        Median dark current of hot pixels at `reference_c`, electrons/s; log-normal with a factor of 2.7 per
+        sigma.
     pattern_seed : int
         Seed of the fixed pattern.
     limiting_magnitude : float
@@ -181,22 +184,22 @@ class SensorModel:
 
     @property
     def zero_magnitude_e_s(self) -> float:
-        """Electrons/s from a star of V = 0 and solar colour."""
+        """Return electrons/s from a star of V = 0 and solar colour."""
         area = math.pi / 4.0 * self.aperture_m**2
         return self.zero_point_photons_s_m2 * area * self.transmission * self.quantum_efficiency
 
     def electrons(self, magnitude: float, exposure_s: float | None = None) -> float:
-        """Mean electrons from a star of a sensor magnitude in one exposure (default: `exposure_s` of the model)."""
+        """Return the mean number of electrons from a star of a sensor magnitude in one exposure."""
         exposure = self.exposure_s if exposure_s is None else exposure_s
         return self.zero_magnitude_e_s * exposure * math.pow(10.0, -0.4 * magnitude)
 
     def sky_e_s(self, pixel_scale_rad: float) -> float:
-        """Electrons/s per pixel from the empty sky, for pixels of `pixel_scale_rad` on a side."""
+        """Return electrons/s per pixel from the sky background, for pixels of width `pixel_scale_rad`."""
         arcsec2 = pixel_scale_rad**2 * ARCSEC2_PER_SR
         return self.zero_magnitude_e_s * arcsec2 * math.pow(10.0, -0.4 * self.sky_mag_arcsec2)
 
     def dark_factor(self, temperature_c: float) -> float:
-        """Dark current at a temperature relative to that at `reference_c`."""
+        """Return the dark current at a temperature relative to that at `reference_c`."""
         return math.pow(2.0, (temperature_c - self.reference_c) / self.dark_doubling_c)
 
     @property
@@ -227,7 +230,7 @@ class SensorModel:
         return Digitizer(self.read_noise_e, self.full_well_e, self.gain_e_per_dn, self.offset_dn, self.max_dn)
 
     def detection_settings(self, **changes: Any) -> DetectionSettings:
-        """Detection settings with this sensor's gain, saturation and, if uniform over the image, spot width."""
+        """Return detection settings with gain, saturation and, if uniform over the image, spot width."""
         settings = DetectionSettings(
             psf_sigma_px=self.psf_sigma_px if self.psf_growth == 0.0 else None,
             gain_e_per_dn=self.gain_e_per_dn,

@@ -1,10 +1,10 @@
-"""Photon, dark and read noise, full well, gain and digitisation of an image, in one pass over its pixels.
+"""Photon, dark and read noise, full well, gain and digitisation of an image, in one pass over the pixels.
 
 Random bits come from parallel xoshiro128++ generators (Blackman & Vigna 2021), one per lane, so that the compiler
-vectorises the loops. Normal deviates come from the Box–Muller transform with polynomials for the logarithm, sine
-and cosine. The sum of Poisson and read noise is drawn as a normal deviate with the right mean, variance and
-skewness (Cornish–Fisher), except where it would show: for few electrons with little read noise, and near the full
-well, each pixel is a true Poisson number plus read noise.
+can vectorise the loops. Normal deviates are computed by the Box–Muller transform, with polynomials for logarithm,
+sine and cosine. The sum of Poisson and read noise is drawn as a normal deviate with the right mean, variance and
+skewness (Cornish–Fisher), unless the difference would be noticeable: for few electrons with little read noise, and
+near the full well, each pixel is a true Poisson number plus read noise.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LANES: Final = 512
 
 BLOCK: Final = 2 * LANES
 FEW_ELECTRONS: Final = 100.0
-"""Mean electrons below which a sensor with little noise gets true Poisson numbers."""
+"""Mean electrons below which true Poisson numbers are used for a sensor with little noise."""
 
 QUIET_NOISE_E: Final = 3.0
 """Read and rounding noise, electrons, below which the discreteness of electrons matters."""
@@ -75,7 +75,7 @@ def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
 
 @compiled_ieee
 def _next_bits(state: npt.NDArray[np.uint32], out: npt.NDArray[np.uint32]) -> None:
-    """Advance every lane by one xoshiro128++ step."""
+    """Advance all lanes by one xoshiro128++ step."""
     for lane in range(LANES):
         s0 = state[0, lane]
         s1 = state[1, lane]
@@ -106,8 +106,8 @@ def fill_normal(
 ) -> None:
     """Fill `normal` (2·LANES,) with standard normal deviates.
 
-    Box–Muller on 32-bit uniforms, so that the tails reach 6.7 standard deviations; the logarithm is from Cephes
-    (`logf`), sine and cosine minimax polynomials on a quarter turn, all within 1e-6.
+    Box–Muller on 32-bit uniforms, so that the tails reach 6.7 standard deviations; the logarithm is from
+    Cephes (`logf`), sine and cosine minimax polynomials on a quarter turn, all within 1e-6.
     """
     _next_bits(state, bits_a)
     _next_bits(state, bits_b)
@@ -227,7 +227,7 @@ def digitize(
     expected_e : ndarray (h, w), float32
         Mean electrons of every pixel: star light, sky, dark current; not negative.
     digitizer : Digitizer
-        The pixel's noise and converter.
+        Noise of the pixels, and converter.
     seed, frame_index : int
         Determine the noise; the same pair and input give the same bytes.
 
@@ -243,7 +243,7 @@ def digitize(
         math.sqrt(digitizer.full_well_e), digitizer.read_noise_e
     )
     if few < 0.0 and least_e / digitizer.gain_e_per_dn + digitizer.offset_dn > digitizer.max_dn:
-        near_full = math.inf  # the converter saturates before the well: no pixel needs its own number
+        near_full = math.inf  # the converter saturates before the well, so no pixel needs a Poisson number
     levels = (
         digitizer.read_noise_e,
         digitizer.full_well_e,

@@ -1,4 +1,4 @@
-"""Streaks of energetic particles in the detector."""
+"""Streaks left by energetic particles in the detector."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def add_cosmic_rays(
 ) -> npt.NDArray[np.float64]:
     """Add the charge of particles to an image, in place.
 
-    Each leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with about 900
-    electrons per pixel, log-normally distributed along the streak.
+    Each particle leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with
+    about 900 electrons per pixel, log-normally distributed along the streak.
 
     Returns
     -------

@@ -32,7 +32,7 @@ def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 
 def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the quadrature rule by which a moving spot is summed to a smooth trail.
+    """Return the quadrature rule that sums a moving spot to a smooth trail.
 
     Parameters
     ----------
@@ -44,9 +44,9 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
     Returns
     -------
     nodes, weights : ndarray (n,)
-        Times from −1 (start of the exposure) to 1 (its end), and weights that sum to 1. A path below a thousandth
-        of the spot width gets one node. Otherwise nodes are closer than the spot's sigma, for which Gauss–Legendre
-        quadrature of a Gaussian is accurate to about 1e-5 of its peak.
+        Times from −1 (start of the exposure) to 1 (its end), and weights that sum to 1. A path below a
+        thousandth of the spot width gets one node. Otherwise nodes are closer than the sigma of the spot;
+        Gauss–Legendre quadrature of a Gaussian is then accurate to about 1e-5 of its peak.
     """
     lengths = longest_px / sigma_px
     if lengths < _STILL_SIGMA:
@@ -58,7 +58,7 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
 
 @compiled_ieee
 def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -> None:
-    """Compute the fractions of a Gaussian at 0 in `count` unit cells, the first of which starts at `edge`."""
+    """Compute the fractions of a Gaussian around 0 in `count` unit cells; the first cell starts at `edge`."""
     scale = _SQRT_HALF / sigma
     before = math.erf(edge * scale)
     for k in range(count):
@@ -82,9 +82,10 @@ def add_spots(
     Parameters
     ----------
     image, sensitivity : ndarray (h, w), float32
-        Mean electrons, added to; relative signal of each pixel.
+        Mean electrons, to which the light is added, and relative signal of each pixel.
     path : ndarray (n, 6)
-        x0, y0, x1, y1, x2, y2: the star is at x0 + x1·t + x2·t² (and so y) at time t, −1…1 over the exposure; pixels.
+        x0, y0, x1, y1, x2, y2, pixels: at time t, −1…1 over the exposure, x = x0 + x1·t + x2·t², and the same
+        for y.
     electrons : ndarray (n,)
         Mean electrons of each star in the whole exposure.
     sigma : ndarray (n, 2)

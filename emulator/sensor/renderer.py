@@ -18,7 +18,6 @@ from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
 from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
-from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.light_grid import Backdrop
@@ -252,26 +251,33 @@ class Renderer:
         if others is not None and others.has_extended_objects:
             area = self._painter.paint(others, optical_axis)
         mean = self._mean_without_stars(exposure, temperature, area)
-        path, chosen, inside = self._paths(optical_axis, rate, exposure, observer)
-        electrons = self._flux_e_s[chosen] * exposure
-        drawn = electrons
+        planets = () if others is None else others.planets
+        path, chosen, inside = self._paths(optical_axis, rate, exposure, observer, planets)
+        count = int(np.count_nonzero(chosen < len(self._rows)))
+        magnitudes = [planets[number - len(self._rows)].magnitude for number in chosen[count:]]
+        planets_e = [self.sensor.electrons(magnitude, exposure) for magnitude in magnitudes]
+        electrons = np.concatenate([self._flux_e_s[chosen[:count]] * exposure, planets_e])
+        drawn, centred = electrons, np.flatnonzero(inside[:count])
         object_truth = None
         if others is not None:
             drawn = electrons.copy()
-            drawn[np.flatnonzero(inside)[: others.missing_stars]] = 0.0
+            drawn[centred[: others.missing_stars]] = 0.0
             if area is not None:
                 drawn *= area.seen_at(path[:, :2])
-            object_truth = self._add_objects(mean, others, optical_axis, rate, exposure, index, area)
+            planet_xy = np.full((len(planets), 2), np.nan)
+            shown = count + np.flatnonzero(inside[count:])
+            planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
+            object_truth = self._add_objects(mean, others, planet_xy, exposure, index, area)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
-        rows = self._rows[chosen[inside]]
+        rows = self._rows[chosen[centred]]
         stars = StarTruth(
             self.catalog.hip[rows],
             rows.astype(np.int64),
-            path[inside, :2].copy(),
-            electrons[inside],
+            path[centred, :2].copy(),
+            electrons[centred],
             self.catalog.v[rows].astype(np.float64),
-            drawn[inside] > _VISIBLE_SHARE * electrons[inside],
+            drawn[centred] > _VISIBLE_SHARE * electrons[centred],
         )
         rates = (float(rate[0]), float(rate[1]), float(rate[2]))
         return Frame(image, stars, attitude, rates, exposure, self.seed, index, object_truth)
@@ -280,44 +286,16 @@ class Renderer:
         self,
         mean: npt.NDArray[np.float32],
         objects: SkyObjects,
-        attitude: Attitude,
-        rate: npt.NDArray[np.float64],
+        planet_xy: npt.NDArray[np.float64],
         exposure_s: float,
         index: int,
         area: AreaLight | None,
     ) -> ObjectTruth:
-        """Add planets, false stars and particles to `mean`, in place."""
+        """Add false stars and particles to `mean`, in place."""
         rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
-        planet_xy = self._add_planets(mean, objects.planets, attitude, rate, exposure_s, area)
         false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
         streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
         return ObjectTruth(false_xy, planet_xy, streaks, 0.0 if area is None else area.covered_share)
-
-    def _add_planets(
-        self,
-        mean: npt.NDArray[np.float32],
-        planets: tuple[PointSource, ...],
-        attitude: Attitude,
-        rate: npt.NDArray[np.float64],
-        exposure_s: float,
-        area: AreaLight | None,
-    ) -> npt.NDArray[np.float64]:
-        """Add point sources at fixed directions; return their positions (n, 2)."""
-        xy = np.full((len(planets), 2), np.nan)
-        if not planets:
-            return xy
-        vectors = np.array([icrs_vector(planet.ra_deg, planet.dec_deg) for planet in planets])
-        near = self._near(vectors, attitude, rate, exposure_s)
-        if not near.size:
-            return xy
-        path, inside, touching = self._path_of(vectors[near], attitude, rate, exposure_s)
-        xy[near[inside]] = path[inside, :2]
-        electrons = np.array(
-            [self.sensor.electrons(planets[k].magnitude, exposure_s) for k in near[touching]]
-        )
-        path = path[touching]
-        self._add_light(mean, path, electrons if area is None else electrons * area.seen_at(path[:, :2]))
-        return xy
 
     def _add_false_stars(
         self,
@@ -385,15 +363,21 @@ class Renderer:
         rate: npt.NDArray[np.float64],
         exposure_s: float,
         observer: Observer | None,
+        planets: tuple[PointSource, ...],
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-        """Return paths (n, 6), numbers and centre-inside mask of the stars whose light may reach the image.
+        """Return paths (n, 6), numbers and centre-inside mask of the stars and planets whose light may reach the image.
 
-        A path is the parabola through the projections at the start, middle and end of the exposure.
+        A path is the parabola through the projections at the start, middle and end of the exposure. The numbers of planets
+        follow those of the stars.
         """
         near = self._near(self._vectors, attitude, rate, exposure_s)
         icrs = self._vectors[near]
         if observer is not None:
             icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
+        if planets:
+            vectors = np.array([planet.direction for planet in planets])
+            icrs = np.concatenate([icrs, vectors])
+            near = np.concatenate([near, len(self._rows) + np.arange(len(planets))])
         path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
 

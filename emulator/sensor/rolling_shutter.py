@@ -1,4 +1,4 @@
-"""A rolling shutter: each row of the image shows the sky at its own time."""
+"""A rolling shutter: each row of the image is exposed at a different time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from starid.camera import Camera
 
 _ROUNDS: Final = 3
-"""Rounds in which a star's row and the time of its row are found from each other."""
+"""Number of iterations for the row of a star and the time of this row."""
 
 
 def at_row_times(
@@ -20,12 +20,12 @@ def at_row_times(
     rate_rad_s: npt.NDArray[np.float64],
     row_time_s: float,
 ) -> npt.NDArray[np.float64]:
-    """Return directions as the rows on which they fall expose them.
+    """Return directions at the exposure times of the rows on which they fall.
 
     Parameters
     ----------
     vectors : ndarray (n, 3)
-        Directions in the sensor frame when the middle row is exposed.
+        Directions in the sensor frame at the time of the middle row.
     camera : Camera
         The camera.
     rate_rad_s : ndarray (3,)
@@ -52,7 +52,7 @@ def at_row_times(
 def turned(
     vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Directions in the frame of a sensor that has turned on, each for its own time.
+    """Return directions in the frame of a sensor after rotation, for a different time each.
 
     Parameters
     ----------
@@ -66,11 +66,11 @@ def turned(
     Returns
     -------
     ndarray (n, 3)
-        As ``Attitude.rotated(rate * time)`` turns them.
+        The directions, rotated as by ``Attitude.rotated(rate * time)``.
     """
     speed = math.sqrt(float(rate_rad_s @ rate_rad_s))
     axis = rate_rad_s / speed
-    angles = -speed * times_s[:, None]  # the sky turns against the sensor
+    angles = -speed * times_s[:, None]  # the sky turns in the opposite direction to the sensor
     along = (vectors @ axis)[:, None] * axis
     across = vectors - along
     result: npt.NDArray[np.float64] = (

@@ -1,4 +1,4 @@
-"""What a change of temperature does to the optics: focal length, distortion and direction of the boresight."""
+"""Effects of temperature on the optics: focal length, distortion and direction of the boresight."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starid.camera import Camera
 
 
 def drifted_camera(camera: Camera, sensor: SensorModel, temperature_c: float) -> Camera:
-    """Return the camera at a temperature; the camera itself at the sensor's `reference_c` or without drift."""
+    """Return the camera at a temperature; unchanged at the sensor's `reference_c` or without drift."""
     above = temperature_c - sensor.reference_c
     if above == 0.0 or (sensor.focal_drift == 0.0 and sensor.k1_drift == 0.0):
         return camera

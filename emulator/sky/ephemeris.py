@@ -18,8 +18,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from starhil.emulator.sky.directions import icrs_vector
-from starhil.emulator.sky.objects import EarthLimb, Moon, PointSource, SunGlare
+from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
 from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
 from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
@@ -116,7 +115,7 @@ class Observer:
     def towards(self, place_m: Vector) -> Vector:
         """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
         gap = place_m - self.position_m
-        return aberrated(gap / np.linalg.norm(gap, axis=-1, keepdims=True), self.velocity_m_s)
+        return aberrated(gap / np.sqrt(np.einsum("...k,...k", gap, gap))[..., None], self.velocity_m_s)
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
         """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
@@ -124,9 +123,13 @@ class Observer:
         return aberrated(vectors - shift, self.velocity_m_s)
 
 
-def sun_seen_by(observer: Observer, style: SunGlare) -> SunGlare:
-    """Return the Sun in its place, with the other fields of `style`."""
-    return dataclasses.replace(style, **_place(observer.directions[0]))
+def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) -> SunGlare | None:
+    """Return the Sun in its place, with the light that the Earth leaves of `style`; None if it is hidden."""
+    share = _visible_share_of_sun(observer, earth)
+    if share == 0.0:
+        return None
+    light = share * style.electrons_s
+    return dataclasses.replace(style, **_place(observer.directions[0]), electrons_s=light)
 
 
 def moon_seen_by(observer: Observer, style: Moon) -> Moon:
@@ -242,24 +245,21 @@ def _planet_magnitude(observer: Observer, place_m: Vector, name: str, law: tuple
     return light + rings + sum(term * phase**power for power, term in enumerate(law))
 
 
-def visible_share_of_sun(observer: Observer, earth: EarthLimb | None) -> float:
+def _visible_share_of_sun(observer: Observer, earth: EarthLimb | None) -> float:
     """Return the share of the Sun's disc that the Earth leaves visible, 0…1 (the limb taken as straight)."""
     if earth is None:
         return 1.0
     radius = math.asin(SUN_RADIUS_M / _length(observer.sun - observer.position_m))
-    above = _angle(observer.directions[0], icrs_vector(earth.ra_deg, earth.dec_deg))
-    height = (above - math.radians(earth.radius_deg)) / radius
+    above = _angle(observer.directions[0], earth.direction)
+    height = (above - earth.radius_rad) / radius
     if abs(height) >= 1.0:
         return 1.0 if height > 0.0 else 0.0
     return (math.acos(-height) + height * math.sqrt(1.0 - height * height)) / math.pi
 
 
-def hidden_by(earth: EarthLimb | None, ra_deg: float, dec_deg: float) -> bool:
-    """Whether the Earth's disc lies in front of a direction."""
-    if earth is None:
-        return False
-    apart = _angle(icrs_vector(ra_deg, dec_deg), icrs_vector(earth.ra_deg, earth.dec_deg))
-    return apart < math.radians(earth.radius_deg)
+def hidden_by(earth: EarthLimb | None, body: CelestialBody) -> bool:
+    """Whether the Earth's disc lies in front of the centre of a body."""
+    return earth is not None and _angle(body.direction, earth.direction) < earth.radius_rad
 
 
 def _place(direction: Vector) -> dict[str, float]:
@@ -284,6 +284,6 @@ def _angle(one: Vector, other: Vector) -> float:
 
 def _position_angle(origin: Vector, target: Vector) -> float:
     """Position angle of one direction seen from another, from north through east, degrees."""
-    x, y, z = origin.tolist()
-    east, north = np.array([-y, x, 0.0]), np.array([-x * z, -y * z, x * x + y * y])
-    return math.degrees(math.atan2(float(target @ east), float(target @ north))) % 360.0
+    (x, y, z), (u, v, w) = origin.tolist(), target.tolist()
+    east, north = x * v - y * u, w * (x * x + y * y) - z * (x * u + y * v)
+    return math.degrees(math.atan2(east, north)) % 360.0

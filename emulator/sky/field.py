@@ -20,11 +20,12 @@ def disc_in_field(centre: npt.NDArray[np.float64], radius_rad: float, camera: Ca
         return False
     if camera.project(centre[None, :])[1][0]:
         return True
-    nearest = float(np.nanmax(_border_of(camera) @ centre, initial=-1.0))
+    nearest = float(np.max(_border_of(camera) @ centre, initial=-1.0))
     return nearest >= math.cos(min(radius_rad, math.pi))
 
 
 @lru_cache(maxsize=4)
 def _border_of(camera: Camera) -> npt.NDArray[np.float64]:
-    """Directions (n, 3) of the outer edge of the pixel array."""
-    return camera.back_project(camera.border(_BORDER_SAMPLES))
+    """Directions (n, 3) of the outer edge of the pixel array, where it sees any."""
+    border = camera.back_project(camera.border(_BORDER_SAMPLES))
+    return border[~np.isnan(border).any(axis=1)]

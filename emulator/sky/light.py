@@ -10,20 +10,24 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.field import disc_in_field
-from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, fill, interpolated
-from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
+from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Sensitivity, expand, fill
+from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
 from starid.attitude import Attitude
 from starid.camera import Camera
-from starid.jit import compiled_ieee
+from starid.jit import compiled_ieee, inner
 
 Glare: TypeAlias = tuple[npt.NDArray[np.float32], float, float, bool]
 """Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""
 
-Box: TypeAlias = tuple[slice, slice]
-"""Rows and columns of part of an image."""
+Line: TypeAlias = npt.NDArray[np.float32]
+
+Box: TypeAlias = tuple[int, int, int, int]
+"""First row and the one after the last, and so the columns, of part of an image."""
+
+NearGlare: TypeAlias = tuple[Box, Glare, Image, Image]
+"""Where a source's glare is not smooth, the source, its glare on the grid, and the directions (3, h, w) of the pixels."""
 
 _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
@@ -49,7 +53,7 @@ class Patch:
 
     Attributes
     ----------
-    box : (slice, slice)
+    box : (int, int, int, int)
         Its rows and columns.
     light : ndarray (h', w'), float32
         Electrons/s in a pixel of mean sensitivity.
@@ -66,23 +70,13 @@ class Patch:
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
-        rows, columns = self.box
-        column, row = np.rint(xy_px).astype(np.int64).T - np.array([[columns.start], [rows.start]])
-        inside = (column >= 0) & (column < self.passed.shape[1]) & (row >= 0) & (row < self.passed.shape[0])
-        seen = np.ones(len(xy_px))
-        seen[inside] = self.passed[row[inside], column[inside]]
-        return seen
+        return _nearest(self.passed, self.box, xy_px)
 
     def cover(self, mean: Image, backdrop: Backdrop) -> None:
         """Put it in front of the mean electrons (h, w), in place."""
-        sensed = backdrop.sensitivity[self.box] * np.float32(backdrop.unit * backdrop.exposure_s)
-        behind, sky = mean[self.box], sensed * np.float32(backdrop.sky_e_s)
-        if self.hides_glare:
-            dark = backdrop.still[self.box] - sky
-            seen = dark + (behind - dark) * self.passed
-        else:
-            seen = behind - sky * (1.0 - self.passed)
-        np.maximum(seen + sensed * self.light, 0.0, out=mean[self.box])
+        light = backdrop.unit * backdrop.exposure_s, backdrop.sky_e_s
+        planes = mean, backdrop.still, backdrop.sensitivity
+        _cover(planes, self.light, self.passed, self.box, light, self.hides_glare)
 
 
 @dataclass(frozen=True)
@@ -95,6 +89,8 @@ class AreaLight:
         Width and height of the image, pixels.
     glare : ndarray (gh, gw), float32, or None
         Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row.
+    near : tuple of NearGlare
+        What is not smooth of that light.
     earth : WideEarth or None
         An Earth in front of `glare`, sky and the patches before the last `in_front`.
     behind, in_front : tuple of Patch
@@ -105,6 +101,7 @@ class AreaLight:
 
     size: tuple[int, int]
     glare: Image | None = None
+    near: tuple[NearGlare, ...] = ()
     earth: WideEarth | None = None
     behind: tuple[Patch, ...] = ()
     in_front: tuple[Patch, ...] = ()
@@ -149,6 +146,8 @@ class AreaLight:
             exposure_s = backdrop.unit * backdrop.exposure_s
             smooth = none if glare is None else glare
             fill(mean, backdrop.still, backdrop.sensitivity, smooth, hidden, exposure_s)
+        for near in self.near:
+            _refine_glare(mean, backdrop.sensitivity, near, backdrop.unit * backdrop.exposure_s)
         for layer in self._layers:
             layer.cover(mean, backdrop)
 
@@ -167,51 +166,160 @@ def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
 
 def _is_lit(earth: EarthLimb, towards: npt.NDArray[np.float64], off_nadir_deg: float) -> bool:
     """Whether the Sun shines on the point of the Earth seen at an angle from its centre towards a direction."""
-    sun = _sun_of(earth)
+    sun = earth.sun_direction
     if sun is None:
         return True
-    nadir = icrs_vector(earth.ra_deg, earth.dec_deg)
+    nadir = earth.direction
     sideways = towards - float(towards @ nadir) * nadir
     sideways /= max(float(np.linalg.norm(sideways)), 1e-12)
-    angle, distance = math.radians(off_nadir_deg), 1.0 / math.sin(math.radians(earth.radius_deg))
+    angle, distance = math.radians(off_nadir_deg), 1.0 / math.sin(earth.radius_rad)
     line = math.cos(angle) * nadir + math.sin(angle) * sideways
     under = max(1.0 - (distance * math.sin(angle)) ** 2, 0.0)
     normal = (distance * math.cos(angle) - math.sqrt(under)) * line - distance * nadir
     return float(normal @ sun) > 0.0
 
 
-def _sun_of(earth: EarthLimb) -> npt.NDArray[np.float64] | None:
-    """Return the direction (3,) of the Sun that lights the Earth; None if all of the disc is lit."""
-    if earth.sun_ra_deg is None or earth.sun_dec_deg is None:
-        return None
-    return icrs_vector(earth.sun_ra_deg, earth.sun_dec_deg)
-
-
-def _off_axis_deg(attitude: Attitude, body: SunGlare | Moon | EarthLimb) -> float:
+def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
     """Angle of a body's centre from the boresight, degrees."""
-    place, boresight = icrs_vector(body.ra_deg, body.dec_deg), attitude.boresight
-    return math.degrees(2.0 * math.asin(min(0.5 * math.dist(place.tolist(), boresight.tolist()), 1.0)))
+    chord = math.dist(body.direction.tolist(), attitude.boresight.tolist())
+    return math.degrees(2.0 * math.asin(min(0.5 * chord, 1.0)))
 
 
 @compiled_ieee
-def _add_glare(
-    image: Image,
-    directions: Image,
-    source: npt.NDArray[np.float32],
-    strength: float,
-    soft2: float,
-    cube: bool,
+def _nearest(passed: Image, box: Box, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """As `Patch.seen_at`."""
+    seen = np.ones(len(xy_px))
+    for i in range(seen.size):
+        row, column = int(np.rint(xy_px[i, 1])) - box[0], int(np.rint(xy_px[i, 0])) - box[2]
+        if 0 <= row < passed.shape[0] and 0 <= column < passed.shape[1]:
+            seen[i] = passed[row, column]
+    return seen
+
+
+@compiled_ieee
+def _cover(
+    planes: tuple[Image, Image, Sensitivity],
+    light: Image,
+    passed: Image,
+    box: Box,
+    units: tuple[float, float],
+    hides_glare: bool,
 ) -> None:
-    """Add strength/(chord² + soft²), or its power 3/2, over the angle (as chord) between pixels and a source."""
-    a, b, c = source[0], source[1], source[2]
+    """As `Patch.cover`, with the exposure at a sensitivity of 1, and the light of the sky."""
+    unit, sky_e_s = np.float32(units[0]), np.float32(units[1])
+    zero, one = np.float32(0.0), np.float32(1.0)
+    run = slice(box[2], box[3])
+    for y in range(light.shape[0]):
+        row = box[0] + y
+        to, base, gain = planes[0][row, run], planes[1][row, run], planes[2][row, run]
+        for x in range(to.size):
+            sensed = np.float32(gain[x]) * unit
+            sky = sensed * sky_e_s
+            dark = base[x] - sky
+            through = (
+                dark + (to[x] - dark) * passed[y, x] if hides_glare else to[x] - sky * (one - passed[y, x])
+            )
+            to[x] = max(through + sensed * light[y, x], zero)
+
+
+@inner
+def _glare_at(chord2: np.float32, factor: np.float32, cube: bool) -> np.float32:
+    """Glare at a squared chord with the squared softness added."""
+    return factor / (chord2 * np.sqrt(chord2) if cube else chord2)
+
+
+@compiled_ieee
+def _add_glare(image: Image, directions: Image, source: Glare) -> None:
+    """Add strength/(chord² + soft²), or its power 3/2, over the angle (as chord) between directions and a source."""
+    towards, strength, soft2, cube = source
+    a, b, c = towards[0], towards[1], towards[2]
     factor, soft = np.float32(strength), np.float32(soft2)
     for y in range(image.shape[0]):
-        row = image[y]
-        dx, dy, dz = directions[0, y], directions[1, y], directions[2, y]
+        row, dx, dy, dz = image[y], directions[0, y], directions[1, y], directions[2, y]
         for x in range(row.size):
             u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
-            chord2 = u * u + v * v + w * w + soft
-            row[x] += factor / (chord2 * np.sqrt(chord2) if cube else chord2)
+            row[x] += _glare_at(u * u + v * v + w * w + soft, factor, cube)
+
+
+@compiled_ieee
+def _refine_glare(mean: Image, sensitivity: Sensitivity, near: NearGlare, exposure_s: float) -> None:
+    """Replace interpolated glare by that of each pixel, at an exposure for a sensitivity of 1."""
+    (top, bottom, left, right), (towards, strength, soft2, cube), grid, directions = near
+    run = slice(left, right)
+    a, b, c = towards[0], towards[1], towards[2]
+    factor, soft, exposure = np.float32(strength), np.float32(soft2), np.float32(exposure_s)
+    lines = np.empty((2, (grid.shape[1] - 1) * GLARE_STEP), dtype=np.float32)
+    cells = (left // GLARE_STEP, -(-right // GLARE_STEP))
+    above, below = lines[0, run], lines[1, run]
+    for band in range(top // GLARE_STEP, -(-bottom // GLARE_STEP)):
+        expand(grid[band], lines[0], cells[0], cells[1])
+        expand(grid[band + 1], lines[1], cells[0], cells[1])
+        for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, bottom)):
+            to, gain, share = mean[y, run], sensitivity[y, run], np.float32(y % GLARE_STEP / GLARE_STEP)
+            dx, dy, dz = directions[0, y, run], directions[1, y, run], directions[2, y, run]
+            for x in range(to.size):
+                u, v, w = dx[x] - a, dy[x] - b, dz[x] - c
+                exact = _glare_at(u * u + v * v + w * w + soft, factor, cube)
+                coarse = above[x] + share * (below[x] - above[x])
+                to[x] += np.float32(gain[x]) * exposure * (exact - coarse)
+
+
+@compiled_ieee
+def _points_near(
+    directions: Image, centre: npt.NDArray[np.float32], cosine: float
+) -> tuple[int, int, int, int]:
+    """First and last row and column of directions (3, h, w) within an angle of a centre; the last before the first if none."""
+    a, b, c, least = centre[0], centre[1], centre[2], np.float32(cosine)
+    height, width = directions.shape[1:]
+    top, bottom, left, right = height, -1, width, -1
+    near = np.empty(width, dtype=np.bool_)
+    for y in range(height):
+        dx, dy, dz = directions[0, y], directions[1, y], directions[2, y]
+        hits = 0
+        for x in range(width):
+            near[x] = a * dx[x] + b * dy[x] + c * dz[x] >= least
+            hits += near[x]
+        if hits:
+            top, bottom = min(top, y), y
+            for x in range(width):
+                if near[x]:
+                    left, right = min(left, x), max(right, x)
+    return top, bottom, left, right
+
+
+@compiled_ieee
+def _draw_moon(
+    disc: Image,
+    passed: Image,
+    directions: Image,
+    box: Box,
+    axes: tuple[npt.NDArray[np.float64], tuple[float, float], npt.NDArray[np.float64]],
+    shape: tuple[float, float, float],
+) -> None:
+    """Draw the disc with the terminator, and what is visible behind it.
+
+    `axes` are the directions (2, 3) to north and east, cosine and sine of the position angle of the bright limb over the radius,
+    and the direction (3,) of the centre, sensor frame. `shape` is the radius, pixels, the illuminated fraction and the
+    brightness of a pixel.
+    """
+    north, east, (along, sideways), source = axes[0][0], axes[0][1], axes[1], axes[2]
+    radius, illuminated, brightness = shape
+    terminator = 1.0 - 2.0 * illuminated
+    run = slice(box[2], box[3])
+    for y in range(disc.shape[0]):
+        row = box[0] + y
+        dx, dy, dz = directions[0, row, run], directions[1, row, run], directions[2, row, run]
+        for x in range(dx.size):
+            up = north[0] * dx[x] + north[1] * dy[x] + north[2] * dz[x]
+            left = east[0] * dx[x] + east[1] * dy[x] + east[2] * dz[x]
+            ahead = source[0] * dx[x] + source[1] * dy[x] + source[2] * dz[x]
+            u, v = along * up + sideways * left, along * left - sideways * up
+            inside = (
+                min(max(0.5 + (1.0 - math.sqrt(u * u + v * v)) * radius, 0.0), 1.0) if ahead > 0.0 else 0.0
+            )
+            edge = terminator * math.sqrt(max(1.0 - v * v, 0.0))
+            disc[y, x] = inside * min(max(0.5 + (u - edge) * radius, 0.0), 1.0) * brightness
+            passed[y, x] = 1.0 - inside
 
 
 @compiled_ieee
@@ -312,10 +420,6 @@ class AreaPainter:
         return self._directions_of(*steps)
 
     @property
-    def _everything(self) -> Box:
-        return slice(0, self._camera.height), slice(0, self._camera.width)
-
-    @property
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
 
@@ -329,9 +433,8 @@ class AreaPainter:
         """Return light and transmission of all extended objects at one attitude."""
         if baffle_passed(objects, attitude):
             return AreaLight(self._size, flooded=True)
-        glare, behind = self._glare(objects, attitude)
-        if objects.moon is not None:
-            behind += self._moon_patch(objects.moon, attitude)
+        glare, near = self._glare(objects, attitude)
+        behind = () if objects.moon is None else self._moon_patch(objects.moon, attitude)
         earth: WideEarth | None = None
         in_front: list[Patch] = []
         if objects.earth is not None and self._in_reach(objects.earth, attitude):
@@ -342,32 +445,32 @@ class AreaPainter:
         covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
-        in_front += [Patch(self._everything, np.zeros_like(cover), cover) for cover in covers]
-        return AreaLight(self._size, glare, earth, tuple(behind), tuple(in_front))
+        everything = (0, self._camera.height, 0, self._camera.width)
+        in_front += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
+        return AreaLight(self._size, glare, near, earth, behind, tuple(in_front))
 
-    def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, list[Patch]]:
-        """Return the glare of Sun and Moon on the grid, and what it lacks near them."""
-        total, near = None, []
+    def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, tuple[NearGlare, ...]]:
+        """Return the glare of Sun and Moon on the grid, and near them."""
+        glare, near = None, []
+        grid, smooth_rad = self._grid_directions, _SMOOTH_PX * self._camera.pixel_scale_rad
         for body in (objects.sun, objects.moon):
             if body is None:
                 continue
             off_axis = _off_axis_deg(attitude, body)
             if off_axis > body.reach_deg:
                 continue
-            direction = attitude.to_sensor(icrs_vector(body.ra_deg, body.dec_deg))
             strength, soft, cube = self._glare_of(body)
+            direction = attitude.to_sensor(body.direction)
             source: Glare = (direction.astype(np.float32), strength, soft * soft, cube)
-            glare = np.zeros(self._grid_directions.shape[1:], dtype=np.float32)
-            _add_glare(glare, self._grid_directions, *source)
-            total = glare if total is None else total + glare
+            light = np.zeros(grid.shape[1:], dtype=np.float32)
+            _add_glare(light, grid, source)
             outside = math.radians(off_axis) - self._camera.field_radius_rad
-            if max(soft, outside) < _SMOOTH_PX * self._camera.pixel_scale_rad:
-                box = self._box_around(direction, _SMOOTH_PX * self._camera.pixel_scale_rad)
+            if max(soft, outside) < smooth_rad:
+                box = self._box_around(direction, smooth_rad)
                 if box is not None:
-                    light = -interpolated(glare, *box)
-                    _add_glare(light, self._directions_in(box), *source)
-                    near.append(Patch(box, light, np.ones_like(light), hides_glare=False))
-        return total, near
+                    near.append((box, source, light, self._directions))
+            glare = light if glare is None else glare + light
+        return glare, tuple(near)
 
     def _glare_of(self, body: SunGlare | Moon) -> tuple[float, float, bool]:
         """Strength and softness of a body's stray light, and whether it falls with the cube of the angle."""
@@ -383,52 +486,37 @@ class AreaPainter:
         """Electrons/s from the whole Moon."""
         return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
 
-    def _moon_patch(self, moon: Moon, attitude: Attitude) -> list[Patch]:
+    def _moon_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
         """Return the Moon's disc with the terminator; nothing if it is outside the image."""
         import cv2
 
-        source = attitude.to_sensor(icrs_vector(moon.ra_deg, moon.dec_deg))
-        radius = math.radians(moon.diameter_deg) / 2.0
-        box = self._box_around(source, radius + _EDGE_PX * self._camera.pixel_scale_rad)
+        source, scale = attitude.to_sensor(moon.direction), moon.radius_rad / self._camera.pixel_scale_rad
+        box = self._box_around(source, moon.radius_rad + _EDGE_PX * self._camera.pixel_scale_rad)
         if box is None:
-            return []
-        # position on the disc in units of its radius, towards the bright limb and across
-        ra, dec, angle = (math.radians(value) for value in (moon.ra_deg, moon.dec_deg, moon.bright_limb_deg))
-        north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
-        east = np.array([-math.sin(ra), math.cos(ra), 0.0])
-        towards = attitude.to_sensor(math.cos(angle) * north + math.sin(angle) * east) / radius
-        across = attitude.to_sensor(math.cos(angle) * east - math.sin(angle) * north) / radius
-        directions = self._directions_in(box)
-        u = np.tensordot(towards, directions, axes=1)
-        v = np.tensordot(across, directions, axes=1)
-        before = np.tensordot(source, directions, axes=1) > 0.0
-        scale = radius / self._camera.pixel_scale_rad
-        inside = np.clip(0.5 + (1.0 - np.hypot(u, v)) * scale, 0.0, 1.0) * before
-        edge = (1.0 - 2.0 * moon.illuminated) * np.sqrt(np.clip(1.0 - v * v, 0.0, 1.0))
-        lit = inside * np.clip(0.5 + (u - edge) * scale, 0.0, 1.0)
+            return ()
+        x, y, z = moon.direction.tolist()
+        across, along = math.hypot(x, y), math.radians(moon.bright_limb_deg)
+        east, north = (-y / across, x / across, 0.0), (-x * z / across, -y * z / across, across)
+        turn = (math.cos(along) / moon.radius_rad, math.sin(along) / moon.radius_rad)
+        axes = attitude.to_sensor(np.array([north, east]))
         area = max(math.pi * scale**2 * moon.illuminated, 1.0)
-        disc = (lit * (self._moonlight(moon) / area)).astype(np.float32)
+        shape = (scale, moon.illuminated, self._moonlight(moon) / area)
+        disc, passed = np.empty((2, box[1] - box[0], box[3] - box[2]), dtype=np.float32)
+        _draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
         light = np.asarray(cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px), dtype=np.float32)
-        return [Patch(box, light, (1.0 - inside).astype(np.float32), hides_glare=False)]
+        return (Patch(box, light, passed, hides_glare=False),)
 
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
-        """Return the slices of the image that hold a disc in the sensor frame; None if it is outside."""
-        margin = 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
-        if not disc_in_field(direction, radius_rad + margin, self._camera):
+        """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""
+        reach_rad = radius_rad + 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
+        if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
             return None
-        cosines = np.einsum("k,kij", direction.astype(np.float32), self._grid_directions)
-        near = cosines >= math.cos(min(radius_rad + margin, math.pi))
-        spans = []
-        for axis, size in enumerate(self._size[::-1]):
-            points = GLARE_STEP * np.flatnonzero(near.any(axis=1 - axis))
-            if not points.size or points[0] >= size:
-                return None
-            spans.append(slice(int(points[0]), min(int(points[-1]) + 1, size)))
-        return spans[0], spans[1]
-
-    def _directions_in(self, box: Box) -> Image:
-        """Return the directions (3, h', w') of the pixels in part of the image."""
-        return np.ascontiguousarray(self._directions[(slice(None), *box)])
+        cosine = math.cos(min(reach_rad, math.pi))
+        top, bottom, left, right = _points_near(self._grid_directions, direction.astype(np.float32), cosine)
+        width, height = self._size
+        top, bottom = GLARE_STEP * top, min(GLARE_STEP * bottom + 1, height)
+        left, right = GLARE_STEP * left, min(GLARE_STEP * right + 1, width)
+        return (top, bottom, left, right) if top < bottom and left < right else None
 
     def _small_earth(self, earth: EarthLimb, attitude: Attitude) -> list[Patch]:
         """Return the Earth's disc, pixel by pixel; nothing if it is outside the image."""
@@ -436,9 +524,9 @@ class AreaPainter:
         box = self._box_around(nadir, self._reach_rad(earth))
         if box is None:
             return []
-        directions = self._directions_in(box)
+        directions = np.ascontiguousarray(self._directions[:, box[0] : box[1], box[2] : box[3]])
         light, passed = np.zeros_like(directions[0]), np.ones_like(directions[0])
-        angles = (math.radians(earth.radius_deg), self._atmosphere_rad(earth))
+        angles = (earth.radius_rad, self._atmosphere_rad(earth))
         _add_earth(light, passed, directions, nadir, sun, angles, earth.electrons_s)
         return [Patch(box, light, passed)]
 
@@ -450,9 +538,9 @@ class AreaPainter:
         towards = np.array([nadir, sun], dtype=np.float32)
         np.matmul(towards, directions.reshape(3, -1), out=grid[:2].reshape(2, -1))
         np.arccos(np.clip(grid[0], -1.0, 1.0, out=grid[2]), out=grid[2])
-        grid[2] -= np.float32(math.radians(earth.radius_deg))
+        grid[2] -= np.float32(earth.radius_rad)
         grid[2] *= np.float32(1.0 / self._atmosphere_rad(earth))
-        distance = 1.0 / math.sin(math.radians(earth.radius_deg))
+        distance = 1.0 / math.sin(earth.radius_rad)
         behind = -distance * float(nadir @ sun) if np.any(sun) else 1.0
         step_rad = GLARE_STEP * self._camera.pixel_scale_rad
         return WideEarth(grid, distance, behind, earth.electrons_s, step_rad)
@@ -461,8 +549,8 @@ class AreaPainter:
         self, earth: EarthLimb, attitude: Attitude
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""
-        sun = _sun_of(earth)
-        nadir = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg))
+        sun = earth.sun_direction
+        nadir = attitude.to_sensor(earth.direction)
         return nadir, np.zeros(3) if sun is None else attitude.to_sensor(sun)
 
     def _atmosphere_rad(self, earth: EarthLimb) -> float:
@@ -472,12 +560,11 @@ class AreaPainter:
 
     def _reach_rad(self, earth: EarthLimb) -> float:
         """Return the angle from the Earth's centre to which the glow of its limb reaches."""
-        return math.radians(earth.radius_deg) + GLOW_HEIGHTS * self._atmosphere_rad(earth)
+        return earth.radius_rad + GLOW_HEIGHTS * self._atmosphere_rad(earth)
 
     def _in_reach(self, earth: EarthLimb, attitude: Attitude) -> bool:
         """Whether the Earth or the glow of its limb reaches into the field."""
-        nadir = attitude.to_sensor(icrs_vector(earth.ra_deg, earth.dec_deg))
-        return disc_in_field(nadir, self._reach_rad(earth), self._camera)
+        return disc_in_field(attitude.to_sensor(earth.direction), self._reach_rad(earth), self._camera)
 
     def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
         """Return the transmission (h, w) of an obstruction."""

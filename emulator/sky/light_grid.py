@@ -82,8 +82,8 @@ def fill(
             expand(glare[band + 1], lower, 0, cells)
         end = 0
         while end < cells:
-            start = end
-            while end < cells and not (height.size and _is_hidden(height, band, end)):
+            start, end = end, end if height.size else cells
+            while end < cells and not _is_hidden(height, band, end):
                 end += 1
             if start == end:
                 end += 1
@@ -108,13 +108,3 @@ def _is_hidden(height: Image, row: int, column: int) -> bool:
         max(height[row, column], height[row, column + 1]) <= 0.0
         and max(height[row + 1, column], height[row + 1, column + 1]) <= 0.0
     )
-
-
-def interpolated(grid: Image, rows: slice, columns: slice) -> Image:
-    """Return the light of a grid in part (h', w') of the image."""
-    for line, axis in ((rows, 0), (columns, 1)):
-        pixel = np.arange(line.start, line.stop)
-        cell = pixel // GLARE_STEP
-        share = np.expand_dims((pixel % GLARE_STEP / GLARE_STEP).astype(np.float32), 1 - axis)
-        grid = grid.take(cell, axis) * (1 - share) + grid.take(cell + 1, axis) * share
-    return grid

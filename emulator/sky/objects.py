@@ -9,16 +9,38 @@ import dataclasses
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final, Self
 
+import numpy as np
+import numpy.typing as npt
+
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sky.directions import icrs_vector
 
 _ANGLE: Final = (-360.0, 360.0)
 _MAX_OBJECTS: Final = 100_000
 
 
+class CelestialBody:
+    """Something in one direction of the sky."""
+
+    ra_deg: float
+    dec_deg: float
+
+    @cached_property
+    def direction(self) -> npt.NDArray[np.float64]:
+        """Direction (3,) of its centre, ICRS."""
+        return icrs_vector(self.ra_deg, self.dec_deg)
+
+    @property
+    def radius_rad(self) -> float:
+        """Angular radius of its disc; 0 if it has none in the image."""
+        return 0.0
+
+
 @dataclass(frozen=True)
-class Moon:
+class Moon(CelestialBody):
     """The Moon: a saturated disc, and its light scattered in the lens.
 
     Attributes
@@ -48,9 +70,14 @@ class Moon:
     glare_share: float = 1e-3
     reach_deg: float = 180.0
 
+    @property
+    def radius_rad(self) -> float:
+        """Angular radius of its disc."""
+        return math.radians(self.diameter_deg) / 2.0
+
 
 @dataclass(frozen=True)
-class SunGlare:
+class SunGlare(CelestialBody):
     """Stray light of the Sun, which itself is outside the field of view.
 
     Attributes
@@ -73,7 +100,7 @@ class SunGlare:
 
 
 @dataclass(frozen=True)
-class EarthLimb:
+class EarthLimb(CelestialBody):
     """The Earth's disc in front of part of the sky.
 
     Attributes
@@ -102,9 +129,21 @@ class EarthLimb:
     sun_ra_deg: float | None = None
     sun_dec_deg: float | None = None
 
+    @cached_property
+    def sun_direction(self) -> npt.NDArray[np.float64] | None:
+        """Direction (3,) of the Sun that lights it, ICRS; None if all of the disc is lit."""
+        if self.sun_ra_deg is None or self.sun_dec_deg is None:
+            return None
+        return icrs_vector(self.sun_ra_deg, self.sun_dec_deg)
+
+    @property
+    def radius_rad(self) -> float:
+        """Angular radius of its disc."""
+        return math.radians(self.radius_deg)
+
 
 @dataclass(frozen=True)
-class PointSource:
+class PointSource(CelestialBody):
     """A planet, satellite or other point source that is not in the star catalogue.
 
     Attributes
@@ -303,17 +342,16 @@ def _flatten(value: Any) -> Iterator[Any]:
 
 def _check_fields(where: str, body: Any) -> None:
     """Check types and ranges of an object's fields."""
-    for name, default, low, high in _RULES[type(body)]:
+    for name, default, low, high, whole in _RULES[type(body)]:
         value = getattr(body, name)
+        if type(value) is float and low <= value <= high and not whole:
+            continue
         if type(default) is bool and not isinstance(value, bool):
             raise EmulatorError(f"sky {where} {name}: must be true or false, not {value!r}")
         if type(default) is str and not isinstance(value, str):
             raise EmulatorError(f"sky {where} {name}: must be a string, not {value!r}")
-        if type(value) is float and low <= value <= high and not isinstance(low, int):
-            continue
         if low > high or (value is None and default is None):
             continue
-        whole = isinstance(low, int)
         for number in _flatten(value):
             good = isinstance(number, int if whole else (int, float)) and not isinstance(number, bool)
             if not good or not low <= number <= high:
@@ -321,15 +359,16 @@ def _check_fields(where: str, body: Any) -> None:
                 raise EmulatorError(f"sky {where} {name}: must be {kind} {low:g}…{high:g}, not {number!r}")
 
 
-def _field_rules(kind: Any) -> tuple[tuple[str, Any, float, float], ...]:
-    """Name, default and range of each field of a class; a range from above to below is none."""
+def _field_rules(kind: Any) -> tuple[tuple[str, Any, float, float, bool], ...]:
+    """Name, default and range of each field of a class, and whether it is a whole number; from above to below is no range."""
+    ranges = [_RANGES.get(field.name, (math.inf, -math.inf)) for field in dataclasses.fields(kind)]
     return tuple(
-        (field.name, field.default, *_RANGES.get(field.name, (math.inf, -math.inf)))
-        for field in dataclasses.fields(kind)
+        (field.name, field.default, low, high, isinstance(low, int))
+        for field, (low, high) in zip(dataclasses.fields(kind), ranges, strict=True)
     )
 
 
-_RULES: Final[dict[type, tuple[tuple[str, Any, float, float], ...]]] = {
+_RULES: Final = {
     kind: _field_rules(kind) for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
 }
 """Rules of the fields of each class of objects."""

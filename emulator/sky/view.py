@@ -16,7 +16,6 @@ from starhil.emulator.sky.ephemeris import (
     moon_seen_by,
     planets_seen_by,
     sun_seen_by,
-    visible_share_of_sun,
 )
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 
@@ -123,13 +122,11 @@ class Sky:
         changes: dict[str, Any] = {"planets": objects.planets + planets_seen_by(observer)}
         earth = objects.earth or earth_seen_by(observer, self._styles["earth"])
         changes["earth"] = earth
-        share = visible_share_of_sun(observer, earth)
-        if objects.sun is None and share > 0.0:
-            sun = sun_seen_by(observer, self._styles["sun"])
-            changes["sun"] = dataclasses.replace(sun, electrons_s=share * sun.electrons_s)
+        if objects.sun is None:
+            changes["sun"] = sun_seen_by(observer, self._styles["sun"], earth)
         if objects.moon is None:
             moon = moon_seen_by(observer, self._styles["moon"])
-            if not hidden_by(earth, moon.ra_deg, moon.dec_deg):
+            if not hidden_by(earth, moon):
                 changes["moon"] = moon
         return dataclasses.replace(objects, **changes)
 

@@ -45,12 +45,12 @@ LATEST_UNIX_S: Final = 4_102_444_800.0
 
 
 def unix_time(value: object) -> float:
-    """Return the Unix time of a date: a TOML date-time, ISO 8601 text, or Unix time; UTC unless it has an offset.
+    """Return the Unix time of a date: a TOML date-time, ISO 8601 text, or Unix time; UTC without an offset.
 
     Raises
     ------
     ValueError
-        It is not a date from 1970 to 2100.
+        The value is not a date from 1970 to 2100.
     """
     number = value
     if isinstance(value, str):
@@ -66,7 +66,7 @@ def unix_time(value: object) -> float:
 
 
 Date: TypeAlias = Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S), BeforeValidator(unix_time)]
-"""A date in UTC, held as Unix time."""
+"""A date in UTC, stored as Unix time."""
 
 
 class Strict(BaseModel):
@@ -85,7 +85,7 @@ class AttitudeConfig(Strict):
     roll_deg: Turn | None = None
     """Angle by which celestial north is turned counter-clockwise in the image; default: 0."""
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
-    """Unit quaternion, ICRS to sensor, scalar last; instead of the angles."""
+    """Unit quaternion, ICRS to sensor, scalar last, instead of the angles."""
 
     @model_validator(mode="after")
     def _one_form(self) -> Self:
@@ -107,25 +107,25 @@ class AttitudeConfig(Strict):
 
 
 DEFAULT_ATTITUDE = AttitudeConfig(ra_deg=83.8, dec_deg=-1.2, roll_deg=0.0)
-"""Orion: bright stars, and easy to recognise in an image."""
+"""Orion, which is easy to recognise in an image."""
 
 
 Angle: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
 Row: TypeAlias = Annotated[list[Annotated[float, Field(ge=-1.0, le=1.0)]], Field(min_length=3, max_length=3)]
 
 ORTHONORMAL: Final = 1e-4
-"""Largest error of a mount's matrix that is attributed to rounding."""
+"""Largest error of a mount matrix that is attributed to rounding."""
 
 
 class MountConfig(Strict):
-    """How the sensor sits in the body: the rotation from the body frame to the sensor frame, in one of three forms."""
+    """Mount of the sensor: the rotation from the body frame to the sensor frame, in one of three forms."""
 
     quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
-    """Quaternion body to sensor, scalar last, of length 1: it rotates vectors, v_sensor = q ⊗ v_body ⊗ q*."""
+    """Quaternion body to sensor, scalar last, of length 1; it rotates vectors: v_sensor = q ⊗ v_body ⊗ q*."""
     matrix: Annotated[list[Row], Field(min_length=3, max_length=3)] | None = None
-    """The sensor's x, y and z axis in the body frame, as three rows."""
+    """The sensor's x, y and z axes in the body frame, as three rows."""
     euler_deg: Annotated[list[Angle], Field(min_length=3, max_length=3)] | None = None
-    """Angles of the successive rotations from the body axes to the sensor's, in 42's convention."""
+    """Angles of the successive rotations from the body axes to the sensor axes, in the convention of 42."""
     sequence: Annotated[str, Field(pattern="^[123]{3}$")] = "321"
     """Axes of `euler_deg`: 1 is x, 2 is y, 3 is z."""
 
@@ -133,7 +133,7 @@ class MountConfig(Strict):
     def _one_form(self) -> Self:
         forms = (self.quaternion_xyzw, self.matrix, self.euler_deg)
         if sum(form is not None for form in forms) != 1:
-            raise ValueError("give quaternion_xyzw, matrix or euler_deg, one of them")
+            raise ValueError("give one of quaternion_xyzw, matrix and euler_deg")
         if self.quaternion_xyzw is not None and abs(math.hypot(*self.quaternion_xyzw) - 1.0) > 0.01:
             raise ValueError("quaternion_xyzw is not of length 1")
         if self.matrix is not None:
@@ -163,11 +163,11 @@ class FixedConfig(Strict):
     """An attitude that does not change."""
 
     kind: Literal["fixed"]
-    """Which truth source this is."""
+    """Selects this truth source."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """The attitude."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then the body's."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
@@ -178,13 +178,13 @@ class RateConfig(Strict):
     """A rotation at a constant body rate, starting from an attitude."""
 
     kind: Literal["rate"]
-    """Which truth source this is."""
+    """Selects this truth source."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude at the start."""
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then the body's."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the rotation begins now."""
@@ -195,9 +195,9 @@ class HoldConfig(Strict):
     """Hold the attitude for a time."""
 
     do: Literal["hold"]
-    """Which segment this is."""
+    """Selects this segment."""
     seconds: SegmentSeconds
-    """How long."""
+    """Duration."""
 
     def build(self) -> Segment:
         """Make the segment."""
@@ -208,9 +208,9 @@ class TurnConfig(Strict):
     """Rotate at a constant body rate for a time."""
 
     do: Literal["rate"]
-    """Which segment this is."""
+    """Selects this segment."""
     seconds: SegmentSeconds
-    """How long."""
+    """Duration."""
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
 
@@ -223,11 +223,11 @@ class SlewToConfig(Strict):
     """Slew about one axis to an attitude, from rest to rest."""
 
     do: Literal["slew"]
-    """Which segment this is."""
+    """Selects this segment."""
     to: AttitudeConfig
     """Attitude at the end."""
     max_rate_deg_s: Annotated[float, Field(ge=1e-6, le=100.0)]
-    """Highest body rate."""
+    """Maximum body rate."""
     shape: Literal["smooth", "limited"] = "smooth"
     """Rate over time: `smooth` (no jump in acceleration), or `limited` (constant acceleration, constant rate,
     constant deceleration)."""
@@ -251,15 +251,15 @@ class SlewConfig(Strict):
     """A sequence of holds, constant rates and slews."""
 
     kind: Literal["slew"]
-    """Which truth source this is."""
+    """Selects this truth source."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude at the start."""
     segments: Annotated[list[SegmentConfig], Field(min_length=1)]
-    """Segments, one after the other."""
+    """Segments in order."""
     repeat: bool = False
-    """Begin again after the last segment."""
+    """Whether to start again after the last segment."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then the body's."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -271,15 +271,15 @@ class FileConfig(Strict):
     """A table of times and attitudes; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
-    """Which truth source this is."""
+    """Selects this truth source."""
     path: str
     """CSV file of times and attitudes."""
     start: Literal["run", "now"] = "run"
-    """Time zero of the file: the start of the run, or the time at which the source is set."""
+    """Time zero of the file: the start of the run, or the time at which the truth is set."""
     repeat: bool = False
-    """Begin again after the last row."""
+    """Whether to start again after the last row."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth is then the body's."""
+    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
@@ -291,39 +291,39 @@ class LiveConfig(Strict):
     """A feed of JSON lines in the format of `starhil.emulator.truth.feed_message`."""
 
     kind: Literal["live"]
-    """Which truth source this is."""
+    """Selects this truth source."""
     protocol: Literal["udp", "tcp"] = "udp"
     """Transport of the feed."""
     host: str = "127.0.0.1"
-    """Address to listen at."""
+    """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 0
-    """Port to listen at; 0 for a free one, which the ready line names."""
+    """Port to listen on; 0 for a free one, which is given on the ready line."""
     convention: Literal["rotation", "attitude"] = "rotation"
-    """What `q` is: `rotation` rotates vectors from ICRS to the body, `attitude` is its conjugate, as in 42,
-    Basilisk and most textbooks."""
+    """Convention of `q`: `rotation` rotates vectors from ICRS to the body, `attitude` is the conjugate, as in
+    42, Basilisk and most textbooks."""
     order: Literal["xyzw", "wxyz"] = "xyzw"
     """Position of the scalar in `q`: last or first."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
     """Silence after which the attitude is held and flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
-    """What `t` of a message means: `anchor` ties the first message to its arrival, `run` takes `t` as seconds
-    of simulation time."""
+    """Meaning of `t` in a message: with `anchor`, the first message refers to its time of arrival; with
+    `run`, `t` is simulation time in seconds."""
     lockstep: bool = False
-    """Each message advances the stepped clock to its `t`, and is then answered by a line; over TCP only."""
+    """Whether each message advances the stepped clock to its `t` and is then answered; TCP only."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
     """Attitude before the first message."""
     mount: MountConfig | None = None
-    """Mount of the sensor on the body; the messages then describe the body."""
+    """Mount of the sensor on the body; the messages are then about the body."""
 
     @model_validator(mode="after")
     def _answers_have_a_way_back(self) -> Self:
         if self.lockstep and self.protocol != "tcp":
-            raise ValueError('lockstep needs protocol = "tcp", as each message is answered')
+            raise ValueError('lockstep needs protocol = "tcp", because each message is answered')
         return self
 
     @property
     def socket(self) -> Socket:
-        """How the feed is reached."""
+        """Socket of the feed."""
         return "udp" if self.protocol == "udp" else "listen"
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
@@ -337,20 +337,20 @@ class LiveConfig(Strict):
 
 
 class Config42(Strict):
-    """The simulator 42, over its socket (`Inp_IPC.txt`, mode TX); on the stepped clock in lock-step with it."""
+    """The simulator 42, over its socket (`Inp_IPC.txt`, mode TX); in lock-step on the stepped clock."""
 
     kind: Literal["42"]
-    """Which truth source this is."""
+    """Selects this truth source."""
     role: Literal["client", "server"] = "client"
-    """`client` connects to 42, where `Inp_IPC.txt` says SERVER; `server` listens, where it says CLIENT."""
+    """`client` connects to 42 (SERVER in `Inp_IPC.txt`); `server` listens (CLIENT in `Inp_IPC.txt`)."""
     host: str = "127.0.0.1"
-    """Address of 42, or to listen at."""
+    """Address of 42, or address to listen on."""
     port: Annotated[int, Field(ge=0, le=65535)] = 4242
-    """Its port; 0 listens at a free one, which the ready line names."""
+    """Port; 0 to listen on a free one, which is given on the ready line."""
     spacecraft: Annotated[int, Field(ge=0, le=999)] = 0
     """Number of the spacecraft, i of `SC[i]`."""
     orbit: Annotated[int, Field(ge=0, le=999)] = 0
-    """Number of its reference orbit, i of `Orb[i]`."""
+    """Number of the reference orbit, i of `Orb[i]`."""
     stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
     """Silence after which the attitude is held and flagged `stale`."""
     attitude: AttitudeConfig = DEFAULT_ATTITUDE
@@ -366,7 +366,7 @@ class Config42(Strict):
 
     @property
     def socket(self) -> Socket:
-        """How the feed is reached."""
+        """Socket of the feed."""
         return "connect" if self.role == "client" else "listen"
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
@@ -380,7 +380,7 @@ class Config42(Strict):
 
 
 FeedConfig: TypeAlias = LiveConfig | Config42
-"""A truth that comes over a socket."""
+"""A truth source with a socket."""
 
 TruthConfig: TypeAlias = Annotated[
     FixedConfig | RateConfig | SlewConfig | FileConfig | LiveConfig | Config42, Field(discriminator="kind")
@@ -396,26 +396,26 @@ class KeplerConfig(Strict):
     """Keplerian elements, relative to the GCRS equator and equinox."""
 
     kind: Literal["kepler"]
-    """How the orbit is given."""
+    """Selects this form of the orbit."""
     semi_major_axis_km: Annotated[float, Field(ge=6378.137, le=1e6)]
-    """Half the length of the ellipse; 6878 for an altitude of 500 km."""
+    """Semi-major axis; 6878 for an altitude of 500 km."""
     eccentricity: Annotated[float, Field(ge=0.0, le=LARGEST_ECCENTRICITY)] = 0.0
-    """Shape of the ellipse."""
+    """Eccentricity."""
     inclination_deg: Annotated[float, Field(ge=0.0, le=180.0)]
-    """Angle between orbit and equator."""
+    """Inclination to the equator."""
     raan_deg: OrbitAngle = 0.0
     """Right ascension of the ascending node."""
     argument_of_perigee_deg: OrbitAngle = 0.0
-    """Angle from the ascending node to the perigee."""
+    """Argument of perigee."""
     mean_anomaly_deg: OrbitAngle = 0.0
     """Mean anomaly at the date."""
     date: Date | None = None
-    """Date of these values; default: the date at which the run starts."""
+    """Date of these values; default: the start date of the run."""
     j2: bool = True
-    """Let node and perigee drift at the secular rates of the Earth's oblateness."""
+    """Whether node and perigee drift at the secular rates due to the Earth's oblateness."""
 
     def build(self, start_unix_s: float) -> Orbit:
-        """Make the orbit of a run that starts at a Unix time."""
+        """Make the orbit for a run that starts at a Unix time."""
         return KeplerOrbit(
             start_unix_s if self.date is None else self.date,
             1e3 * self.semi_major_axis_km,
@@ -432,18 +432,18 @@ class StateConfig(Strict):
     """Position and velocity at one time, relative to the Earth's centre, GCRS."""
 
     kind: Literal["state"]
-    """How the orbit is given."""
+    """Selects this form of the orbit."""
     position_m: Annotated[list[Metres], Field(min_length=3, max_length=3)]
     """Position."""
     velocity_m_s: Annotated[list[MetresPerSecond], Field(min_length=3, max_length=3)]
     """Velocity."""
     date: Date | None = None
-    """Date of these values; default: the date at which the run starts."""
+    """Date of these values; default: the start date of the run."""
     j2: bool = True
-    """Let node and perigee drift at the secular rates of the Earth's oblateness."""
+    """Whether node and perigee drift at the secular rates due to the Earth's oblateness."""
 
     def build(self, start_unix_s: float) -> Orbit:
-        """Make the orbit of a run that starts at a Unix time."""
+        """Make the orbit for a run that starts at a Unix time."""
         state = OrbitState(np.array(self.position_m), np.array(self.velocity_m_s))
         return KeplerOrbit.from_state(start_unix_s if self.date is None else self.date, state, j2=self.j2)
 
@@ -452,14 +452,14 @@ class TleConfig(Strict):
     """A two-line element set, propagated by SGP4."""
 
     kind: Literal["tle"]
-    """How the orbit is given."""
+    """Selects this form of the orbit."""
     line1: str
     """First line, 69 characters."""
     line2: str
     """Second line, 69 characters."""
 
     def build(self, start_unix_s: float) -> Orbit:
-        """Make the orbit; it must be possible to propagate it to the start of the run."""
+        """Make the orbit, which must be valid at the start of the run."""
         orbit = TleOrbit(self.line1, self.line2)
         orbit.state(start_unix_s)
         return orbit

@@ -1,4 +1,4 @@
-"""The sockets of a live feed: UDP, or TCP to which the simulator connects or which connects to it."""
+"""The sockets of a live feed: UDP, or TCP as server or client of the simulator."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class LiveFeed:
         Raises
         ------
         EmulatorError
-            The address is not available to listen at.
+            The address to listen on is not available.
         """
         if socket == "connect":
             self._client = asyncio.create_task(self._keep_connected(host, port))
@@ -97,12 +97,12 @@ class LiveFeed:
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, data: bytes) -> None:
-        """Process one message received now."""
+        """Process one received message."""
         self._message_received(data)
         self.truth.receive(data, self._now_s())
 
     async def process(self, data: bytes) -> str:
-        """Process one message, in lock-step if that is wanted; return the fault of one rejected in lock-step."""
+        """Process one message; return the fault of a message rejected in lock-step."""
         if self._lock_step is None:
             self.receive(data)
             return ""
@@ -114,7 +114,7 @@ class LiveFeed:
             self._on_message(data)
 
     async def _keep_connected(self, host: str, port: int) -> None:
-        """Connect to a simulator that listens, again whenever it is gone."""
+        """Connect to a simulator that listens, and reconnect after a loss."""
         reported = False
         while True:
             try:
@@ -145,7 +145,7 @@ class LiveFeed:
             writer.close()
 
     async def _answer(self, data: bytes, writer: asyncio.StreamWriter) -> None:
-        """Process one message from a connection, and answer it if its sender expects an answer."""
+        """Process one message from a connection, and answer it if the sender expects this."""
         fault = await self.process(data)
         if self._lock_step is not None or self.truth.format.always_answers:
             writer.write(self.truth.format.answer(self._now_s(), fault))

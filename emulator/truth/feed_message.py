@@ -1,4 +1,4 @@
-"""Messages of a live feed, and their form as JSON lines.
+"""Messages of a live feed, and their format as JSON lines.
 
 ::
 
@@ -7,18 +7,18 @@
 ``t``
     Seconds on the sender's clock, increasing. Optional; default: time of receipt.
 ``q``
-    Quaternion between ICRS and body, of length 1 within 1 %. With ``convention = "rotation"`` it rotates
-    vectors (v_body = q ⊗ v_icrs ⊗ q*), with ``"attitude"`` it is the conjugate, as the attitude quaternions
-    of 42, Basilisk and most textbooks. ``order`` is ``"xyzw"`` (scalar last) or ``"wxyz"``.
+    Quaternion between ICRS and body, of length 1 within 1 %. With ``convention = "rotation"`` it rotates vectors
+    (v_body = q ⊗ v_icrs ⊗ q*), with ``"attitude"`` it is the conjugate, like the attitude quaternions of 42,
+    Basilisk and most textbooks. ``order`` is ``"xyzw"`` (scalar last) or ``"wxyz"``.
 ``rate``
     Body rate in the body frame, degrees per second, at most `MAX_RATE_DEG_S` per axis. Optional;
     default: derived from the last two messages, or without ``t`` from messages at least
     `starhil.emulator.truth.feed_rates.RECEIPT_BASELINE_S` apart.
 ``position_m``, ``velocity_m_s``
-    Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, both
-    or none.
+    Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, but only
+    together.
 ``unix_s``
-    Date, as Unix time. Optional; default: the run's.
+    Date, as Unix time. Optional; default: the date of the run.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
 from starid.attitude import Attitude
 
 NORM_TOLERANCE: Final = 0.01
-"""Largest error of a quaternion's length that is attributed to rounding."""
+"""Largest error of the length of a quaternion that is attributed to rounding."""
 
 KEYS: Final = ("t", "q", "rate", "position_m", "velocity_m_s", "unix_s")
 
@@ -70,7 +70,7 @@ class FeedMessage:
 
 
 class FeedFormat(Protocol):
-    """How the messages of a feed are written, and answered in lock-step."""
+    """Format of the messages of a feed, and of the answers in lock-step."""
 
     @property
     def end(self) -> bytes:
@@ -86,7 +86,7 @@ class FeedFormat(Protocol):
         Raises
         ------
         FeedError
-            It is not valid; the text names the key.
+            The message is invalid; the text names the key.
         """
 
     def answer(self, run_time_s: float, fault: str) -> bytes:
@@ -99,7 +99,7 @@ class FeedFormat(Protocol):
 
 @dataclass(frozen=True)
 class JsonFormat:
-    """JSON objects, one per line; see the module."""
+    """JSON objects, one per line; see the module docstring."""
 
     convention: Convention = "rotation"
     order: Order = "xyzw"
@@ -139,7 +139,7 @@ class JsonFormat:
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:
-        """Return a line: `ok`, the simulation time, and the fault of a rejected message."""
+        """Return a line with `ok`, the simulation time, and the fault of a rejected message."""
         body = {"ok": not fault, "run_time_s": run_time_s, **({"error": fault} if fault else {})}
         return json.dumps(body).encode() + b"\n"
 
@@ -150,7 +150,7 @@ def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) 
     Raises
     ------
     FeedError
-        It is not of length 1.
+        The quaternion is not of length 1.
     """
     if not abs(float(np.linalg.norm(quaternion_xyzw)) - 1.0) <= NORM_TOLERANCE:
         raise FeedError(f"{key} is not of length 1")
@@ -165,7 +165,7 @@ def checked_rate(key: str, rate_rad_s: Vector | None) -> Vector | None:
     Raises
     ------
     FeedError
-        It is above `MAX_RATE_DEG_S`.
+        The rate is above `MAX_RATE_DEG_S`.
     """
     if rate_rad_s is not None and not np.degrees(np.abs(rate_rad_s).max()) <= MAX_RATE_DEG_S * (1.0 + 1e-12):
         raise FeedError(f"{key} exceeds {MAX_RATE_DEG_S:g} degrees per second")
@@ -187,5 +187,5 @@ def _numbers(key: str, value: object, count: int) -> Vector:
         raise FeedError(f"{key} is not {count} numbers")
     for number in value:
         if isinstance(number, bool) or not isinstance(number, (int, float)) or not abs(number) < 1e15:
-            raise FeedError(f"{key} holds {number!r}, not a finite number")
+            raise FeedError(f"{key}: {number!r} is not a finite number")
     return np.array(value, dtype=np.float64)

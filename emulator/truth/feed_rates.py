@@ -1,8 +1,8 @@
 """Body rates of a live feed: derived from its attitudes, or checked against them.
 
-Attitudes and rates that contradict each other reveal a sender with another convention: a conjugated or
-reordered quaternion, rates in radians or in another frame. Each message is checked against the ones
-before it, accepted or not, so a single jump costs one message and a wrong convention all but the first.
+Contradictions between attitudes and rates reveal a wrong convention: a conjugated or reordered quaternion, rates in
+radians or in another frame. Each message is checked against earlier ones, whether accepted or not, so a single jump
+causes one rejection, and a wrong convention causes the rejection of all messages except the first.
 """
 
 from __future__ import annotations
@@ -22,14 +22,13 @@ SHORTEST_S: Final = 1e-9
 """Shortest time between two messages, seconds: the resolution of simulation time."""
 
 RECEIPT_BASELINE_S: Final = 0.05
-"""Shortest time over which a rate is derived from times of receipt, seconds: messages may arrive in
-bursts."""
+"""Shortest time over which a rate is derived from times of receipt, seconds; longer than a burst."""
 
 NOISE_RAD: Final = math.radians(0.01)
-"""Tolerated error of attitudes when they are compared with a rate, radians."""
+"""Tolerated error of attitudes in comparisons with a rate, radians."""
 
 CONCLUSIVE_RAD: Final = 2.0 * NOISE_RAD
-"""Smallest rotation that is compared with a rate at once, radians."""
+"""Smallest rotation that is compared with a rate immediately, radians."""
 
 AMBIGUOUS_RAD: Final = 2.0
 """Rotation between two messages above which its direction is ambiguous, radians."""
@@ -38,7 +37,7 @@ PATIENCE_S: Final = 1.0
 """Time after which smaller rotations are compared too, seconds."""
 
 TIME_FACTOR: Final = 8.0
-"""Tolerated factor of a sender's time steps: it may repeat an attitude until the next one is computed."""
+"""Tolerated factor of a sender's time steps, because it may repeat an attitude until the next is computed."""
 
 DIRECTION_TOLERANCE: Final = 0.5
 """Tolerated difference in direction, as a fraction of the expected rotation."""
@@ -61,8 +60,8 @@ class FeedRates:
     Parameters
     ----------
     timed
-        Whether times are the sender's; otherwise they are times of receipt, and only the directions of
-        rotations are checked.
+        Whether times are from the sender's clock; otherwise they are times of receipt, and only the
+        directions of rotations are checked.
     """
 
     def __init__(self, *, timed: bool) -> None:
@@ -76,7 +75,7 @@ class FeedRates:
         self._contradicts = False
 
     def body_rate(self, at_s: float, attitude: Attitude, given_rad_s: Vector | None) -> Vector:
-        """Return the body rate of the next message, rad/s on the time scale of `at_s`.
+        """Return the body rate in the next message, rad/s on the time scale of `at_s`.
 
         Raises
         ------
@@ -138,7 +137,7 @@ class FeedRates:
             )
 
     def _disagree(self, turned: Vector) -> bool:
-        """Whether the rotation since the reference contradicts the rates received since."""
+        """Return whether the rotation since the reference contradicts the received rates."""
         length, expected = float(np.linalg.norm(turned)), float(np.linalg.norm(self._expected))
         if max(length, expected) > AMBIGUOUS_RAD:
             return False

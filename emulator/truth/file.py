@@ -4,13 +4,13 @@ The file is CSV with one header line. Columns, in any order:
 
 - ``t``: simulation time in seconds, increasing from row to row;
 - either ``qx, qy, qz, qw`` (quaternion ICRS→sensor, scalar last) or ``ra_deg, dec_deg, roll_deg``;
-- optional ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them the rate between
-  two rows is the constant rate that leads from one to the next;
-- optional ``x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s``: position and velocity relative to the Earth's centre,
-  GCRS, interpolated by cubics.
+- optional ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them, the rate between two rows is
+  constant;
+- optional ``x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s``: position and velocity relative to the Earth's centre, GCRS,
+  with cubic interpolation.
 
-A truth log (`starhil run --truth-log`) is accepted too, so that a run can be replayed: its columns
-``run_time_s``, ``true_qx`` … ``true_qw`` and ``true_wx_deg_s`` … are used, the others ignored.
+A truth log (`starhil run --truth-log`) is accepted too, to repeat a run: the columns ``run_time_s``, ``true_qx`` …
+``true_qw`` and ``true_wx_deg_s`` … are used, the others ignored.
 
 Empty lines and lines that begin with ``#`` are ignored.
 """
@@ -45,10 +45,10 @@ LOG_COLUMNS: Final = {
 """Column of a truth log → column of a truth file."""
 
 NORM_TOLERANCE: Final = 0.01
-"""Largest error of a quaternion's length that is attributed to rounding."""
+"""Largest error of the length of a quaternion that is attributed to rounding."""
 
 MAX_BYTES: Final = 500 * MEGABYTE
-"""Largest truth file that is read: a day at 50 rows per second."""
+"""Maximum size of a truth file: a day at 50 rows per second."""
 
 BOUNDS: Final = {
     "t": 1e9,
@@ -77,7 +77,7 @@ class FileTruth:
     start_s
         Simulation time of the file's time zero.
     repeat
-        Restart after the last row.
+        Whether to start again after the last row.
     orbit
         Position and velocity of each row; None if the file has none.
     """
@@ -143,13 +143,14 @@ class FileTruth:
 def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -> FileTruth:
     """Read a truth file.
 
-    Messages never quote the file: a client of the control channel may name files it is not allowed to read.
+    Messages do not quote the file, because a client of the control channel may name files that it must not
+    read.
 
     Raises
     ------
     EmulatorError
-        The file cannot be read, lacks columns, or a row is not numeric, not a rotation, or not later than
-        the row before; the message names the line.
+        The file cannot be read or lacks columns, or a row is not numeric, not a rotation, or not later than
+        the previous row; the message names the line.
     """
     try:
         text = read_text(path, MAX_BYTES)
@@ -176,7 +177,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
         where = f"truth file {path} line {number}"
         row = _parse_row(where, columns, line)
         if times and row["t"] <= times[-1]:
-            raise EmulatorError(f"{where}: t is not later than in the row before")
+            raise EmulatorError(f"{where}: t is not later than in the previous row")
         times.append(row["t"])
         attitudes.append(_attitude(where, needed, row))
         if has_orbit:
@@ -190,7 +191,7 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
             rate = np.degrees(rate_between(attitudes[-2], attitudes[-1], times[-1] - times[-2]))
             if np.abs(rate).max() > MAX_RATE_DEG_S:
                 raise EmulatorError(
-                    f"{where}: the turn from the row before is faster than {MAX_RATE_DEG_S:g} degrees per second; "
+                    f"{where}: the rotation from the previous row is faster than {MAX_RATE_DEG_S:g} degrees per second; "
                     f"give {', '.join(RATE_COLUMNS)} if the attitude jumps"
                 )
     if not times:
@@ -221,7 +222,7 @@ def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
         raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(known))}")
     twice = [name for name in columns if name and columns.count(name) > 1]
     if twice:
-        raise EmulatorError(f"{where}: column {twice[0]} appears twice; leave one out")
+        raise EmulatorError(f"{where}: column {twice[0]} appears twice; remove one")
     for group in (RATE_COLUMNS, ORBIT_COLUMNS):
         missing = [name for name in group if name not in columns]
         if 0 < len(missing) < len(group):

@@ -1,19 +1,19 @@
 """Truth from a live feed: a dynamics simulator sends attitudes as it computes them.
 
 Messages are JSON lines (`starhil.emulator.truth.feed_message`) or the blocks of 42
-(`starhil.emulator.truth.simulator_42`). A rate that contradicts the attitudes makes a bad message
+(`starhil.emulator.truth.simulator_42`). A message whose rate contradicts the attitudes is rejected
 (`starhil.emulator.truth.feed_rates`).
 
 The first message sets the offset between the sender's clock and simulation time; drift is tracked
-(`starhil.emulator.truth.sender_clock`) and rates are scaled accordingly. With ``timeline = "run"`` in the
-profile, ``t`` is simulation time.
+(`starhil.emulator.truth.sender_clock`) and rates are scaled accordingly. With ``timeline = "run"`` in the profile,
+``t`` is simulation time.
 
-Between two messages the attitude is interpolated. After the last one it is propagated at the last rate for
-at most ``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the
-last ``t`` is older than that.
+Between two messages the attitude is interpolated. After the last one it is propagated at the last rate for at most
+``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the last ``t`` is
+older than this.
 
-A bad message is counted, logged (the 1st, 10th, 100th …) and otherwise ignored. A ``t`` that does not
-increase makes a bad message, except that a jump back by more than `RESTART_S` starts a new timeline.
+A rejected message is counted, logged (the 1st, 10th, 100th …) and otherwise ignored. Messages whose ``t`` does not
+increase are rejected, except that a jump back by more than `RESTART_S` starts a new timeline.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from starid.attitude import Attitude, interpolate, propagate
 log = logging.getLogger("starhil.truth")
 
 HISTORY: Final = 512
-"""Number of messages kept, for exposures whose midpoint has already passed."""
+"""Number of messages kept for exposures whose midpoint is in the past."""
 
 RESTART_S: Final = 1.0
-"""A sender's time that jumps back by more than this starts a new timeline, seconds."""
+"""Jump back of the sender's time that starts a new timeline, seconds."""
 
 
 class LiveTruth:
@@ -52,10 +52,10 @@ class LiveTruth:
     stale_s
         Silence, in seconds of simulation time, after which the attitude is held and flagged stale.
     timeline
-        `anchor`: the first message sets the offset of the sender's clock; `run`: the sender uses
-        simulation time.
+        `anchor`: the first message sets the offset of the sender's clock; `run`: the sender uses simulation
+        time.
     message_format
-        How messages are written; JSON lines by default.
+        Format of messages; default: JSON lines.
     kind
         Kind of source, as named in a profile.
     """
@@ -80,14 +80,14 @@ class LiveTruth:
         self._clock = SenderClock()
         self._rates = FeedRates(timed=True)
         self._last_t: float | None = None
-        """The sender's time in the last message with a time."""
+        """Sender's time in the last message with a time."""
         self._received_s = 0.0
         """Simulation time at which the last message was accepted."""
         self._times: deque[float] = deque(maxlen=HISTORY)
         self._states: deque[TruthState] = deque(maxlen=HISTORY)
 
     def receive(self, data: bytes | str, received_s: float) -> bool:
-        """Process what was received at a simulation time in seconds; return whether it was accepted."""
+        """Process data received at a simulation time in seconds; return whether the message was accepted."""
         try:
             message = self.format.decode(data)
         except FeedError as fault:
@@ -106,7 +106,7 @@ class LiveTruth:
         return True
 
     def reject(self, fault: str) -> None:
-        """Count a bad message and keep its fault in `last_fault`."""
+        """Count a rejected message and keep its fault in `last_fault`."""
         self.refused += 1
         self.last_fault = fault
         if str(self.refused).rstrip("0") == "1":
@@ -133,7 +133,7 @@ class LiveTruth:
         self._states.append(TruthState(message.attitude, rate, orbit=message.orbit, unix_s=message.unix_s))
 
     def _repeats_the_last(self, message: FeedMessage) -> bool:
-        """Whether a message is the last one again, as simulators send at their start."""
+        """Return whether a message repeats the last one, as simulators do at their start."""
         return (
             bool(self._states)
             and message.t == self._last_t
@@ -145,18 +145,18 @@ class LiveTruth:
         if self._last_t is None or t >= self._last_t + SHORTEST_S:
             return
         if self._last_t - t <= RESTART_S:
-            raise FeedError(f"t = {t} is not later than the message before")
+            raise FeedError(f"t = {t} is not later than in the previous message")
         self.begin_timeline()
 
     def begin_timeline(self) -> None:
-        """Forget the messages and the sender's clock, as the sender has started again."""
+        """Discard the messages and the sender's clock, because the sender has restarted."""
         self._last_t = None
         self._times.clear()
         self._states.clear()
         self._clock, self._rates = SenderClock(), FeedRates(timed=True)
 
     def _drop_superseded(self, t: float, *, timed: bool) -> None:
-        """Drop messages that a new one replaces: one received at the same time, or an abandoned timeline."""
+        """Drop messages replaced by a new one: one received at the same time, or an abandoned timeline."""
         if not self._times or t >= self._times[-1] + SHORTEST_S:
             return
         if not timed and t >= self._times[-1]:
@@ -166,7 +166,7 @@ class LiveTruth:
             self._times.clear()
             self._states.clear()
         else:
-            raise FeedError(f"its time is {self._times[-1] - t:.3g} s before that of the message before")
+            raise FeedError(f"its time is {self._times[-1] - t:.3g} s before the previous message's")
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
@@ -188,7 +188,7 @@ class LiveTruth:
 
 
 def _moved_on(last: TruthState, seconds: float) -> TruthState:
-    """Return a state propagated at its rates."""
+    """Return a state propagated at its rate."""
     orbit = last.orbit
     return replace(
         last,
@@ -200,7 +200,7 @@ def _moved_on(last: TruthState, seconds: float) -> TruthState:
 
 
 def _between(before: TruthState, after: TruthState, fraction: float, span_s: float) -> TruthState:
-    """Return the state a fraction of the way between two that are `span_s` seconds apart."""
+    """Interpolate between two states that are `span_s` seconds apart."""
     orbit = None
     if before.orbit is not None and after.orbit is not None:
         orbit = interpolate_orbit(before.orbit, after.orbit, fraction, span_s)

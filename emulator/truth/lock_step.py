@@ -1,8 +1,8 @@
 """Lock-step with a simulator: each message advances the simulation clock to its time, and is then answered.
 
-The first message is the truth now. Each later one is the truth at the end of the step that it causes, so
-that exposures within the step lie between two messages. The simulator waits for the answer; time in the
-emulator passes no faster and no slower than there, and the same messages give the same bytes.
+The first message is the current truth. Each later message is the truth at the end of the step that it causes, so
+that exposures within the step are between two messages. The simulator waits for the answer: both have the same
+time, and the same messages give the same bytes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
 from starhil.emulator.truth.live import RESTART_S, LiveTruth
 
 Step = Callable[[float], Awaitable[None]]
-"""Advances simulation time by a number of seconds; returns when all events within are done."""
+"""Advances simulation time by a number of seconds; returns when all events within the step are done."""
 
 
 class LockStep:
@@ -25,11 +25,11 @@ class LockStep:
     Parameters
     ----------
     truth
-        Receives the messages; the run follows its timeline.
+        Receives the messages, which set the timeline of the run.
     now_s
         Returns the simulation time in seconds.
     step
-        Advances it.
+        Advances the simulation time.
     """
 
     def __init__(self, truth: LiveTruth, now_s: Callable[[], float], step: Step) -> None:
@@ -41,7 +41,7 @@ class LockStep:
         self._lock = asyncio.Lock()
 
     async def receive(self, data: bytes) -> str:
-        """Process one message; return the fault of a rejected one, else an empty text."""
+        """Process one message; return the fault of a rejected message, otherwise an empty text."""
         async with self._lock:
             try:
                 return await self._process(data)
@@ -61,7 +61,7 @@ class LockStep:
         if last is not None and abs(step_s) < SHORTEST_S:
             return ""  # a simulator may repeat its first message
         if step_s < 0.0:
-            raise FeedError(f"t = {message.t} is not later than the message before")
+            raise FeedError(f"t = {message.t} is not later than in the previous message")
         self._last_t = message.t
         accepted = self._truth.accept(replace(message, t=now + step_s), now)
         if step_s > 0.0:

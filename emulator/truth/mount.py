@@ -1,4 +1,4 @@
-"""The truth of a sensor, from the truth of the body that it is mounted on."""
+"""The truth of a sensor, from the truth of the body on which it is mounted."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from starid.attitude import Attitude
 
 @dataclass(frozen=True)
 class MountedTruth:
-    """The truth of a sensor at a fixed mount.
+    """The truth of a sensor with a fixed mount.
 
     Attributes
     ----------
@@ -25,7 +25,7 @@ class MountedTruth:
 
     @property
     def kind(self) -> str:
-        """Kind of source of the body's truth."""
+        """Kind of the truth source of the body."""
         return self.body.kind
 
     def state(self, t_s: float) -> TruthState:

@@ -61,12 +61,12 @@ class KeplerOrbit:
     inclination_rad, raan_rad, argument_of_perigee_rad, mean_anomaly_rad
         Angles at the epoch, radians.
     j2
-        Let node, perigee and mean anomaly drift at the secular rates of the Earth's oblateness.
+        Whether node, perigee and mean anomaly drift at the secular rates due to the Earth's oblateness.
 
     Raises
     ------
     EmulatorError
-        The orbit is not an ellipse, or its perigee lies below the Earth's surface.
+        The orbit is not an ellipse, or its perigee is below the Earth's surface.
     """
 
     epoch_unix_s: float
@@ -92,7 +92,7 @@ class KeplerOrbit:
 
     @classmethod
     def from_state(cls, epoch_unix_s: float, state: OrbitState, *, j2: bool = True) -> Self:
-        """Return the orbit through a position and velocity (osculating elements).
+        """Return the orbit with a position and velocity (osculating elements).
 
         Raises
         ------
@@ -178,7 +178,7 @@ class TleOrbit:
         for number, line in (("1", line1), ("2", line2)):
             if len(line) != TLE_LENGTH or line[:2] != f"{number} ":
                 raise EmulatorError(
-                    f"orbit: line {number} of the TLE is not one; it begins with {number} and has {TLE_LENGTH} characters"
+                    f"orbit: line {number} of the TLE is invalid; it must begin with {number} and have {TLE_LENGTH} characters"
                 )
         try:
             verify_checksum(line1, line2)
@@ -187,7 +187,7 @@ class TleOrbit:
             why = str(error).partition("\n")[0].rstrip(": ")
             raise EmulatorError(f"orbit: TLE: {why}; copy both lines again") from None
         if self._satellite.error:
-            raise EmulatorError(f"orbit: TLE: {_sgp4_error(self._satellite.error)}; give a current one")
+            raise EmulatorError(f"orbit: TLE: {_sgp4_error(self._satellite.error)}; give a current TLE")
 
     def state(self, unix_s: float) -> OrbitState:
         """Return position and velocity at a Unix time.
@@ -202,7 +202,9 @@ class TleOrbit:
         days, seconds = divmod(unix_s, DAY_S)
         error, position_km, velocity_km_s = self._satellite.sgp4(UNIX_EPOCH_JD + days, seconds / DAY_S)
         if error:
-            raise EmulatorError(f"orbit: TLE: {_sgp4_error(error)}; give one of a date nearer to the run's")
+            raise EmulatorError(
+                f"orbit: TLE: {_sgp4_error(error)}; give a TLE with an epoch closer to the run's date"
+            )
         tt = terrestrial_time(unix_s)
         equinoxes = float(erfa.ee00b(*tt))
         c, s = math.cos(equinoxes), math.sin(equinoxes)
@@ -211,7 +213,7 @@ class TleOrbit:
 
 
 def interpolate_orbit(before: OrbitState, after: OrbitState, fraction: float, span_s: float) -> OrbitState:
-    """Return the state a fraction of the way between two that are `span_s` seconds apart (cubic Hermite)."""
+    """Interpolate between two states that are `span_s` seconds apart (cubic Hermite)."""
     f, g = fraction, 1.0 - fraction
     gap = after.position_m - before.position_m
     start, end = before.velocity_m_s * span_s, after.velocity_m_s * span_s
@@ -235,7 +237,7 @@ def _eccentric_anomaly(mean: float, e: float) -> float:
 
 
 def _orbit_axes(raan: float, inclination: float, perigee: float) -> Vector:
-    """Unit vectors (2, 3) in the plane of the orbit: to the perigee, and 90° ahead of it."""
+    """Return unit vectors (2, 3) in the orbital plane: to the perigee, and 90° ahead of it."""
     co, so = math.cos(raan), math.sin(raan)
     ci, si = math.cos(inclination), math.sin(inclination)
     cw, sw = math.cos(perigee), math.sin(perigee)
@@ -248,7 +250,7 @@ def _orbit_axes(raan: float, inclination: float, perigee: float) -> Vector:
 
 
 def _angle_about(axis: Vector, origin: Vector, direction: Vector) -> float:
-    """Angle from one direction to another about an axis perpendicular to both, radians."""
+    """Return the angle from one direction to another about an axis perpendicular to both, radians."""
     return math.atan2(float(axis @ np.cross(origin, direction)), float(origin @ direction))
 
 

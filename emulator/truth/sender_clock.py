@@ -1,9 +1,9 @@
 """Conversion of a feed sender's clock to simulation time, with tracking of its drift.
 
-The first message sets the offset between the clocks. Drift is judged per window of messages: the sender
-is slow only if all of them arrive later than predicted, and fast only if all arrive earlier, so a single
-late message or a burst sent ahead has no effect. The offset is corrected gradually over the next window.
-After a pause, or a difference above `JUMP_S`, it is set again at once.
+The first message sets the offset between the clocks. Drift is determined per window of messages: the sender is slow
+only if all of them arrive later than predicted, and fast only if all arrive earlier, so a single late message or an
+early burst has no effect. The offset is corrected gradually over the next window. After a pause, or a difference above
+`JUMP_S`, it is set again at once.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ WINDOW_MESSAGES: Final = 5
 """Minimum number of messages per window."""
 
 JUMP_S: Final = 1.0
-"""A larger difference is not drift but a pause or a jump of the sender's clock, seconds."""
+"""Difference above which the sender's clock has paused or jumped, seconds."""
 
 
 class SenderClock:
@@ -25,7 +25,7 @@ class SenderClock:
 
     def __init__(self) -> None:
         self.slope = 0.0
-        """Present rate of change of the offset, seconds per second; positive for a slow sender."""
+        """Current rate of change of the offset, seconds per second; positive for a slow sender."""
         self._offset_s: float | None = None
         self._last_t = self._last_received_s = 0.0
         self._begin_window(0.0)

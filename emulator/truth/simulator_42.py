@@ -1,4 +1,4 @@
-"""Messages of 42, NASA's spacecraft simulator, as its sockets send them (`Inp_IPC.txt`, mode TX).
+"""Messages of 42, NASA's spacecraft simulator, over its sockets (`Inp_IPC.txt`, mode TX).
 
 A message is a block of text lines that ends with ``[ENDMSG]``::
 
@@ -9,10 +9,10 @@ A message is a block of text lines that ends with ``[ENDMSG]``::
     Orb[0].VelN = [-2.623614934750e+03 4.436324912759e+03 5.678236949775e+03]
     [ENDMSG]
 
-``qn`` is an attitude quaternion J2000 → body, scalar last: the conjugate of that used here. ``wn`` is the
-body rate in the body frame, rad/s. ``PosN`` and ``VelN`` belong to the reference orbit, to which
-``SC[0].PosR`` and ``VelR`` are added. Older versions of 42 write no brackets, and only ``SC[0].B[0].qn``. 42
-waits for four bytes, ``Ack`` and a zero, after each message if its blocking is on.
+``qn`` is an attitude quaternion J2000 → body, scalar last, the conjugate of the quaternion used here. ``wn`` is the
+body rate in the body frame, rad/s. ``PosN`` and ``VelN`` describe the reference orbit, to which ``SC[0].PosR`` and
+``VelR`` are added. Older versions of 42 write no brackets, and only ``SC[0].B[0].qn``. If blocking is enabled, 42
+waits for four bytes, ``Ack`` and a zero, after each message.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ _PREFIXES: Final = 'give 42 the prefixes "SC" and "Orb" in Inp_IPC.txt'
 
 
 class Format42:
-    """Blocks of 42 for one spacecraft.
+    """Message format of 42 for one spacecraft.
 
     Parameters
     ----------
     spacecraft
         Number of the spacecraft, i of ``SC[i]``.
     orbit
-        Number of its reference orbit, i of ``Orb[i]``.
+        Number of the reference orbit, i of ``Orb[i]``.
     """
 
     end: Final = b"[ENDMSG]"
@@ -59,7 +59,7 @@ class Format42:
         self._first_ns: int | None = None
 
     def decode(self, data: bytes | str) -> FeedMessage:
-        """Decode one block; `t` counts from the first one."""
+        """Decode one block; `t` is relative to the first block."""
         text = data if isinstance(data, str) else data.decode("ascii", "replace")
         if not text.rstrip().endswith(self.end.decode()):
             raise FeedError("block without [ENDMSG]")
@@ -83,7 +83,7 @@ class Format42:
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)
-        """Return the answer that 42 expects."""
+        """Return the answer expected by 42."""
         return ACKNOWLEDGE
 
 
@@ -102,7 +102,7 @@ def _unix_ns(text: str) -> int:
 
 
 def _vector(values: dict[str, str], count: int, *names: str) -> Vector | None:
-    """Return the numbers of the first of the names that the block has."""
+    """Return the numbers for the first of the names that is in the block."""
     for name in names:
         if name in values:
             try:

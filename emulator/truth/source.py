@@ -1,7 +1,7 @@
 """Truth sources: the true attitude and body rate of the sensor at any simulation time.
 
-A source has neither clock nor socket; `state(t)` depends only on the time and the data received. Some
-sources bring date and orbit too; otherwise `TruthState.completed` adds the run's.
+A source has neither clock nor socket; `state(t)` depends only on the time and the received data. Some sources also
+provide date and orbit; otherwise `TruthState.completed` adds the run's.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ZERO_RATE: Final[Vector] = np.zeros(3)
 ZERO_RATE.flags.writeable = False
 
 MAX_RATE_DEG_S: Final = 600.0
-"""Largest body rate per axis, degrees per second; images can still be rendered at this rate on all three."""
+"""Largest body rate per axis, degrees per second; images can be rendered at this rate about all axes."""
 
 SMOOTH_PEAK: Final = 1.875
 """Peak of the derivative of the quintic 10τ³ − 15τ⁴ + 6τ⁵, at τ = ½."""
@@ -50,7 +50,7 @@ class TruthStatus(StrEnum):
 
 @dataclass(frozen=True)
 class TruthState:
-    """Attitude and rate at one time, with the date and the place in orbit where they are known.
+    """Attitude and rate at one time, with date and orbit if known.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class TruthState:
     unix_s: float | None = None
 
     def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
-        """Return the state with the date and orbit of the run where the source has brought none.
+        """Return the state with the date and orbit of the run if the source has none.
 
         Raises
         ------
@@ -112,7 +112,7 @@ class FixedTruth:
 
 @dataclass(frozen=True)
 class RateTruth:
-    """A rotation at a constant rate that starts from `attitude` at `start_s`.
+    """A rotation at a constant rate that starts with `attitude` at `start_s`.
 
     Attributes
     ----------
@@ -183,7 +183,7 @@ class _Leg:
     segment: Segment
 
     def state(self, elapsed: float) -> TruthState:
-        """Truth at `elapsed` seconds into the leg."""
+        """Return the truth `elapsed` seconds after the start of the leg."""
         segment = self.segment
         if isinstance(segment, SlewSegment):
             angle, rate = _slew_angle_and_rate(segment, self.angle, self.seconds, elapsed)
@@ -205,7 +205,7 @@ def _slew_seconds(segment: SlewSegment, angle: float) -> float:
 def _slew_angle_and_rate(
     segment: SlewSegment, angle: float, seconds: float, elapsed: float
 ) -> tuple[float, float]:
-    """Return the angle (radians) and rate (rad/s) `elapsed` seconds into a slew."""
+    """Return the angle (radians) and rate (rad/s) `elapsed` seconds after the start of a slew."""
     if seconds <= 0.0:
         return angle, 0.0
     if segment.shape == "smooth":
@@ -232,9 +232,10 @@ class SlewTruth:
     segments
         Segments in order.
     start_s
-        Simulation time at which the first segment begins; at rest before.
+        Simulation time at which the first segment begins; at rest before this.
     repeat
-        Restart from the initial attitude after the last segment; otherwise hold the final attitude.
+        Whether to restart from the initial attitude after the last segment; otherwise the final attitude is
+        held.
     """
 
     kind: Final = "slew"

@@ -84,7 +84,7 @@ class CanRows:
         self.longest = _first(sorted((row for row in commands if row.size > 8), key=lambda row: -row.size))
 
     def texts(self, icd: InterfaceDefinition) -> dict[str, str]:
-        """Return the texts for the names in braces in the table of frames, without those of missing rows."""
+        """Return the texts for the names in braces in the table of frames; missing rows have none."""
         found = {name: f"{row.id:02X}" for name, row in vars(self).items() if isinstance(row, Row)}
         found |= {name: f"{number:02X}" for name, number in vars(self).items() if isinstance(number, int)}
         for name in ("single", "small"):

@@ -148,7 +148,7 @@ def cob_ids(probe: CanopenProbe) -> None:
         restricted = any(low <= can_id <= high for low, high in RESTRICTED)
         check(not restricted, f"CAN ID of {index:04X}h allowed", f"0x{can_id:03X}")
         check(can_id not in used, f"CAN ID of {index:04X}h is unique", used.get(can_id))
-        used[can_id] = f"0x{can_id:03X} is that of {index:04X}h"
+        used[can_id] = f"0x{can_id:03X} belongs to {index:04X}h"
 
 
 @EDS.case("identity", "device information agrees with the identity object")

@@ -59,7 +59,7 @@ class ConformanceRequest:
     speed: float = 1.0
     times: ProbeTimes = field(default_factory=ProbeTimes)
     view: str | None = None
-    """Address of a console that shows the outcomes; `auto` with `start`: that of the started emulator."""
+    """Address of a console that shows the outcomes; `auto` with `start`: the started emulator's console."""
 
 
 def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:

@@ -32,7 +32,7 @@ class Exchange:
     Attributes
     ----------
     id, title, clause
-        As in a case; clause None: that of the area.
+        As in a case; clause None: the clause of the area.
     sent
         Raw traffic, in the format of `LinkProbe.send_text`.
     answers

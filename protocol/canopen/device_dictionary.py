@@ -324,7 +324,7 @@ class DeviceDictionary(Dictionary):
         if type_ is not None:
             if type_size(DATA_TYPES[type_]) != row.size:
                 raise IcdError(
-                    f"canopen.toml: {key[0]:04X}h: {row.name} has {row.size} bytes, not those of {type_}"
+                    f"canopen.toml: {key[0]:04X}h: {row.name} has {row.size} bytes, not the size of {type_}"
                 )
             member = variable(name, *key, DATA_TYPES[type_], "wo", mappable=True)
             self._writers[key] = partial(self._execute, row)

@@ -35,7 +35,7 @@ class PackedField(_Model):
 
 
 class PlacedMember(_Model):
-    """An entry of a record, with `value`, `telecommand` or both, with `parameter`, or with `domain`."""
+    """An entry of a record: give `parameter`, `domain`, or one or both of `value` and `telecommand`."""
 
     subindex: Annotated[int, Field(ge=1, le=254)] | None = None
     """Sub-index; default: the next one."""
@@ -61,8 +61,8 @@ class PlacedMember(_Model):
 class PlacedObject(_Model):
     """An application object.
 
-    Its content is given by one of the keys from `requests` on, or by `telecommand` with `value` or
-    `telemetry`.
+    The keys after `name`, except `type`, define its content. Give one of them, or `telecommand` with
+    `value` or `telemetry`.
     """
 
     index: Index

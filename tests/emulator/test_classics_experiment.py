@@ -14,7 +14,7 @@ FRAMES = [(22.0, 12.0), (332.0, -38.0), (180.0, 62.0), (22.0, -68.0)]
 
 
 @pytest.mark.parametrize("name", ["flat", "sphere"])
-def test_frames_hold_the_stars_that_the_catalogue_puts_there(name):
+def test_frames_contain_the_stars_of_the_catalogue(name):
     sky = thesis_sky(name)
     solver = make_identifier(
         "oriented-svd",

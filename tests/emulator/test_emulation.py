@@ -53,7 +53,7 @@ def test_the_ready_line_names_links_seed_and_clock(run):
     run(scenario)
 
 
-def test_the_real_clock_goes_by_itself(run):
+def test_the_real_clock_advances_by_itself(run):
     async def scenario(emulation, _line):
         device = emulation.device
         assert device.modes.mode.value == "standby"
@@ -130,7 +130,7 @@ def test_a_truth_log_can_be_replayed(run, tmp_path):
     assert replayed.rate_rad_s == pytest.approx(wanted[0].rate_rad_s, rel=1e-5)
 
 
-def test_a_scenario_happens_at_its_run_times(run, tmp_path):
+def test_scenario_events_happen_at_their_simulation_times(run, tmp_path):
     path = tmp_path / "day.toml"
     path.write_text(
         """

@@ -92,7 +92,7 @@ def profile(**keys):
 @pytest.mark.parametrize(
     ("keys", "said"),
     [
-        ({}, "links.can.address is 4, as that of"),
+        ({}, "links.can.address is 4, as in"),
         ({"run": {"clock": "stepped"}}, "heads share a clock"),
         (
             {"links": {"can": {"channel": "auto", "address": 5}, "serial": {"port": "/dev/ttyUSB0"}}},

@@ -134,7 +134,7 @@ def test_a_profile_that_extends_itself_is_rejected(tmp_path):
     assert "extend itself" in refusal(path)
 
 
-def test_unknown_names_tell_the_known_ones():
+def test_errors_about_unknown_names_list_the_known_ones():
     assert "cubestar" in refusal("cubestr")
 
 
@@ -145,7 +145,7 @@ def test_a_bad_override_is_named(override):
     )
 
 
-def test_an_override_that_is_wrong_is_blamed_itself(tmp_path):
+def test_an_invalid_override_is_named_in_the_error(tmp_path):
     path = write(tmp_path, "[run]\nseed = 1\n")
     assert refusal(path, ["run.seed=-1"]).startswith("--set run.seed=-1: run.seed: must be at least 0")
     assert refusal(path, ["camera=3"]).startswith("--set camera=3: camera: must be a table")
@@ -172,7 +172,7 @@ def test_an_override_that_is_wrong_is_blamed_itself(tmp_path):
         "truth.attitude={ra_deg=0.0, dec_deg=0.0, roll_deg=-1e6}",
     ],
 )
-def test_a_value_that_no_unit_can_have_is_named_with_its_bound(override):
+def test_an_impossible_value_is_named_with_its_bound(override):
     message = refusal("cubestar", [override])
     key = override.partition("=")[0]
     assert message.startswith(f"--set {override}: {key}")

@@ -167,7 +167,7 @@ def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_is_played_to_there
 
 
 @pytest.mark.parametrize("content", [None, "{}", '{"profile": {"x": 1}, "folder": "."}'])
-def test_a_folder_that_is_no_recording_is_named(tmp_path, content):
+def test_a_folder_without_a_recording_is_named(tmp_path, content):
     if content is not None:
         (tmp_path / RUN_FILE).write_text(content)
     with pytest.raises(EmulatorError, match=f"replay {os.fspath(tmp_path)}"):

@@ -110,7 +110,7 @@ def test_a_peer_that_does_not_read_is_waited_for_once_and_then_again_when_it_rea
     run(scenario, **SETTINGS)
 
 
-def test_delays_of_a_wire_pass_in_run_time(run):
+def test_wire_delays_use_simulation_time(run):
     async def scenario(emulation, _line):
         peer = Peer(emulation.ready_fields["serial"])
         emulation.serial.wire.settings = type(emulation.serial.wire.settings)(delay_s=5.0)

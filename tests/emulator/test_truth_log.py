@@ -12,7 +12,7 @@ from starhil.emulator.truth_log import COLUMNS, TruthLog
 HEAD = ",".join(COLUMNS) + "\r\n"
 
 
-def test_a_file_that_holds_something_is_left_alone_unless_it_may_be_replaced(tmp_path):
+def test_a_nonempty_file_is_kept_unless_it_may_be_replaced(tmp_path):
     path = tmp_path / "truth.csv"
     path.write_text("of great worth")
     with pytest.raises(EmulatorError, match=r"exists and is not empty; .*--overwrite"):

@@ -83,7 +83,7 @@ def test_names_that_are_not_in_the_definition_are_rejected_before_anything_is_se
     assert not client.transactions
 
 
-def test_values_that_the_definition_does_not_allow_go_out_unchecked_if_asked(pair):
+def test_out_of_range_values_can_be_sent_unchecked_if_asked(pair):
     _device, client = pair
     wrong = client.icd.telecommands["set_star_config"].example() | {"max_stars_matched": 0}
     for send in (
@@ -100,7 +100,7 @@ def test_values_that_the_definition_does_not_allow_go_out_unchecked_if_asked(pai
         assert len(client.transactions) == 1
 
 
-def test_no_reply_is_an_error_after_the_time_out_and_is_tried_again_only_if_asked(pair):
+def test_no_reply_is_an_error_after_the_timeout_and_is_retried_only_if_asked(pair):
     device, client = pair
     device.mute = 1
     with pytest.raises(NoReplyError, match=r"rates: no reply within 0\.15 s"):
@@ -116,7 +116,7 @@ def test_no_reply_is_an_error_after_the_time_out_and_is_tried_again_only_if_aske
     ]
 
 
-def test_a_late_reply_is_not_taken_as_the_next_request_s(pair):
+def test_a_late_reply_does_not_answer_the_next_request(pair):
     device, client = pair
     device.telemetry["rates"] = {"rate_x": 1.0}
     device.telemetry["quaternion"] = {"q_x": 0.5}
@@ -137,7 +137,7 @@ def test_a_request_by_number_may_be_undefined(pair):
         assert caught.value.code == ErrorCode.INVALID_ID
 
 
-def test_parameters_go_by_name_and_in_their_own_type(pair):
+def test_parameters_are_accessed_by_name_in_their_own_type(pair):
     _device, client = pair
     client.set_parameter("exposure", 250)
     client.set_parameter("tracking_enable", value=False)
@@ -151,7 +151,7 @@ def test_parameters_go_by_name_and_in_their_own_type(pair):
         client.set_parameter("exposure", 1e9)
 
 
-def test_waiting_ends_when_the_condition_holds_or_the_time_is_over(pair):
+def test_waiting_ends_when_the_condition_holds_or_time_runs_out(pair):
     device, client = pair
     device.telemetry["precise_attitude"] = {"valid": False}
     with pytest.raises(BenchError, match="precise_attitude"):
@@ -171,7 +171,7 @@ def test_an_image_is_downloaded_frame_by_frame(pair):
     assert image.pixels == device.pixels
 
 
-def test_a_frame_that_stays_wrong_ends_the_download(pair):
+def test_a_repeatedly_damaged_frame_ends_the_download(pair):
     device, client = pair
     device.bad_checksums = 1000
     with pytest.raises(BadReplyError, match="image frame 0: checksum"):
@@ -200,7 +200,7 @@ def test_unsolicited_telemetry_is_a_separate_stream(hub):
         assert not client.stray_replies
 
 
-def test_bytes_and_frames_can_be_sent_as_they_stand(pair):
+def test_raw_bytes_and_frames_can_be_sent(pair):
     device, client = pair
     device.telemetry["boot_status"] = {"boot_count": 0x1F}
     if client.core.link.name == "can":

@@ -40,7 +40,7 @@ def expectation(value, known=frozenset()):
         ({"value": 5, "plus": 1}, 6, 5),
     ],
 )
-def test_each_form_holds_where_it_should_and_nowhere_else(wanted, good, bad):
+def test_each_form_matches_only_its_own_values(wanted, good, bad):
     assert expectation(wanted).mismatch(good, {}) is None
     text = expectation(wanted).mismatch(bad, {})
     assert text is not None
@@ -89,6 +89,6 @@ def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
     assert "no_match" in problem
 
 
-def test_all_zeros_are_no_attitude():
+def test_an_all_zero_quaternion_is_not_an_attitude():
     with pytest.raises(BenchError, match="length is 0"):
         measured_attitude({"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 0.0})

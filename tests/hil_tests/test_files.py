@@ -46,7 +46,7 @@ def test_a_bmp_file_is_read_as_opencv_wrote_it(width):
 
 
 @pytest.mark.parametrize("data", [b"", b"BM", b"PNG" * 50, b"BM" + bytes(100)])
-def test_a_file_that_is_no_bmp_is_rejected(data):
+def test_a_file_that_is_not_a_bmp_is_rejected(data):
     with pytest.raises(BenchError):
         decode_bmp(data)
 

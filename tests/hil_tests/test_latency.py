@@ -18,7 +18,7 @@ def reply_to(destination):
     return f"< send {frame.id:08X} {len(frame.data)}{data} >".encode()
 
 
-def test_replies_to_other_nodes_are_not_taken_for_the_own_one():
+def test_replies_to_other_nodes_are_ignored():
     with HubThread() as hub:
         own, other = HubRequester(hub.channel, ICD), HubRequester(hub.channel, ICD)
         other._socket.sendall(reply_to(253) * 3)

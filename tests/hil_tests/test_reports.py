@@ -43,7 +43,7 @@ def test_a_report_that_cannot_be_written_is_rejected_before_the_run(words, tmp_p
 
 
 @pytest.mark.process
-def test_an_emulator_that_ends_with_the_last_step_fails_the_session_and_its_report(tmp_path, monkeypatch):
+def test_an_emulator_that_dies_at_the_last_step_fails_the_session_and_its_report(tmp_path, monkeypatch):
     script = tmp_path / "s.toml"
     script.write_text("[[step]]\nwait_s = 0\n", encoding="ascii")
     junit = tmp_path / "out" / "j.xml"
@@ -83,7 +83,7 @@ def test_a_port_where_nothing_answers_ends_the_conformance_run_with_its_reports(
 @pytest.mark.parametrize(
     ("module", "words"), [(session_run, ("session", "first_light")), (conformance_run, ("conformance",))]
 )
-def test_an_emulator_started_for_a_run_speaks_the_dialect_of_the_run(module, words, monkeypatch):
+def test_an_emulator_started_for_a_run_uses_the_dialect_of_the_run(module, words, monkeypatch):
     def refuse(command):
         raise BenchError(" ".join(command))
 

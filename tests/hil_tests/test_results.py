@@ -107,7 +107,7 @@ def test_the_folder_of_a_report_is_made(write, tmp_path):
 
 
 @WRITERS
-def test_a_folder_is_no_report(write, tmp_path, monkeypatch):
+def test_a_folder_cannot_be_a_report(write, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for path in (Path(), tmp_path):
         with pytest.raises(BenchError, match="is a folder; name the file of the report"):

@@ -76,7 +76,7 @@ wait_s = 0.5
 """
 
 
-def test_a_full_script_is_read_as_it_stands(load):
+def test_a_full_script_is_read_unchanged(load):
     script = load(FULL)
     assert (script.title, script.timeout_s, script.retries, script.keep_going, script.link) == (
         "All parts", 0.5, 1, True, "both",
@@ -216,7 +216,7 @@ def test_a_missing_file_is_rejected_with_near_names(tmp_path):
 
 
 @pytest.mark.parametrize("path", sorted(SCRIPT_FOLDER.glob("*.toml")), ids=lambda path: path.stem)
-def test_the_scripts_that_come_along_are_valid(path):
+def test_the_included_scripts_are_valid(path):
     script = load_script(path, ICD)
     assert script.steps
     assert script.doc

@@ -90,7 +90,7 @@ def test_a_time_in_seconds_keeps_its_fraction_in_the_junit_file(play, device):
     assert "time_of_exposure = 1767225619.53125" in case.output.splitlines()
 
 
-def test_a_message_has_one_unit_of_time(play, device, capsys):
+def test_a_message_uses_one_time_unit(play, device, capsys):
     result = play("[[step]]\nread = 'rates'\nmax_latency_s = 0.0\nwithin_s = 0.1\nevery_s = 0.01\n")
     assert result.results[0].detail.startswith("not within 0.1 s: latency 0.")
     _printer(quiet=False)(result.results[0])
@@ -111,7 +111,7 @@ def attitude_values(dec_offset_arcsec: float = 0.0, **more) -> dict:
 TRUTH = "[truth]\nra_deg = 83.8\ndec_deg = -1.2\nroll_deg = 30\n"
 
 
-def test_steps_that_hold_pass_and_those_that_do_not_say_why(play, device):
+def test_passing_steps_pass_and_failing_steps_give_the_reason(play, device):
     device.telemetry["boot_status"] = {"boot_count": 7, "reset_cause": "command"}
     device.refuse["save_parameters"] = ErrorCode.BUSY
     result = play(
@@ -255,7 +255,7 @@ def test_an_invalid_attitude_never_passes(play, device):
     assert not result.passed
 
 
-def test_a_step_is_tried_until_it_holds_or_its_time_is_over(play, device):
+def test_a_step_is_retried_until_it_passes_or_times_out(play, device):
     device.mute = 2
     result = play(
         "[[step]]\nread = 'rates'\nwithin_s = 10\nevery_s = 0.01\ntimeout_s = 0.3\n"

@@ -21,7 +21,7 @@ with temporary_folder("run-", base=Path(sys.argv[1])) as folder:
 
 
 @pytest.mark.process
-def test_the_folder_of_a_killed_owner_is_removed_and_a_living_owner_s_stays(tmp_path):
+def test_the_folder_of_a_killed_owner_is_removed_and_that_of_a_running_owner_kept(tmp_path):
     def names() -> set[str]:
         return {path.name for path in tmp_path.iterdir()}
 

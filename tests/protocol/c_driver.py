@@ -236,7 +236,7 @@ static void on_can(const char *verb, unsigned long id, const uint8_t *data, size
 }
 """,
 }
-"""The two kinds of links: that of the CubeSpace family, with its dialects, and those that are composed."""
+"""The two kinds of links: CubeSpace, with its dialects, and composed links."""
 
 
 def _printed(field: Field) -> str:

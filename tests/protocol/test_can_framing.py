@@ -115,7 +115,7 @@ def test_a_message_too_long_for_the_counter_is_rejected() -> None:
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.integers(0, 255), st.binary(max_size=512), st.integers(0, 255))
-def test_requests_come_out_as_they_went_in(identifier: int, data: bytes, source: int) -> None:
+def test_requests_survive_encoding_and_decoding(identifier: int, data: bytes, source: int) -> None:
     if identifier >= 128:
         data = data[:8]
     request = Request.of(identifier, data, source)
@@ -134,7 +134,7 @@ replies = st.one_of(
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.lists(replies, max_size=5))
-def test_replies_come_out_as_they_went_in(sent: list[Reply]) -> None:
+def test_replies_survive_encoding_and_decoding(sent: list[Reply]) -> None:
     receiver = CanHostReceiver(OBC, DEVICE)
     got: list[object] = []
     for reply in sent:
@@ -151,7 +151,7 @@ def test_messages_of_several_senders_may_interleave() -> None:
     assert events == [Request.of(54, bytes(20), 1), Request.of(54, bytes(range(20)), 2)]
 
 
-def test_frames_for_others_are_passed_over() -> None:
+def test_frames_for_other_nodes_are_ignored() -> None:
     receiver = CanDeviceReceiver(DEVICE)
     assert take(receiver, encode_request_frames(Request.of(54, bytes(20)), OBC, 9)) == []
     assert take(receiver, [CanFrame(0x104, b"", extended=False), CanFrame(0x04850104, remote=True)]) == []
@@ -220,7 +220,7 @@ def test_a_message_longer_than_allowed_is_one_fault() -> None:
     assert take(receiver, _segments()) == [WHOLE]
 
 
-def test_too_many_open_messages_push_out_the_oldest() -> None:
+def test_too_many_open_messages_evict_the_oldest() -> None:
     receiver = CanDeviceReceiver(DEVICE)
     events: list[object] = []
     for source in range(MAX_OPEN_MESSAGES + 5):
@@ -242,7 +242,7 @@ def test_too_many_open_messages_push_out_the_oldest() -> None:
         "07850104#0001020304050601",
     ],
 )
-def test_types_that_are_no_request_are_faults(text_: str) -> None:
+def test_types_other_than_requests_are_faults(text_: str) -> None:
     (event,) = CanDeviceReceiver(DEVICE).feed(frame(text_), 0.0)
     assert isinstance(event, LinkFault)
     assert event.kind is FaultKind.CAN_TYPE
@@ -263,7 +263,7 @@ def test_lost_first_segment_of_unsolicited_telemetry_is_noticed() -> None:
     assert [type(event) for event in events] == [LinkFault]
 
 
-def test_ten_thousand_random_frames_leave_the_receiver_sound() -> None:
+def test_the_receiver_survives_ten_thousand_random_frames() -> None:
     source = random.Random(20260102)
     receiver = CanDeviceReceiver(DEVICE)
     accepted = 0
@@ -296,12 +296,12 @@ def test_ten_thousand_random_frames_leave_the_receiver_sound() -> None:
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.integers(0, 0x1FFFFFFF))
-def test_identifiers_come_apart_and_together(raw: int) -> None:
+def test_can_ids_are_split_and_joined(raw: int) -> None:
     assert CanId.unpack(raw).pack() == raw
 
 
 @pytest.mark.parametrize("parts", [(32, 0, 0, 0), (0, 256, 0, 0), (0, 0, -1, 0), (0, 0, 0, 300)])
-def test_parts_that_do_not_fit_an_identifier_are_rejected(parts: tuple[int, int, int, int]) -> None:
+def test_parts_that_do_not_fit_a_can_id_are_rejected(parts: tuple[int, int, int, int]) -> None:
     with pytest.raises(ProtocolError):
         CanId(*parts).pack()
 
@@ -343,7 +343,7 @@ def test_candump_lines_have_the_format_of_candump() -> None:
         timestamp=st.integers(0, 2**31).map(float),
     )
 )
-def test_candump_lines_come_back(one: CanFrame) -> None:
+def test_candump_lines_survive_writing_and_reading(one: CanFrame) -> None:
     assert parse_candump(format_candump(one, "can0")) == ("can0", one)
 
 

@@ -114,7 +114,7 @@ def test_a_matrix_becomes_the_quaternion():
 
 
 @pytest.mark.parametrize("name", ["markdown", "html"])
-def test_texts_for_people_have_the_convention(name):
+def test_human_readable_exports_contain_the_convention(name):
     said = export(ICD, name)
     for section in ICD.sections:
         assert section.heading in said

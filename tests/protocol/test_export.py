@@ -329,7 +329,7 @@ class _Page(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_the_page_is_whole_and_its_links_lead_somewhere() -> None:
+def test_the_page_is_complete_and_its_links_resolve() -> None:
     page = _Page()
     page.feed(text("html"))
     assert page.open == []
@@ -356,7 +356,7 @@ def test_markdown_tables_have_even_columns_and_every_field() -> None:
 
 
 @pytest.mark.parametrize("name", ["markdown", "html"])
-def test_texts_for_people_tell_parameters_and_enumerations(name: str) -> None:
+def test_human_readable_exports_contain_parameters_and_enumerations(name: str) -> None:
     for word in (*ICD.parameters, *ICD.enums):
         assert word in text(name)
 

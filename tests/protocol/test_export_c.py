@@ -218,7 +218,7 @@ def test_the_receiver_of_the_c_reads_can_as_ours(c: CDriver) -> None:
             assert [*got, c("can_give_up", 0)] == can_events(sent), sent
 
 
-def test_another_row_ends_a_message_on_can_that_is_incomplete(c: CDriver) -> None:
+def test_another_row_ends_an_incomplete_message_on_can(c: CDriver) -> None:
     cut, whole = (
         encode_reply_frames(Reply(ReplyKind.TELEMETRY, id_, bytes(size), destination=1), 4)
         for id_, size in ((130, 20), (131, 13))

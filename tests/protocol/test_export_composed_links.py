@@ -132,7 +132,7 @@ def c_events(driver: CDriver, pending: int | None, data: bytes) -> list[list[str
 
 
 def our_events(stack: ComposedStack, data: bytes) -> list[list[str]]:
-    """Messages of our own end of the link, in the same form."""
+    """Messages from our end of the link, in the same form."""
     return [
         [
             str(KINDS.index(event.kind.value)),

@@ -102,7 +102,7 @@ def test_a_frame_goes_to_every_other_client_as_socketcand_writes_it(command: str
     run(scenario, now=lambda: 1_700_000_000.25)
 
 
-def test_buses_are_apart() -> None:
+def test_buses_are_independent() -> None:
     async def scenario(hub: CanHub) -> None:
         one, two, other = await Peer.join(hub), await Peer.join(hub), await Peer.join(hub, "vcan1")
         one.write("< send 123 1 1 >")
@@ -157,7 +157,7 @@ def test_nothing_can_be_sent_before_a_bus_is_open() -> None:
     run(scenario)
 
 
-def test_random_bytes_from_one_client_do_not_touch_the_others() -> None:
+def test_random_bytes_from_one_client_do_not_affect_the_others() -> None:
     async def scenario(hub: CanHub) -> None:
         noisy, one, two = await Peer.join(hub, None), await Peer.join(hub), await Peer.join(hub)
         source = random.Random(5)
@@ -329,7 +329,7 @@ def test_any_text_is_a_frame_or_a_command_error(text: bytes) -> None:
             assert "CAN" in str(error)  # noqa: PT017
 
 
-# -- a log that cannot be written, a host that is none ------------------------------------------------------------------
+# -- a log that cannot be written, an invalid host ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("at", ["write", "flush", "close"])

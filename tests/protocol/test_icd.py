@@ -34,11 +34,11 @@ def test_published_rows_have_their_published_sizes(identifier: int, size: int) -
     assert row.size == size
 
 
-def test_the_escape_byte_is_no_identifier() -> None:
+def test_the_escape_byte_is_not_an_id() -> None:
     assert ICD.row_by_id(0x1F) is None
 
 
-def test_rows_of_our_own_say_so_and_published_ones_name_their_source() -> None:
+def test_own_rows_are_marked_and_published_rows_name_their_source() -> None:
     for row in ROWS:
         assert row.doc
         assert (row.provenance == "ours") == (row.source == ""), row.name
@@ -266,7 +266,7 @@ def test_values_against_the_definition_are_rejected_by_row_and_field(
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_a_telecommand_with_a_number_that_is_none_is_rejected(value: float) -> None:
+def test_a_telecommand_with_a_non_finite_number_is_rejected(value: float) -> None:
     data = struct.pack("<Bd", 1, value)
     with pytest.raises(FieldError, match=r"set_parameter\.value"):
         ICD.telecommands["set_parameter"].decode(data)

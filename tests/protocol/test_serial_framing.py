@@ -100,7 +100,7 @@ def test_an_incomplete_message_is_abandoned_after_the_timeout() -> None:
     assert receiver.flush(99.0) == []
 
 
-def test_bytes_after_the_time_out_begin_anew() -> None:
+def test_bytes_after_the_timeout_start_a_new_frame() -> None:
     receiver = DeviceReceiver(timeout_s=0.5)
     receiver.feed(b"\x1f\x7f\x02\x05", 0.0)
     assert kinds(receiver.feed(encode_request(GOOD), 1.0)) == [FaultKind.UART_INCOMPLETE, GOOD.id]
@@ -148,7 +148,7 @@ def test_events_do_not_depend_on_how_noise_is_cut(noise: bytes, size: int) -> No
     assert pieces == whole
 
 
-def test_ten_thousand_random_byte_strings_leave_the_receiver_sound() -> None:
+def test_the_receiver_survives_ten_thousand_random_byte_strings() -> None:
     random_bytes = random.Random(20260101)
     receiver = DeviceReceiver()
     for number in range(10_000):

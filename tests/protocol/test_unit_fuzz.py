@@ -42,7 +42,7 @@ def exchanges(icd: InterfaceDefinition, stack: SerialStack) -> tuple[list[bytes]
 
 
 @pytest.mark.parametrize("unit", UNITS)
-def test_decoders_stand_mutated_input_and_read_the_next_request(unit):
+def test_decoders_survive_mutated_input_and_read_the_next_request(unit):
     icd = load_unit(unit)
     stack = build_serial_stack(icd)
     requests, replies = exchanges(icd, stack)

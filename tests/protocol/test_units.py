@@ -149,7 +149,7 @@ INVALID = [
     ("unknown key", telemetry('{ name = "a", type = "u8", scal = 2 }'), r"row\.fields\.a\.scal: unknown key; did you mean scale"),
     ("unknown key of a convention", '[conventions]\nquaternions = "attitude"\n', r"conventions\.quaternions: unknown key; did you mean quaternion"),
     ("left-handed axes", '[conventions]\naxes = ["+x", "-y", "+z"]\n', "is not a right-handed frame"),
-    ("unknown epoch", '[conventions]\nepoch = "y2k"\n', "'y2k' is none of unix, gps, j2000, midnight"),
+    ("unknown epoch", '[conventions]\nepoch = "y2k"\n', "'y2k' is not one of unix, gps, j2000, midnight"),
     ("unknown error", "[errors]\nbad_id = 1\n", "errors.bad_id: no such error; did you mean invalid_id"),
     ("unknown class", CLASSES + telemetry("", more='class = "gets"'), "no class named 'gets'; did you mean get"),
     ("class left out", CLASSES + telemetry(""), "needs `class`, one of get, watch"),
@@ -197,7 +197,7 @@ def test_all_errors_are_listed(tmp_path):
         load_unit(tmp_path)
 
 
-def test_rows_that_are_bound_to_nothing_cannot_be_emulated(unit, tmp_path):
+def test_unbound_rows_cannot_be_emulated(unit, tmp_path):
     icd = unit(
         HEAD + telemetry('{ name = "a", type = "u8" }') + telecommand("").replace('action = "nothing"\n', "")
     )

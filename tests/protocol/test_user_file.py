@@ -29,7 +29,7 @@ READERS = {
 }
 
 
-def test_a_file_comes_whole_and_one_beyond_the_limit_not_at_all(tmp_path):
+def test_a_file_is_read_completely_or_rejected_above_the_limit(tmp_path):
     path = tmp_path / "a"
     path.write_bytes(b"12\xc3\xa4")
     assert read_user_file(path, 4) == b"12\xc3\xa4"
@@ -52,7 +52,7 @@ def test_a_file_that_is_not_regular_is_rejected_without_waiting(tmp_path):
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_every_reader_names_a_pipe_in_one_line_and_does_not_wait(tmp_path, name):
+def test_every_reader_rejects_a_pipe_in_one_line_without_waiting(tmp_path, name):
     path = tmp_path / "pipe.toml"
     os.mkfifo(path)
     with pytest.raises((EmulatorError, BenchError, ProtocolError)) as refusal:

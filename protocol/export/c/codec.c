@@ -94,7 +94,7 @@ static void get_text(const uint8_t *data, size_t size, char *text)
     text[size] = '\0';
 }
 
-/* Characters beyond 7 bits, or more than `size` of them, are refused. */
+/* Characters beyond 7 bits, or more than `size` characters, are rejected. */
 static bool put_text(uint8_t *data, size_t size, const char *text)
 {
     size_t i;

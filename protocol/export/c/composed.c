@@ -1,7 +1,7 @@
 size_t unit_frame_request(uint32_t id, const uint8_t *data, size_t size, uint8_t *out, size_t capacity)
 {
     output_t output = {out, capacity, 0u};
-    uint8_t *body; /* at the end of `out`, ahead of what is framed at its beginning */
+    uint8_t *body; /* at the end of `out`, so that framing can be written to its beginning */
     size_t header, end;
     if (!is_row(id) || capacity < UNIT_REQUEST_CAPACITY(size)) {
         return 0u;

@@ -1,20 +1,20 @@
 /* --- Serial link of the OBC's side ------------------------------------------------------------------------------- */
 
 typedef enum {
-    UNIT_NONE,        /* nothing is complete yet */
-    UNIT_TELEMETRY,   /* data of a row that was asked for */
+    UNIT_NONE,        /* no message is complete */
+    UNIT_TELEMETRY,   /* data of a requested row */
     UNIT_ACK,         /* a telecommand was accepted */
-    UNIT_NACK,        /* a request was refused: `code`, where the unit's replies have one */
-    UNIT_UNSOLICITED, /* data of a row that was not asked for */
-    UNIT_FAULT        /* bytes that are no message were dropped */
+    UNIT_NACK,        /* a request was refused: `code`, if the unit's replies have one */
+    UNIT_UNSOLICITED, /* data of a row that was not requested */
+    UNIT_FAULT        /* invalid bytes were dropped */
 } unit_kind_t;
 
 typedef struct {
     unit_kind_t kind;
-    uint32_t id; /* row that it is about */
+    uint32_t id; /* row of the message */
     uint32_t code;
-    uint64_t ticks, time; /* of the header, in its counts, where it has them */
-    bool is_final;        /* no further reply to the same request follows */
+    uint64_t ticks, time; /* counts in the header, if it has them */
+    bool is_final;        /* whether this is the last reply to the request */
     const uint8_t *data;  /* in the receiver; valid until its next call */
     size_t size;
 } unit_message_t;
@@ -29,25 +29,25 @@ typedef struct {
     uint8_t bytes[@BUFFER@u];
 } unit_receiver_t;
 
-/* Bytes that a request with `size` bytes of data takes at most. */
+/* Maximum size of a request with `size` bytes of data. */
 #define UNIT_REQUEST_CAPACITY(size) (2u * ((size) + @OVERHEAD@u) + @MARKS@u)
 
-/* Frame a request: a telecommand with its encoded data, or the identifier of telemetry without data. Return the number
- * of bytes written, 0 if `capacity` is too small or there is no such row. */
+/* Frame a request: a telecommand with its encoded data, or a telemetry ID without data. Return the number of bytes
+ * written, 0 if `capacity` is too small or there is no such row. */
 size_t unit_frame_request(uint32_t id, const uint8_t *data, size_t size, uint8_t *out, size_t capacity);
 
-/* Bytes of data of a telemetry row, -1 if there is no such row. */
+/* Data size of a telemetry row in bytes, -1 if there is no such row. */
 int unit_telemetry_size(uint32_t id);
 
 void unit_receiver_init(unit_receiver_t *receiver);
 
-/* Note the request that is about to be sent, since a reply may name no row. One request may be open at a time. */
+/* Record the request that is about to be sent, because a reply may not contain its ID. Only one request at a time. */
 void unit_expect(unit_receiver_t *receiver, uint32_t id);
 
-/* Take one received byte. Return the kind of the message that it completes, with the rest of it in `message`. */
+/* Take one received byte. Return the kind of the message that it completes; the message is in `message`. */
 unit_kind_t unit_receive(unit_receiver_t *receiver, uint8_t byte, unit_message_t *message);
 
-/* Abandon a message that has begun and not ended; call it after half a second of silence, and when a reply is given
- * up. Return UNIT_FAULT if there was one, else UNIT_NONE. */
+/* Discard an incomplete message. Call this after half a second of silence, and to stop waiting for a reply. Return
+ * UNIT_FAULT if there was an incomplete message, otherwise UNIT_NONE. */
 unit_kind_t unit_give_up(unit_receiver_t *receiver);
 

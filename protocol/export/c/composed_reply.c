@@ -1,4 +1,4 @@
-/* The echo of the open request: its header again. */
+/* The echo of the request: its header again. */
 static unit_kind_t interpret_echo(unit_receiver_t *receiver, const uint8_t *body, size_t size,
                                   unit_message_t *message)
 {

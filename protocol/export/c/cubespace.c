@@ -91,7 +91,7 @@ static unit_kind_t add(unit_receiver_t *receiver, uint8_t byte)
     return UNIT_NONE;
 }
 
-/* The one byte of data is an error code. */
+/* The single data byte is an error code. */
 static unit_kind_t with_code(unit_message_t *message, unit_kind_t kind)
 {
     message->code = message->data[0];
@@ -204,7 +204,7 @@ static unit_kind_t advance(unit_receiver_t *receiver, uint8_t byte, unit_message
             return UNIT_NONE;
         }
         return add(receiver, byte);
-    case FIRST_ESCAPED: /* an identifier 1F: some senders double it, others do not */
+    case FIRST_ESCAPED: /* an ID of 1F: some senders double it, others do not */
         if (byte == ESCAPE || byte == END || is_start(receiver, byte)) {
             return after_escape(receiver, byte, message);
         }

@@ -39,7 +39,7 @@ unit_kind_t unit_can_give_up(unit_can_receiver_t *receiver)
     return open ? UNIT_FAULT : UNIT_NONE;
 }
 
-/* A segment out of order breaks its message: the rest is skipped, up to its end or a new start. */
+/* A segment out of order breaks its message: further segments are skipped up to the end or a new start. */
 static unit_kind_t can_add(unit_can_message_t *open, bool starts, const unit_can_frame_t *frame, unit_kind_t whole,
                            unit_message_t *message)
 {
@@ -95,7 +95,7 @@ static unit_kind_t can_interpret(unit_can_receiver_t *receiver, const unit_can_f
     case CAN_LONG_TELEMETRY:
         open = burst ? &receiver->burst : &receiver->telemetry;
         return can_add(open, false, frame, burst ? UNIT_BURST : UNIT_TELEMETRY, message);
-    case CAN_LAST: /* alone, all of a short message */
+    case CAN_LAST: /* a single frame with a short message */
         if (!open->is_open || open->row != message->id) {
             return UNIT_UNSOLICITED;
         }

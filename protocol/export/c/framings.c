@@ -128,7 +128,7 @@ static void put_end(output_t *output)
     put_plain(output, end_bytes, END_SIZE);
 }
 
-/* Size of the body that begins with these bytes: 0 if they are too few, -1 if no message is so. */
+/* Size of the body that begins with these bytes: 0 if more are needed, -1 if they are invalid. */
 static long measure(const unit_receiver_t *receiver, const uint8_t *body, size_t size)
 {
     head_t head;
@@ -145,7 +145,7 @@ static long measure(const unit_receiver_t *receiver, const uint8_t *body, size_t
     }
 }
 
-/* Look at the bytes from `start` on; true if the search has to go on one byte later. */
+/* Examine the bytes from `start` on; true if the search has to continue at the next byte. */
 static bool look(unit_receiver_t *receiver, size_t start, unit_kind_t *kind, unit_message_t *message)
 {
     const uint8_t *bytes = receiver->bytes + start;
@@ -231,7 +231,7 @@ static int digit(uint8_t text)
     return text >= 'a' && text <= 'f' ? text - 'a' + 10 : -1;
 }
 
-/* The size of the bytes that hexadecimal digits stand for, in place of them; -1 if they are none. */
+/* Decode hexadecimal digits in place. Return the number of bytes, -1 if they are invalid. */
 static long from_hex(uint8_t *text, size_t size)
 {
     size_t i;

@@ -166,7 +166,7 @@ def test_a_plan_that_cannot_be_written_whole_leaves_no_plan(tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize("text", ["{", "[]", '{"made_by": 3}', "\xff"])
-def test_a_plan_that_is_none_is_named(text, tmp_path):
+def test_an_invalid_plan_is_named(text, tmp_path):
     (tmp_path / "plan.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(StaridError, match=r"plan\.json .*give another folder"):
         open_store(tmp_path, asdict(PLAN))

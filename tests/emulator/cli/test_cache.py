@@ -59,7 +59,7 @@ def test_a_newly_computed_file_is_kept_even_beyond_the_limit(
     assert kept(folder) == {2}
 
 
-def test_files_of_others_are_neither_counted_nor_removed(folder: Path) -> None:
+def test_foreign_files_are_neither_counted_nor_removed(folder: Path) -> None:
     folder.mkdir()
     (folder / "notes.bin").write_bytes(bytes(9_000_000))
     (folder / "index-mine.bin").write_bytes(bytes(9_000_000))
@@ -85,7 +85,7 @@ def test_an_empty_cache_is_shown_and_cleared(folder: Path) -> None:
     assert "removed 0 of 0 files" in CliRunner().invoke(build_app(), ["cache", "clear"]).stdout
 
 
-def test_a_limit_that_is_no_number_is_reported_and_the_default_holds(
+def test_a_limit_that_is_not_a_number_is_reported_and_the_default_used(
     folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     for text in ("much", "-1", "nan", "inf"):

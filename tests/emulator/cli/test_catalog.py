@@ -43,7 +43,7 @@ def test_belt_of_orion_in_a_cone(monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert [s["hip"] for s in json.loads(capsys.readouterr().out)["stars"]] == [26311, 26727, 25930]
 
 
-def test_tables_for_people(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_human_readable_tables(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(monkeypatch, "--cone", "84.05", "-1.2", "1.6", "--rows", "2") == 0
     out = capsys.readouterr().out
     assert "26311" in out

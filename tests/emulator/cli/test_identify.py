@@ -89,7 +89,7 @@ def test_the_annotated_image_is_written_in_colour(tmp_path):
     assert (image[..., 0] != image[..., 1]).any()
 
 
-def test_noise_alone_is_no_attitude(tmp_path):
+def test_noise_alone_gives_no_attitude(tmp_path):
     image = tmp_path / "noise.png"
     cv2.imwrite(str(image), np.random.default_rng(1).normal(60, 4, (937, 937)).astype(np.uint8))
     result = starhil("identify", str(image), "--json")
@@ -117,7 +117,7 @@ def test_an_image_of_another_size_is_rejected(tmp_path):
         (["--fov", "11", "--model", "fisheye"], "pinhole or equidistant"),
     ],
 )
-def test_options_that_name_no_camera_are_rejected(tmp_path, options, named):
+def test_options_without_a_camera_are_rejected(tmp_path, options, named):
     image = tmp_path / "dark.png"
     cv2.imwrite(str(image), np.random.default_rng(1).integers(0, 25, (64, 64)).astype(np.uint8))
     result = starhil("identify", str(image), *options)

@@ -117,7 +117,7 @@ def test_lost_in_space_is_commanded_in_the_form_and_the_attitude_shown_is_that_o
     assert abs(float(page.locator("#ra").text_content().strip("° ").replace("−", "-")) - 83.8) < 0.01
 
 
-def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_comes_back(page):
+def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_recovers(page):
     track(page)
     page.evaluate(
         """() => {
@@ -191,7 +191,7 @@ def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
     assert not page.locator("body.paused").count()
 
 
-def test_the_first_paint_comes_at_once_and_every_tab_opens_in_both_themes(page):
+def test_the_page_paints_at_once_and_every_tab_opens_in_both_themes(page):
     paint = page.evaluate("performance.getEntriesByType('paint')[0].startTime")
     assert paint > 0
     for _ in range(2):
@@ -201,7 +201,7 @@ def test_the_first_paint_comes_at_once_and_every_tab_opens_in_both_themes(page):
         page.keyboard.press("t")
 
 
-def test_nothing_leaves_the_window_at_any_size(page):
+def test_content_fits_the_window_at_any_size(page):
     track(page)
     for width, height in ((1280, 800), (1920, 1080), (3840, 2160)):
         page.set_viewport_size({"width": width, "height": height})

@@ -82,13 +82,13 @@ def test_the_stepped_clock_runs_until_it_is_paused(run):
 def test_a_clock_that_passes_by_itself_cannot_be_stopped(run):
     async def scenario(emulation, _line):
         async with Page(emulation) as page:
-            assert (await page.ask(do="clock", speed=1))["error"] == "the clock is real: it cannot be stopped"
+            assert (await page.ask(do="clock", speed=1))["error"] == "the clock is real and cannot be stopped"
 
     run(scenario, clock="real", options=OPTIONS)
 
 
 @pytest.mark.parametrize("mount", [None, ALONG_X])
-def test_the_sensor_points_turns_and_stands_as_the_page_asks_however_it_is_mounted(run, mount):
+def test_the_sensor_points_turns_and_stops_as_the_page_asks_with_any_mount(run, mount):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:

@@ -15,7 +15,7 @@ from tests.emulator.console.pages import OPTIONS, Page
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 
 
-def test_a_telecommand_goes_over_a_link_and_its_outcome_comes_back(run):
+def test_a_telecommand_is_sent_over_a_link_and_its_outcome_shown(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:
@@ -62,7 +62,7 @@ def test_what_the_console_sent_is_a_session_script(run, tmp_path):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
         async with Page(emulation) as page:
-            assert "nothing was sent yet" in await page.get("/session.toml")
+            assert "nothing has been sent yet" in await page.get("/session.toml")
             await page.ask(do="send", row="set_mode", values={"mode": "lost_in_space"})
             await page.ask(do="send", row="set_update_rate", values={"rate": "500"})
             await page.ask(do="send", row="clear_counters", values={})
@@ -75,7 +75,7 @@ def test_what_the_console_sent_is_a_session_script(run, tmp_path):
             assert rate.action.refused == "invalid_parameter"
             assert len(others) == 2
             await page.ask(do="clear_session")
-            assert "nothing was sent yet" in await page.get("/session.toml")
+            assert "nothing has been sent yet" in await page.get("/session.toml")
 
     run(scenario, options=OPTIONS)
 

@@ -185,7 +185,7 @@ def test_each_head_has_its_own_page_on_a_shared_clock(run):
             truth = await second.ask(do="control", request={"do": "truth"})
             assert (truth["ra_deg"], truth["dec_deg"]) == pytest.approx((78.634, -8.202), abs=0.01)
             assert truth["roll_deg"] == pytest.approx(20.0)
-            assert "head: '3' given, must be 1 to 2" in await Page(emulation, head=3).refusal()
+            assert "head: must be 1 to 2, not '3'" in await Page(emulation, head=3).refusal()
 
     links = {"serial": {"port": "off"}, "can": {"channel": "off"}}
     parameters = {"start_mode": "lost_in_space"}
@@ -270,7 +270,7 @@ def test_a_report_to_no_console_is_an_error_in_one_line(run):
         ("no.such.host:1", "cannot listen"),
     ],
 )
-def test_an_address_that_is_none_ends_the_start_in_one_line(run, where, said):
+def test_an_invalid_address_ends_startup_with_one_line(run, where, said):
     async def nothing(_emulation, _line):
         return
 

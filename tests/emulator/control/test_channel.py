@@ -162,7 +162,7 @@ def test_bad_requests_are_answered_and_the_next_good_one_too(run, line):
         ),
     ],
 )
-def test_a_truth_that_cannot_be_is_rejected_and_the_connection_stays(run, truth, said):
+def test_an_invalid_truth_is_rejected_and_the_connection_kept(run, truth, said):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             answer = await control.do("set_truth", truth=truth)
@@ -174,7 +174,7 @@ def test_a_truth_that_cannot_be_is_rejected_and_the_connection_stays(run, truth,
     run(scenario)
 
 
-def test_a_fault_of_ours_is_answered_and_logged_and_the_connection_stays(run, monkeypatch, caplog):
+def test_an_internal_error_is_answered_and_logged_and_the_connection_kept(run, monkeypatch, caplog):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             with monkeypatch.context() as patch:
@@ -191,7 +191,7 @@ def test_a_fault_of_ours_is_answered_and_logged_and_the_connection_stays(run, mo
 
 
 @pytest.mark.parametrize("protocol", ["udp", "tcp"])
-def test_a_live_feed_stays_until_another_one_is_there(run, protocol):
+def test_a_live_feed_stays_until_its_replacement_is_open(run, protocol):
     live = {"kind": "live", "protocol": protocol}
 
     async def scenario(emulation, _line):

@@ -28,7 +28,7 @@ def mode(path) -> int:
     return stat.S_IMODE(Path(path).stat().st_mode)
 
 
-def test_the_socket_is_for_its_user_alone_and_gone_at_the_end(run, runtime_folder):
+def test_the_socket_is_private_to_its_user_and_removed_at_the_end(run, runtime_folder):
     async def scenario(emulation, line):
         path = emulation.ready_fields["control"].removeprefix("unix:")
         assert f"control=unix:{path}" in line
@@ -128,7 +128,7 @@ def test_with_a_token_nothing_is_done_without_it(run, control):
                 assert answer == {
                     "id": 7,
                     "ok": False,
-                    "error": "token: missing or wrong; give the one of --control-token",
+                    "error": "token: missing or wrong; give the token set with --control-token",
                 }
             assert not run.launched.ended.is_set()
             assert (await control.do("status", token="sésame"))["ok"]
@@ -136,7 +136,7 @@ def test_with_a_token_nothing_is_done_without_it(run, control):
     run(scenario, options=RunOptions(control=control, control_token="sésame"))
 
 
-def test_a_token_that_is_not_asked_for_does_no_harm(run):
+def test_an_unneeded_token_does_no_harm(run):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             assert (await control.do("status", token="any"))["ok"]

@@ -140,7 +140,7 @@ def test_processing_longer_than_allowed_is_flagged(bench):
     assert bench.read("star_performance_2")["processing_time_error"]
 
 
-def test_mounting_turns_what_is_reported(bench):
+def test_the_mount_rotates_the_reported_attitude(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.command("set_parameter", parameter=20, value=90.0)  # alpha: about x
     bench.step(3.5)

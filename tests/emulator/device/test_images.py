@@ -76,7 +76,7 @@ def test_download_needs_an_image_and_its_frames(bench):
     assert bench.read("image_frame_info")["frame"] == 31
 
 
-def test_the_image_stays_while_another_is_captured(bench):
+def test_the_image_is_kept_while_another_is_captured(bench):
     save(bench, "size_64")
     bench.command("init_image_download", image_size="size_64")
     bench.command("advance_image_download", next_frame=3)

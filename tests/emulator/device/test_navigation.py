@@ -94,10 +94,10 @@ def test_elements_in_parameters_give_an_orbit():
     assert known_orbit({}) is None
 
 
-def test_an_orbit_that_meets_the_earth_is_refused(bench):
-    with pytest.raises(Exception, match="meets the Earth"):
+def test_an_orbit_that_intersects_the_earth_is_refused(bench):
+    with pytest.raises(Exception, match="intersects the Earth"):
         bench.device.parameters.set({"orbit_semi_major_axis": 6000.0})
-    with pytest.raises(Exception, match="meets the Earth"):
+    with pytest.raises(Exception, match="intersects the Earth"):
         bench.device.parameters.set({"orbit_semi_major_axis": 7000.0, "orbit_eccentricity": 0.2})
     bench.device.parameters.set({"orbit_semi_major_axis": 26600.0, "orbit_eccentricity": 0.7})
 
@@ -117,7 +117,7 @@ def test_a_run_continues_after_its_orbit_has_decayed(make_bench, caplog):
     assert caplog.text.count("has decayed; the run continues without an orbit") == 1
 
 
-def test_an_orbit_of_a_profile_that_is_none_names_the_profile(make_bench):
+def test_an_invalid_orbit_in_a_profile_names_the_profile(make_bench):
     tle = {"kind": "tle", "line1": "1", "line2": "2"}
     with pytest.raises(EmulatorError, match=r"profile .*: orbit: line 1 of the TLE"):
         make_bench(Profile.model_validate({"orbit": tle}))

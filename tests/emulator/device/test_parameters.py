@@ -36,7 +36,7 @@ def holds(bench, name):
     return bench.read("parameter")["value"]
 
 
-def test_a_rate_that_the_exposure_leaves_no_time_for_is_refused(bench):
+def test_a_rate_too_high_for_the_exposure_is_refused(bench):
     assert bench.command("set_update_rate", rate=20.0) is ErrorCode.INVALID_PARAMETER
     assert bench.command("set_parameter", parameter=29, value=10.1) is ErrorCode.INVALID_PARAMETER
     assert bench.read("acknowledge")["parameter_index"] == 1
@@ -46,7 +46,7 @@ def test_a_rate_that_the_exposure_leaves_no_time_for_is_refused(bench):
 
 
 @pytest.mark.parametrize(("name", "value"), [("exposure", 101), ("exposure", 500), ("delay_time", 1)])
-def test_an_exposure_or_delay_that_the_rate_leaves_no_time_for_is_refused(bench, name, value):
+def test_an_exposure_or_delay_too_long_for_the_rate_is_refused(bench, name, value):
     bench.command("set_update_rate", rate=10.0)
     before = holds(bench, name)
     identifier = bench.icd.parameters[name].id
@@ -54,7 +54,7 @@ def test_an_exposure_or_delay_that_the_rate_leaves_no_time_for_is_refused(bench,
     assert (holds(bench, name), holds(bench, "update_rate")) == (before, 10.0)
 
 
-def test_the_acknowledge_names_the_field_of_a_configuration_that_the_rate_leaves_no_time_for(bench):
+def test_the_acknowledge_names_the_configuration_field_too_long_for_the_rate(bench):
     bench.command("set_update_rate", rate=10.0)
     config = {**bench.read("star_config"), "delay_time": 50}
     assert bench.command("set_star_config", **config) is ErrorCode.INVALID_PARAMETER
@@ -71,7 +71,7 @@ def test_every_exposure_and_delay_has_a_rate_that_leaves_it_time(bench):
         assert sent is ErrorCode.OK
 
 
-def test_a_profile_with_a_rate_that_its_exposure_leaves_no_time_for_is_rejected(make_bench):
+def test_a_profile_with_a_rate_too_high_for_its_exposure_is_rejected(make_bench):
     with pytest.raises(EmulatorError) as rejection:
         make_bench(Profile(name="bench", parameters={"update_rate": 20.0}))
     assert str(rejection.value) == (

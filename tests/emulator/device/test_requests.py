@@ -76,7 +76,7 @@ def test_counters_wrap_at_16_bits(bench):
     assert bench.read("communication_status")["telecommand_count"] == 0
 
 
-def test_unsolicited_telemetry_goes_out_at_its_rate(bench):
+def test_unsolicited_telemetry_is_sent_at_its_rate(bench):
     sent = []
     bench.requests.unsolicited_receivers.append(sent.append)
     assert bench.command("set_unsolicited", telemetry=160, rate=4.0) is ErrorCode.OK

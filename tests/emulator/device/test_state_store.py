@@ -104,7 +104,7 @@ def test_a_failing_disk_leaves_the_old_state(tmp_path, monkeypatch):
 
 
 @pytest.mark.process
-def test_a_killed_writer_leaves_a_whole_state(tmp_path):
+def test_a_killed_writer_leaves_a_complete_state(tmp_path):
     program = textwrap.dedent(
         """
         import sys

@@ -31,7 +31,7 @@ def test_an_address_is_reported_while_another_uses_it_and_free_afterwards(caplog
     second.take(BUS, 4)
     [text] = clashes(caplog)
     assert text.startswith(f"CAN {BUS}: address 4: in use by another emulator, process ")
-    assert text.endswith("give one of them another: --set links.can.address=5")
+    assert text.endswith("change one of them: --set links.can.address=5")
     second.release()
     first.release()
     second.take(BUS, 4)

@@ -234,7 +234,7 @@ def test_restart_takes_over_the_stored_node_parameter(linked):
     linked(test)
 
 
-def test_node_id_that_lss_stored_goes_before_the_parameter_until_that_changes(linked):
+def test_node_id_stored_by_lss_overrides_the_parameter_until_it_changes(linked):
     storage = MemoryStorage()
     storage.save("lss", {"node_id": b"\x30", "bit_rate": (1_000_000).to_bytes(4, "little")})
 

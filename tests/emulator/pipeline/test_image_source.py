@@ -140,7 +140,7 @@ def test_a_video_delivers_its_images_and_then_none(tmp_path):
         source.image(2)
 
 
-def test_a_camera_that_is_not_there_is_named(tmp_path):
+def test_a_missing_camera_is_named(tmp_path):
     with pytest.raises(EmulatorError, match=r"none\.avi cannot be opened"):
         CapturedImages(str(tmp_path / "none.avi"))
 

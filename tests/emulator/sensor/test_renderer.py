@@ -34,7 +34,7 @@ def place_of(frame_stars: object, hip: int) -> np.ndarray:
     return np.asarray(frame_stars.xy_px[frame_stars.hip == hip][0])  # type: ignore[attr-defined]
 
 
-def test_orion_stands_as_in_the_sky(renderer: Renderer) -> None:
+def test_orion_appears_as_in_the_sky(renderer: Renderer) -> None:
     """North up and east left: Betelgeuse upper left, Rigel lower right, Sirius low left, Aldebaran high right."""
     stars = renderer.render(ORION).stars
     centre = np.array(DEFAULT_CAMERA.centre_px)
@@ -181,7 +181,7 @@ def test_gain_brightens_and_exposure_too(renderer: Renderer) -> None:
     assert longer.stars.electrons[0] == pytest.approx(5.0 * plain.stars.electrons[0])
 
 
-def test_hot_and_dead_pixels_stand_in_every_frame(catalog: StarCatalog) -> None:
+def test_hot_and_dead_pixels_appear_in_every_frame(catalog: StarCatalog) -> None:
     sensor = SensorModel(bits=16, hot_pixels=50, dead_pixels=60, sky_mag_arcsec2=17.0, read_noise_e=2.0)
     pattern = make_fixed_pattern(sensor, 937, 937)
     assert (len(pattern.hot), len(pattern.dead)) == (50, 60)

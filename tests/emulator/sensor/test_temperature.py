@@ -51,7 +51,7 @@ def test_at_the_reference_temperature_an_image_is_as_without_one(renderer):
     np.testing.assert_array_equal(plain.image, stated.image)
 
 
-def test_a_temperature_that_no_sensor_has_is_rejected(renderer):
+def test_an_impossible_temperature_is_rejected(renderer):
     with pytest.raises(EmulatorError, match="temperature_c"):
         renderer.render(ORION, temperature_c=500.0)
 

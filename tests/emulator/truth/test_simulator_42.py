@@ -73,7 +73,7 @@ def test_a_bad_block_is_rejected_by_name(old, new, said):
         Format42().decode(block.replace(old, new))
 
 
-def test_a_rate_that_no_image_can_show_is_rejected_by_name():
+def test_a_rate_too_high_for_any_image_is_rejected_by_name():
     with pytest.raises(FeedError, match="exceeds 600 degrees per second"):
         Format42().decode(block_of_42(0.0, ORION, (0.0, 700.0, 0.0)))
 

@@ -150,7 +150,7 @@ def test_file_takes_angles_rates_and_repeats(tmp_path):
         ("t,ra_deg,dec_deg,roll_deg\n0,0,91,0\n", "line 2: dec_deg is outside"),
         (
             "t,qx,qy,qz,qw\n0,0,0,0,1\n0.001,1,0,0,0\n",
-            "line 3: the turn from the row before is faster than 600",
+            "line 3: the rotation from the previous row is faster than 600",
         ),
         ("t,qx,qy,qz,qw\n0,0,0,0,1_0\n", "line 2: qw is not a number"),
         ("t,ra_deg,dec_deg,roll_deg\n0,1e300,0,0\n", "line 2: ra_deg is outside ±1e+06"),
@@ -254,7 +254,7 @@ def test_a_restarted_live_feed_starts_a_new_time_line():
     assert apart_arcsec(live.state(2.0).attitude, EAST) < MILLIARCSECOND
 
 
-def test_live_feed_on_run_time_takes_times_as_they_stand():
+def test_live_feed_on_simulation_time_uses_message_times_unchanged():
     live = LiveTruth(EAST, timeline="run")
     live.receive(line(10.0, ORION), 3.0)
     assert live.state(10.0).status is TruthStatus.OK
@@ -274,8 +274,8 @@ def test_live_feed_on_run_time_takes_times_as_they_stand():
         ('{"q":[0,0,0,true]}', "finite number"),
         ('{"q":[0,0,0,2]}', "length 1"),
         ('{"q":[0,0,0,1],"rate":[1,2]}', "rate is not 3 numbers"),
-        ('{"q":[0,0,0,1],"t":"x"}', "t holds"),
-        ('{"q":[0,0,0,1],"t":1e999}', "t holds"),
+        ('{"q":[0,0,0,1],"t":"x"}', "t: 'x' is not"),
+        ('{"q":[0,0,0,1],"t":1e999}', "t: inf is not"),
         ('{"q": [0, 0, 0, 1], "rate": [0, 1e9, 0]}', "rate exceeds 600"),
     ],
 )
@@ -295,7 +295,7 @@ def test_messages_that_do_not_rise_are_rejected():
     assert "not later" in live.last_fault
 
 
-def test_two_messages_at_almost_the_same_time_make_no_endless_rate():
+def test_two_messages_at_almost_the_same_time_give_a_finite_rate():
     live = LiveTruth(EAST, timeline="run")
     live.receive(line(0.0, ORION), 0.0)
     assert not live.receive(line(5e-324, EAST), 0.1)
@@ -474,7 +474,7 @@ def test_a_jump_of_the_attitude_costs_one_message():
     assert taken == [True] * 10 + [False] + [True] * 9
 
 
-def test_a_path_that_no_file_can_have_is_named():
+def test_an_impossible_path_is_named():
     with pytest.raises(EmulatorError, match="cannot be read"):
         read_truth_file(Path("a\0b"))
 

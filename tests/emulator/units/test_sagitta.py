@@ -90,7 +90,7 @@ def test_validity_clears_when_the_lens_is_covered_and_the_count_of_stable_soluti
     with_unit("sagitta", "serial", scenario)
 
 
-def test_time_that_is_set_stands_in_the_head_of_telemetry():
+def test_time_that_is_set_appears_in_the_telemetry_header():
     def scenario(unit: Emulated) -> None:
         assert ask(unit, ACTION, 14, struct.pack("<Q", UNIX_US)) == b"\0"
         unit.step(2.5)

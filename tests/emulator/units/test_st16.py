@@ -102,7 +102,7 @@ def test_rate_is_the_true_one_in_radians_a_second():
     with_unit("st16", "serial", scenario)
 
 
-def test_return_code_is_no_success_when_the_lens_is_covered():
+def test_return_code_is_not_success_when_the_lens_is_covered():
     def scenario(unit: Emulated) -> None:
         unit.cover()
         unit.step(3.0)

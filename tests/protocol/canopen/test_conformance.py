@@ -27,7 +27,7 @@ def test_our_slave_passes(simulated_probe, case):
     assert (outcome.status, outcome.expected, outcome.seen) == ("passed", "", ""), "\n".join(outcome.log)
 
 
-def test_cases_in_a_row_leave_nothing_behind(simulated_probe):
+def test_consecutive_cases_are_independent(simulated_probe):
     probe = simulated_probe()
     failed = [
         case.id
@@ -80,6 +80,6 @@ def test_there_are_enough_mutants(mutants):
     assert len(set(names)) == len(names) >= 40
 
 
-def test_mutant_whose_place_is_gone_is_an_error(mutants):
+def test_mutant_that_no_longer_applies_is_an_error(mutants):
     with pytest.raises(ValueError, match="0 times"):
         mutants.load(mutants.Mutant("x", "sdo", "sdo", "no such text", ""))

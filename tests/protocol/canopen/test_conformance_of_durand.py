@@ -115,7 +115,7 @@ def scheduler():
     set_scheduler(before)
 
 
-def test_durand_fails_just_where_it_is_at_fault(scheduler, run_conformance):
+def test_durand_fails_only_its_known_faults(scheduler, run_conformance):
     bus = DurandBus(scheduler)
     node = MinimalNode(bus, NODE)
     od = node.object_dictionary

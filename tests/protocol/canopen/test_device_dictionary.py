@@ -18,12 +18,12 @@ from starhil.protocol.values import IcdError
 ICD = load_unit()
 
 
-def test_every_row_stands_at_its_identifier():
+def test_the_subindex_of_every_row_is_its_id():
     entries = build_dictionary(load_unit()).entries
     assert {subindex for index, subindex in entries if index == 0x2000} == {0, *(row.id for row in ICD.rows)}
 
 
-def test_every_parameter_stands_at_its_identifier(bench):
+def test_the_subindex_of_every_parameter_is_its_id(bench):
     for parameter in ICD.parameters.values():
         entry = bench.dictionary.find(0x6020, parameter.id)
         assert entry.variable.name == parameter.name

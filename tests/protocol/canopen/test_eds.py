@@ -39,7 +39,7 @@ def variables(od):
             yield from (item.subindices[subindex] for subindex in sorted(item.subindices))
 
 
-def test_dcfchk_has_nothing_to_say(eds):
+def test_dcfchk_accepts_the_eds(eds):
     program = Path(sys.executable).with_name("dcfchk")
     result = subprocess.run([program, "-n", "44", "-p", eds], capture_output=True, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")

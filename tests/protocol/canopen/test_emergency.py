@@ -20,7 +20,7 @@ def clear_error(bench, code=CODE, key=b""):
     ]
 
 
-def test_error_comes_and_goes(bench):
+def test_error_is_reported_and_reset(bench):
     assert raise_error(bench) == [(0xAC, "01ff810a0b000000")]
     assert bench.number(0x1001) == 0x81
     assert raise_error(bench) == []
@@ -39,7 +39,7 @@ def test_the_error_register_holds_the_bits_of_the_remaining_errors(bench):
     assert bench.number(0x1001) == 0x09
 
 
-def test_history_newest_first_and_limited(bench):
+def test_history_is_newest_first_and_bounded(bench):
     for number in range(10):
         raise_error(bench, 0xFF00 + number, data=bytes([number, 0x20]))
     assert bench.number(0x1003, 0) == 8
@@ -72,7 +72,7 @@ def test_switched_off_by_bit_31(bench):
     assert bench.number(0x1003, 0) == 1
 
 
-def test_identifier_moves_only_while_off(bench):
+def test_can_id_changes_only_while_disabled(bench):
     assert bench.write(0x1014, 0, 0x91) == AbortCode.VALUE_RANGE
     assert bench.write(0x1014, 0, 0x8000_00AC) == 0
     assert bench.write(0x1014, 0, 0x701) == AbortCode.VALUE_RANGE
@@ -81,7 +81,7 @@ def test_identifier_moves_only_while_off(bench):
     assert raise_error(bench)[0][0] == 0x91
 
 
-def test_nothing_in_stopped_and_all_of_it_after(bench):
+def test_nothing_is_sent_in_stopped_and_everything_afterwards(bench):
     bench.nmt(2)
     assert raise_error(bench) == []
     assert [(identifier, data[:2].hex()) for identifier, data in bench.nmt(128)] == [(0xAC, "01ff")]

@@ -35,7 +35,7 @@ def unconfigured(new_bench):
     return new_bench(255).power_on()
 
 
-def test_unconfigured_node_is_silent_but_for_lss(unconfigured):
+def test_unconfigured_node_answers_only_lss(unconfigured):
     assert unconfigured.sent == []
     assert unconfigured.slave.state is NmtState.INITIALISING
     assert unconfigured.frame(0, "0100") == []
@@ -63,7 +63,7 @@ def test_configured_node_takes_its_new_id_at_the_reset(bench):
     assert bench.frame(0x62C, "4014100000000000") == []
 
 
-def test_id_taken_away_at_the_reset(bench):
+def test_node_id_is_cleared_at_the_reset(bench):
     lss(bench, "04 01")
     assert lss(bench, "11 ff") == ["1100000000000000"]
     lss(bench, "04 00")
@@ -79,7 +79,7 @@ def test_node_id_out_of_range(bench, node_id):
 
 
 @pytest.mark.parametrize("request_", ["11 05", "13 00 02", "17", "5a", "5b", "5c", "5d", "5e"])
-def test_waiting_node_obeys_no_configuration(bench, request_):
+def test_waiting_node_ignores_configuration_commands(bench, request_):
     assert lss(bench, request_) == []
     lss(bench, "04 01")
     assert len(lss(bench, request_)) == 1
@@ -150,7 +150,7 @@ def test_other_bit_timing_tables_and_rates_that_are_not_allowed(new_bench):
     assert lss(bench, "13 00 03") == ["1301000000000000"]
 
 
-def test_activated_bit_timing_makes_silence_before_and_after(bench):
+def test_activated_bit_timing_keeps_silent_before_and_after(bench):
     bench.write(0x1017, 0, 30, 2)
     lss(bench, "04 01")
     lss(bench, "13 00 02")

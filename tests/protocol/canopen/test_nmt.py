@@ -29,7 +29,7 @@ def test_boot_up_then_pre_operational(new_bench):
 )
 @pytest.mark.parametrize("before", [1, 2, 128])
 @pytest.mark.parametrize("node", [0, 0x2C])
-def test_commands_lead_from_every_state_to_every_other(bench, before, command, node, state):
+def test_commands_switch_between_all_states(bench, before, command, node, state):
     bench.nmt(before)
     bench.nmt(command, node)
     assert bench.slave.state is state
@@ -53,7 +53,7 @@ def test_an_invalid_or_foreign_nmt_command_is_ignored(bench, data):
     assert bench.sent == bench.sent[:1]
 
 
-def test_extended_or_remote_frame_is_no_command(bench):
+def test_extended_or_remote_frame_is_not_a_command(bench):
     bench.frame(0, "012c", extended=True)
     bench.frame(0, remote=True)
     assert bench.slave.state is NmtState.PRE_OPERATIONAL
@@ -70,7 +70,7 @@ def test_reset_communication_restores_communication_only(bench):
 
 
 @pytest.mark.parametrize("node_id", [0, 128, 254, -1, 300])
-def test_node_id_that_is_none(node_id):
+def test_invalid_node_id_is_rejected(node_id):
     with pytest.raises(ProtocolError, match="node ID"):
         CanopenSlave(build_dictionary(load_unit()), node_id)
 
@@ -188,7 +188,7 @@ def test_lost_node_does_not_move_a_node_that_is_not_operational(bench):
     assert bench.slave.state is NmtState.PRE_OPERATIONAL
 
 
-def test_error_is_gone_when_the_node_is_heard_again(bench):
+def test_error_is_reset_when_the_node_is_heard_again(bench):
     watch(bench)
     bench.frame(0x705, "05")
     bench.advance(0.2)
@@ -215,7 +215,7 @@ def test_one_node_is_watched_by_one_entry(bench):
 
 
 @pytest.mark.parametrize("node", [0, 128, 255])
-def test_consumer_entry_that_names_no_node_is_not_used(bench, node):
+def test_consumer_entry_without_a_node_is_not_used(bench, node):
     assert watch(bench, node=node) == 0
     bench.frame(0x700 + (node & 0x7F), "05")
     assert [sent for sent in bench.advance(0.5) if sent[1] == 0xAC] == []

@@ -146,7 +146,7 @@ def test_event_timer(quiet):
     assert [round(time - start, 6) for time, _, _ in quiet.advance(0.12)] == [0.35]
 
 
-def test_lateness_of_the_event_timer_does_not_add_up(quiet):
+def test_lateness_of_the_event_timer_does_not_accumulate(quiet):
     configure_tpdo(quiet, event_ms=100)
     quiet.operational()
     start, times = quiet.now, []
@@ -218,7 +218,7 @@ def test_writes_to_an_enabled_pdo_are_answered_with_their_abort_code(
 @pytest.mark.parametrize(
     "identifier", [0x000, 0x07F, 0x101, 0x180, 0x581, 0x601, 0x6E0, 0x701, 0x77F, 0x7FF, 0x800]
 )
-def test_restricted_identifiers(quiet, identifier):
+def test_restricted_can_ids(quiet, identifier):
     assert quiet.write(0x1800, 1, NO_RTR | identifier) == AbortCode.VALUE_RANGE
     assert quiet.write(0x1800, 1, NO_RTR | OFF | identifier) == 0
 
@@ -262,7 +262,7 @@ def test_mapping_entries_of_an_rpdo(quiet, value, code):
     assert quiet.write(0x1600, 1, value) == code
 
 
-def test_mapping_is_fixed_while_it_counts(quiet):
+def test_mapping_is_fixed_while_its_count_is_set(quiet):
     assert quiet.write(0x1A00, 1, 0x6000_0008) == AbortCode.UNSUPPORTED_ACCESS
 
 
@@ -283,7 +283,7 @@ def test_mapping_count_over_an_empty_slot(quiet):
     assert quiet.write(0x1A00, 0, 1, 1) == AbortCode.NO_OBJECT
 
 
-def test_remapping_at_run_time(quiet):
+def test_remapping_while_operational(quiet):
     configure_tpdo(quiet, mapping=(0x6001_0108, 0x6001_0510))
     assert quiet.operational() == [(TPDO1, b"\x03\x00\x00")]
     quiet.application.rows["device_status"] = {"mode": "tracking", "boot_count": 0x1234}
@@ -291,7 +291,7 @@ def test_remapping_at_run_time(quiet):
     assert sync(quiet) == [(TPDO1, b"\x34\x12\x03")]
 
 
-def test_identifier_moves(quiet):
+def test_can_id_changes(quiet):
     assert quiet.write(0x1800, 1, NO_RTR | OFF | 0x3F0) == 0
     assert quiet.write(0x1800, 1, NO_RTR | 0x3F0) == 0
     quiet.operational()
@@ -379,7 +379,7 @@ def test_rpdo_deadline(quiet):
     assert quiet.frame(RPDO1, "03") == [(0xAC, bytes.fromhex("0000 00 5082000000"))]
 
 
-def test_remote_and_extended_frames_are_no_rpdo(quiet):
+def test_remote_and_extended_frames_are_not_rpdos(quiet):
     quiet.operational()
     quiet.frame(RPDO1, remote=True)
     quiet.frame(RPDO1, "03", extended=True)

@@ -193,7 +193,7 @@ def test_silent_client_times_out(bench):
     assert not [sent for sent in bench.advance(3.0) if sent[1] == 0x5AC]
 
 
-def test_every_request_starts_the_time_out_anew(bench):
+def test_every_request_restarts_the_timeout(bench):
     bench.sdo("40" + NAME)
     bench.advance(0.9)
     assert bench.sdo("60").startswith("00")
@@ -201,7 +201,7 @@ def test_every_request_starts_the_time_out_anew(bench):
     assert bench.sdo("70").startswith("10")
 
 
-def test_frames_that_are_no_sdo(bench):
+def test_frames_that_are_not_sdos(bench):
     assert bench.frame(0x62C, "4000100000000000", extended=True) == []
     assert bench.frame(0x62C, remote=True) == []
 

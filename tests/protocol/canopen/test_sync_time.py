@@ -40,7 +40,7 @@ def test_the_counter_wraps_at_its_overflow_and_restarts_after_stopped(bench):
 
 
 @pytest.mark.parametrize("value", [1, 241, 255])
-def test_counter_overflow_that_does_not_exist(bench, value):
+def test_invalid_counter_overflow(bench, value):
     assert bench.write(0x1019, 0, value, 1) == AbortCode.VALUE_RANGE
 
 
@@ -62,11 +62,11 @@ def test_sync_of_wrong_length_is_an_error_until_a_right_one(bench, overflow, goo
 
 
 @pytest.mark.parametrize("cob_id", [0x2000_0080, 0x0, 0x7F, 0x601, 0x801, 0x101, 0x180, 0x701])
-def test_sync_identifier_that_cannot_be(bench, cob_id):
+def test_invalid_sync_can_id(bench, cob_id):
     assert bench.write(0x1005, 0, cob_id) == AbortCode.VALUE_RANGE
 
 
-def test_sync_identifier_is_fixed_while_it_is_produced(bench):
+def test_sync_can_id_is_fixed_while_producing(bench):
     assert bench.write(0x1005, 0, 0x90) == 0
     assert bench.write(0x1005, 0, 0x4000_0090) == 0
     assert bench.write(0x1005, 0, 0x4000_0080) == AbortCode.VALUE_RANGE
@@ -112,7 +112,7 @@ def test_time_is_an_event_except_in_stopped(bench, command, heard):
     assert bench.events() == ([("time", NOON.timestamp())] if heard else [])
 
 
-def test_time_can_be_moved_and_switched_off(bench):
+def test_time_can_id_can_be_changed_and_time_disabled(bench):
     assert bench.write(0x1012, 0, 0x8000_0090) == AbortCode.VALUE_RANGE
     assert bench.write(0x1012, 0, 0x100) == 0
     bench.events()
@@ -127,7 +127,7 @@ def test_time_is_not_produced(bench):
     assert bench.write(0x1012, 0, 0xC000_0100) == AbortCode.VALUE_RANGE
 
 
-def test_high_resolution_time_stamp_runs_and_can_be_set(bench):
+def test_high_resolution_time_stamp_advances_and_can_be_set(bench):
     assert bench.write(0x1013, 0, 5) == 0
     bench.now += 0.25
     assert bench.number(0x1013) == 250_005

@@ -18,7 +18,7 @@ from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, can_pai
 
 
 @pytest.mark.parametrize("kind", CAN_KINDS)
-def test_frames_pass_both_ways_whole_in_order_and_without_echo(kind: str) -> None:
+def test_frames_pass_both_ways_intact_in_order_and_without_echo(kind: str) -> None:
     async def main() -> None:
         async with can_pair(kind) as pair:
             for frame in FRAMES:
@@ -61,7 +61,7 @@ def test_a_burst_passes_whole(kind: str) -> None:
     asyncio.run(main())
 
 
-def test_identical_frames_of_two_nodes_are_no_echo() -> None:
+def test_identical_frames_of_two_nodes_are_not_echoes() -> None:
     async def main() -> None:
         async with can_pair("udp_multicast") as pair:
             for _ in range(20):
@@ -121,7 +121,7 @@ class _BusInTrouble(can.BusABC):
         raise can.CanOperationError("bus-off")
 
 
-def test_bus_off_is_reported_and_is_no_frame() -> None:
+def test_bus_off_is_reported_and_is_not_a_frame() -> None:
     async def main() -> None:
         transport = PythonCanTransport("trouble:0", _BusInTrouble)
         errors: list[ProtocolError] = []

@@ -1,4 +1,4 @@
-"""The CAN bus over TCP from its clients' side: a hub that goes, hangs, comes back, or is none."""
+"""The CAN bus over TCP from its clients' side: a hub that ends, hangs, restarts, or is no hub."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from starhil.protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
 from tests.protocol.transports.pairs import FRAMES, HAS_VCAN, CanPair, bare, until
 
 
-def test_a_hub_that_goes_and_comes_back_is_found_again() -> None:
+def test_a_restarted_hub_is_found_again() -> None:
     async def main() -> None:
         hub = CanHub(port=0)
         await hub.start()
@@ -177,7 +177,7 @@ async def _wrong_server(greeting: bytes) -> asyncio.Server:
 
 
 @pytest.mark.parametrize("greeting", [b"SSH-2.0-OpenSSH", b"< error busy >", b"", b"< hi >"])
-def test_a_server_that_is_no_socketcand_is_reported(greeting: bytes) -> None:
+def test_a_server_other_than_socketcand_is_reported(greeting: bytes) -> None:
     async def main() -> None:
         async with await _wrong_server(greeting) as server:
             port = server.sockets[0].getsockname()[1]
@@ -192,7 +192,7 @@ IN_GUEST = "User Mode Linux" in Path("/proc/cpuinfo").read_text(encoding="utf-8"
 
 @pytest.mark.socketcan
 @pytest.mark.skipif(not IN_GUEST, reason="takes the loopback interface down: in the guest only")
-def test_a_hub_that_is_gone_without_a_word_is_noticed_and_found_again() -> None:
+def test_a_hub_lost_without_a_close_is_noticed_and_found_again() -> None:
     """The connection is half open: no FIN, no RST, packets simply vanish."""
 
     async def main() -> None:

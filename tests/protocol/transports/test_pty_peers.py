@@ -79,7 +79,7 @@ def fill(line: SerialTransport) -> None:
 
 
 @pytest.mark.parametrize("watched", [True, False], ids=["inotify", "no inotify"])
-def test_unread_bytes_are_gone_for_the_next_peer(watched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unread_bytes_are_not_passed_to_the_next_peer(watched: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     if not watched:
         monkeypatch.setattr(pty, "_watch", lambda _: -1)
 
@@ -98,9 +98,7 @@ def test_unread_bytes_are_gone_for_the_next_peer(watched: bool, monkeypatch: pyt
     asyncio.run(main())
 
 
-def test_a_peer_that_comes_before_the_loop_knows_that_the_last_one_left_gets_its_answer_and_no_other() -> (
-    None
-):
+def test_a_peer_that_connects_before_the_loop_sees_the_last_one_leave_gets_only_its_own_answer() -> None:
     async def main() -> None:
         line = open_serial("pty", paced=False)
         await line.start(lambda _: line.send(MESSAGE))
@@ -118,7 +116,7 @@ def test_a_peer_that_comes_before_the_loop_knows_that_the_last_one_left_gets_its
     asyncio.run(main())
 
 
-def test_a_peer_hears_no_rest_of_a_message_that_began_before_it_came() -> None:
+def test_a_peer_does_not_receive_the_rest_of_a_message_begun_before_it_connected() -> None:
     async def main() -> None:
         async with opened(baud=9600, paced=True) as (line, _):
             with peer(line) as fd:
@@ -132,7 +130,7 @@ def test_a_peer_hears_no_rest_of_a_message_that_began_before_it_came() -> None:
     asyncio.run(main())
 
 
-def test_a_program_that_looks_in_beside_a_peer_takes_nothing_from_it() -> None:
+def test_a_second_program_that_opens_the_port_takes_no_bytes_from_the_peer() -> None:
     async def main() -> None:
         async with opened() as (line, _):
             with peer(line) as fd:
@@ -147,7 +145,7 @@ def test_a_program_that_looks_in_beside_a_peer_takes_nothing_from_it() -> None:
     asyncio.run(main())
 
 
-def test_a_request_written_by_a_program_that_closes_at_once_is_heard() -> None:
+def test_a_request_from_a_program_that_closes_at_once_is_received() -> None:
     async def main() -> None:
         async with opened() as (line, heard):
             Path(line.description).write_bytes(REQUEST)

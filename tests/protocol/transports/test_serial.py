@@ -98,7 +98,7 @@ def test_a_vanished_port_is_reported_once_and_reopened(tmp_path: Path) -> None:
     asyncio.run(main())
 
 
-def test_a_lost_connection_comes_back_by_itself() -> None:
+def test_a_lost_connection_is_restored() -> None:
     async def main() -> None:
         one = open_serial("listen://127.0.0.1:0")
         await one.start(lambda _: None)
@@ -160,7 +160,7 @@ def test_pyserial_opens_our_pseudo_terminal_and_our_socket(tmp_path: Path) -> No
     asyncio.run(main())
 
 
-def test_the_symlink_replaces_a_stale_one_and_goes_at_close(tmp_path: Path) -> None:
+def test_the_symlink_replaces_a_stale_one_and_is_removed_at_close(tmp_path: Path) -> None:
     async def main() -> None:
         link = tmp_path / "tty"
         link.symlink_to("/nowhere")

@@ -25,7 +25,7 @@ def test_an_invalid_host_is_reported_in_one_line(kind, host):
     asyncio.run(main())
 
 
-def test_a_hub_that_goes_after_its_last_answer_is_not_joined(monkeypatch):
+def test_a_hub_that_ends_after_its_last_answer_is_not_joined(monkeypatch):
     shake = HubTransport._shake_hands
 
     async def shake_and_see_it_go(self, connection):

@@ -1,4 +1,4 @@
-// Error and health over time, with a cursor that shows the past.
+// Plots of error and health over time, with a cursor to look back.
 
 import uPlot from "/static/vendor/uPlot.esm.js";
 import { fixed, make } from "./format.js";
@@ -93,7 +93,7 @@ export class Charts {
     setTimeout(() => requestAnimationFrame(() => this.redraw()), wait);
   }
 
-  // Make the plots again, as their size or colours have changed.
+  // Redraw the plots after a change of size or colours.
   build() {
     for (const plot of this.plots) plot.u.destroy();
     this.host.replaceChildren();
@@ -165,7 +165,7 @@ export class Charts {
     ctx.restore();
   }
 
-  // While paused the window stays, unless the cursor leaves it.
+  // While paused, the window is kept, unless the cursor leaves it.
   setSpan() {
     const { store } = this;
     if (store.cursor === null) this.to = store.now;
@@ -222,13 +222,13 @@ export class Charts {
     });
   }
 
-  // A round range that grows at once and shrinks only when it is far too large, so that nothing flickers.
+  // A round range that grows at once but shrinks only when it is far too large, to prevent flicker.
   setScale(plot, highest) {
     const wanted = nice(1.1 * highest);
     if (wanted > plot.scale || wanted < 0.4 * plot.scale) plot.scale = wanted;
   }
 
-  // The modes as a band; where the attitude was not valid, it is hatched.
+  // The modes as a band, hatched where the attitude was not valid.
   drawModes(rows, position) {
     const ratio = window.devicePixelRatio || 1;
     const { clientWidth: width, clientHeight: height } = this.modes;
@@ -280,7 +280,7 @@ function pick(rows, from, to) {
   return groups.filter((group) => group[1] >= group[0]);
 }
 
-// The value of a group that is farthest from zero; null if one is missing.
+// The value of a group that is farthest from zero; null if a value is missing.
 function extreme(column, [first, last], times) {
   let best = 0;
   for (let at = first; at <= last; at++) {

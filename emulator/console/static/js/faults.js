@@ -1,4 +1,4 @@
-// Each fault and scenario as a control; what is active now.
+// Controls for all faults and scenarios, and the active faults.
 
 import { make, setText, short } from "./format.js";
 
@@ -37,7 +37,7 @@ export class Faults {
     return make("fieldset", { "data-level": level.level }, make("legend", { text: LEVELS[level.level] || level.level }), form);
   }
 
-  // A control of one value: `read` returns the value, or undefined if it was left as it is by default.
+  // A control for one value: `read` returns the value, or undefined if it is the default.
   control(control) {
     if (control.kind === "group") return this.group(control);
     const label = make("span", { text: control.name, title: control.name });
@@ -127,7 +127,7 @@ export class Faults {
   }
 }
 
-// A fault's value in one line.
+// The value of a fault in one line.
 function shown(item) {
   if (item === true) return "";
   if (typeof item !== "object" || item === null) return String(item);

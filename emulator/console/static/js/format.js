@@ -1,4 +1,4 @@
-// Numbers as text of fixed width, so that nothing jumps when they change.
+// Numbers as text of fixed width, so that the layout does not move when they change.
 
 const MINUS = "−";
 
@@ -26,7 +26,7 @@ export function wall(seconds) {
   return date.toTimeString().slice(0, 8) + "." + String(date.getMilliseconds()).padStart(3, "0");
 }
 
-// A telemetry value in no more than 14 characters.
+// A telemetry value in at most 14 characters.
 export function value(item, field) {
   if (item === null || item === undefined) return "–";
   if (typeof item === "boolean") return item ? "yes" : "no";

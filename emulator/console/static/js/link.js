@@ -5,7 +5,7 @@ const FIRST_RETRY_MS = 500;
 const LAST_RETRY_MS = 5000;
 const FRAME = 70; // "F"
 
-// The address of a path, for this page's head or another one.
+// The address of a path, for the head of this page or another one.
 export function address(path, head = QUERY.get("head")) {
   const query = new URLSearchParams({ token: QUERY.get("token") || "", ...(head && { head }) });
   return `${path}?${query}`;
@@ -66,7 +66,7 @@ export class Link {
     }
   }
 
-  // Resolve with the answer, whose `ok` says whether the request was executed.
+  // Resolve with the answer; its `ok` reports whether the request was executed.
   request(content) {
     if (this.socket.readyState !== WebSocket.OPEN) {
       return Promise.resolve({ ok: false, error: "not connected to the emulator" });
@@ -87,7 +87,7 @@ export class Link {
     this.send();
   }
 
-  // A hidden page wants nothing.
+  // A hidden page has no subscriptions.
   send() {
     if (this.socket.readyState !== WebSocket.OPEN) return;
     const wanted = document.hidden ? { frames: false, wire: false, rows: [] } : this.wanted;

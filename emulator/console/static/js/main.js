@@ -82,7 +82,7 @@ function openTab(name) {
 
 openTab(TABS.includes(location.hash.slice(1)) ? location.hash.slice(1) : "telemetry");
 
-// --- the line at the top ---
+// --- top line ---
 
 $("head").addEventListener("change", () => location.assign(address(location.pathname, $("head").value) + location.hash));
 
@@ -136,7 +136,7 @@ store.on("shown", () => {
   showMoment(item);
 });
 
-// An angle of a full turn, which is shown with four digits, is none.
+// An angle that is rounded to a full turn with four digits is shown as zero.
 function turn(degrees) {
   return degrees >= 359.99995 ? 0 : degrees;
 }
@@ -212,7 +212,7 @@ document.addEventListener("keydown", (event) => {
   found[3](event);
 });
 
-// A click leaves the keys to the page: space is to pause, not to press the button again.
+// Remove the focus after a click, so that space pauses instead of pressing the button again.
 document.addEventListener("click", (event) => {
   if (event.detail > 0 && event.target.closest("button, a")) document.activeElement.blur();
 });

@@ -17,7 +17,7 @@ export class SkyMap {
     new ResizeObserver(() => this.redraw()).observe(this.canvas.parentElement);
   }
 
-  // Right ascension grows to the left, as one sees the sky; 12 h is at the centre.
+  // Right ascension increases to the left, as seen in the sky; 12 h is at the centre.
   place(ra, dec) {
     const longitude = (((180 - ra + 540) % 360) - 180) * RAD;
     const latitude = dec * RAD;
@@ -66,7 +66,7 @@ export class SkyMap {
     this.draw();
   }
 
-  // A line, broken where it crosses the edge of the map.
+  // A line, interrupted where it crosses the edge of the map.
   line(context, points) {
     context.beginPath();
     let last = null;
@@ -143,7 +143,7 @@ export class SkyMap {
   }
 }
 
-// A direction of the sensor frame as right ascension and declination: v = q* s q.
+// A direction in the sensor frame as right ascension and declination: v = q* s q.
 function toSky([a, b, c], [x, y, z, w]) {
   const length = Math.hypot(a, b, c);
   const s = [a / length, b / length, c / length];
@@ -155,7 +155,7 @@ function toSky([a, b, c], [x, y, z, w]) {
   return [(Math.atan2(v[1], v[0]) / RAD + 360) % 360, Math.asin(Math.max(-1, Math.min(1, v[2]))) / RAD];
 }
 
-// A small circle about a direction.
+// A small circle around a direction.
 function circle(ra, dec, radius) {
   const points = [];
   const [d, r] = [dec * RAD, radius * RAD];

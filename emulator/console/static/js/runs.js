@@ -1,4 +1,4 @@
-// Session and conformance runs: the list, the one that is chosen, and its results as they come.
+// Session and conformance runs: the list, the selected run, and its results as they arrive.
 
 import { duration, make, setText } from "./format.js";
 

@@ -1,4 +1,4 @@
-// The image of the sensor with what was found in it, and what should have been.
+// The sensor image with detected, identified and missing stars.
 
 import { fixed, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
@@ -104,7 +104,7 @@ export class Sky {
     return Math.min(this.stage.clientWidth / head.width, this.stage.clientHeight / head.height) * this.zoom;
   }
 
-  // Decode the image to show; while one is decoded, later ones wait and only the newest is taken.
+  // Decode the image to be shown; images that arrive during decoding wait, and only the latest of them is used.
   async show() {
     if (this.decoding) return;
     const { image, hello, stepping } = this.store;
@@ -122,7 +122,7 @@ export class Sky {
     if (this.store.image !== image) this.show();
   }
 
-  // Say why there is no image.
+  // Show why there is no image.
   say(text) {
     setText(this.notice, text);
     this.notice.hidden = !text;
@@ -135,7 +135,7 @@ export class Sky {
     }
   }
 
-  // From image pixels, whose centres are integers, to the screen.
+  // Convert image pixels, whose centres are integers, to screen coordinates.
   place(x, y) {
     const scale = this.scale();
     return [(x + 0.5 - this.offset[0]) * scale, (y + 0.5 - this.offset[1]) * scale];
@@ -268,7 +268,7 @@ export class Sky {
     context.setLineDash([]);
   }
 
-  // Names beside their stars, brightest first; one that finds no room is left out.
+  // Names beside the stars, brightest first; names without enough space are omitted.
   drawLabels(context, labels, size, ink) {
     const height = parseFloat(context.font);
     const taken = [];
@@ -295,7 +295,7 @@ export class Sky {
     context.lineWidth = 1.4 * pen();
   }
 
-  // Where the boresight moves to: with the body rate ω it moves by ω × z = (ω_y, −ω_x).
+  // Motion of the boresight: with the body rate ω it is ω × z = (ω_y, −ω_x).
   drawRate(context, head) {
     const { index } = this.store.rows;
     const [x, y, z] = ["true_rate_x", "true_rate_y", "true_rate_z"].map((name) => head.row[index[name]]);
@@ -328,7 +328,7 @@ export class Sky {
     }
   }
 
-  // Say what is under the pointer.
+  // Describe the object under the pointer.
   point() {
     if (!this.pointer || !this.shown) return;
     const { head } = this.shown;
@@ -365,7 +365,7 @@ export class Sky {
   }
 }
 
-// Catalogue stars that were not identified though no fainter than most that were, or than V 4 if none was.
+// Catalogue stars that were not identified although they are as bright as most identified ones, or V 4 if there are none.
 function missing(head, found) {
   const matched = (head.catalogue || []).filter((star) => found.has(star[0])).map((star) => star[3]);
   matched.sort((a, b) => a - b);

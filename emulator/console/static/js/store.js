@@ -1,11 +1,11 @@
-// What the page knows: the description of the run, the numbers of the last hour, and images of it.
+// Data of the page: the description of the run, and numbers and images of the last hour.
 
 const KEPT_ROWS = 36000;
 const RECENT_S = 60; // every image of the last minute is kept …
 const SPARSE_S = 5; // … and one in five seconds of the last hour
 const KEPT_S = 3600;
 
-// Rows of numbers by column, in arrays that hold the newest rows at their end.
+// Rows of numbers by column, in arrays with the latest rows at the end.
 class Rows {
   constructor(columns) {
     this.index = Object.fromEntries(columns.map((name, number) => [name, number]));
@@ -65,7 +65,7 @@ export class Store {
     this.truth = null;
     this.stepping = 0;
     this.events = [];
-    this.cursor = null; // run time shown; null: live
+    this.cursor = null; // simulation time shown; null: live
     this.listeners = new Map();
   }
 
@@ -109,7 +109,7 @@ export class Store {
     this.emit("rows");
   }
 
-  // A page that begins to look is sent the newest image, whose row is in the history already.
+  // A new page is sent the latest image, whose row is already in the history.
   frame(head, blob) {
     if (!this.rows) return;
     const time = head.row[this.rows.index.run_s];
@@ -145,7 +145,7 @@ export class Store {
     return this.cursor === null ? this.rows.end - 1 : this.rows.find(this.cursor);
   }
 
-  // The image nearest to what is shown.
+  // The image nearest to the shown time.
   get image() {
     const { images } = this;
     if (!images.length) return null;

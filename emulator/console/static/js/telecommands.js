@@ -1,4 +1,4 @@
-// A form for each telecommand: its bytes before it is sent, and the reply after.
+// A form for each telecommand, with a preview of its bytes, and the reply.
 
 import { address } from "./link.js";
 import { limits, make, setText, wall } from "./format.js";
@@ -70,7 +70,7 @@ export class Telecommands {
       setText(this.bytes, "–");
       return;
     }
-    setText(this.problem, answer.problem ? `outside the definition, the device will judge: ${answer.problem}` : "");
+    setText(this.problem, answer.problem ? `violates the definition, but can be sent: ${answer.problem}` : "");
     const lines = [];
     if (answer.serial) lines.push(`serial   ${answer.serial}`);
     for (const frame of answer.cansend || []) lines.push(`cansend ${this.interface()} ${frame}`);

@@ -1,4 +1,4 @@
-// Every telemetry row, decoded live; only rows that are on the screen are read.
+// All telemetry rows, decoded live; only visible rows are read.
 
 import { limits, make, setText, value, wall } from "./format.js";
 

@@ -1,4 +1,4 @@
-// Dark or light, as the system has it unless the user has chosen.
+// Dark or light theme: the user's choice, or else the system's.
 
 const listeners = [];
 
@@ -24,7 +24,7 @@ export function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 }
 
-// Line widths and marks follow the size of the type, so that they can be seen on a large screen too.
+// Line widths and marks scale with the font size, so that they are visible on a large screen too.
 export function pen() {
   return Math.max(1, parseFloat(getComputedStyle(document.documentElement).fontSize) / 12.5);
 }

@@ -36,7 +36,7 @@ export class Truth {
     this.host.replaceChildren(stars, this.now, this.outcome, make("div", { class: "scroll" }, ...this.clock(hello), slew, rate, still, other));
   }
 
-  // Controls of the stepped clock.
+  // Controls for the stepped clock.
   clock(hello) {
     this.speed = null;
     if (hello.clock !== "stepped") return [];

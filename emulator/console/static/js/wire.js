@@ -63,7 +63,7 @@ export class Wire {
     return !this.text || `${line.raw} ${line.text}`.toLowerCase().includes(this.text);
   }
 
-  // Newest first; lines that are on the screen already are kept.
+  // Newest first; lines that are already on the screen are kept.
   render() {
     const shown = this.lines.filter((line) => this.wanted(line)).slice(-SHOWN_LINES).reverse();
     const there = new Map([...this.list.children].map((item) => [item.dataset.n, item]));
