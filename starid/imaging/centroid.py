@@ -22,7 +22,7 @@ X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
 UNUSABLE: Final = 1e9
 """Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
 
-GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
+GOOD, NO_FIT, HOT_PIXEL, WANDERED, FAINT = range(5)
 
 _ITERATIONS: Final = 12
 _CONVERGED_PX: Final = 1e-3
@@ -188,6 +188,7 @@ def fit_star(
     start: tuple[float, float],
     shape: tuple[float, float, float],
     noise: tuple[float, float, float],
+    least_signal: float,
     model: Array,
     work: Array,
     result: Array,
@@ -207,8 +208,10 @@ def fit_star(
     noise : (float, float, float)
         Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
         unknown); relative error of the model in a pixel.
-    model : ndarray (3, rows·columns)
-        On return, the model near the result.
+    least_signal : float
+        Least light of the first guess under its own model as weight, counts; without it the star is FAINT and not fitted.
+    model : ndarray (3, m)
+        Room for rows·columns pixels; on return, the model near the result.
     work : ndarray (5, side)
         Scratch; side at least that of the window, and 11.
     result : ndarray (FIT_COLUMNS,)
@@ -217,7 +220,10 @@ def fit_star(
     x, y = start
     result[STATE] = NO_FIT
     star_model(x, y, shape, window, model, work)
-    flux = _best_flux(pixels, model)
+    flux, signal = _best_flux(pixels, model)
+    if signal < least_signal:
+        result[STATE] = FAINT
+        return
     sums = work[4]
     for iteration in range(_ITERATIONS + 1):
         if iteration > 0:
@@ -265,8 +271,8 @@ def fit_star(
 
 
 @compiled_sums
-def _best_flux(pixels: Array32, model: Array) -> float:
-    """Best-fitting flux at a fixed position, with equal weights of all pixels."""
+def _best_flux(pixels: Array32, model: Array) -> tuple[float, float]:
+    """Best-fitting flux at a fixed position, with equal weights of all pixels, and it times the norm of the model."""
     above = 0.0
     below = 1e-12
     for k in range(pixels.size):
@@ -274,7 +280,7 @@ def _best_flux(pixels: Array32, model: Array) -> float:
         share = model[0, k] if value < UNUSABLE else 0.0
         above += share * (value if value < UNUSABLE else 0.0)
         below += share * share
-    return max(above / below, _FLOOR_FLUX)
+    return max(above / below, _FLOOR_FLUX), above / math.sqrt(below)
 
 
 @compiled_sums

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from starid.arrays import Array, Array32, Indices, Indices32, Mask
 from starid.imaging.centroid import (
     CHI2,
+    FAINT,
     FLUX,
     GOOD,
     HOT_PIXEL,
@@ -49,8 +50,11 @@ FRESH: Final = (0, 3)
 AGAIN: Final = (1, 4)
 """First and last round of `measure`: from the candidates, or from existing fits."""
 
-FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
+NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 5, 6, 7, 8
 """Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""
+
+_HOPELESS: Final = 0.6
+"""Share of the least signal of a star below which a first guess is not fitted."""
 
 _MIN_EXPLAINED: Final = 0.55
 _SHARP_SIGMA_PX: Final = 0.5
@@ -196,7 +200,7 @@ def _is_at_rest(
     bad = BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
     if star[STATE] != GOOD or star[CHI2] <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
         return False
-    fit_star(pixels, bounds, (star[X], star[Y]), (shape[0], 0.0, 0.0), noise, model, work, spot)
+    fit_star(pixels, bounds, (star[X], star[Y]), (shape[0], 0.0, 0.0), noise, 0.0, model, work, spot)
     return bool(spot[STATE] == GOOD and spot[CHI2] <= min(bad, _AT_REST * star[CHI2]))
 
 
@@ -334,7 +338,7 @@ def measure(
         if windows[k, COLUMNS] > 0.0:
             largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
             side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
-    models = np.empty((3, largest))
+    model = np.empty((3, largest))
     lights = np.empty((3, largest))
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
@@ -352,7 +356,6 @@ def measure(
             count = bounds[2] * bounds[3]
             begin = int(window[OFFSET])
             own = pixels[begin : begin + count]
-            model = models[:, :count]
             shape = (sigma, window[TRAIL_X], window[TRAIL_Y])
             target = own
             if not alone:
@@ -365,14 +368,15 @@ def measure(
                 continue
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
             guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
-            fit_star(target, bounds, guess, shape, noise, model, work, star)
+            least = _HOPELESS * least_ratio * window[NOISE] if turn == 0 and window[PATCH] == 0.0 else 0.0
+            fit_star(target, bounds, guess, shape, noise, least, model, work, star)
             if (
                 last
                 and star[STATE] == GOOD
                 and star[CHI2] > BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
                 and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
             ):
-                fit_star(target, bounds, (star[X], star[Y]), shape, noise, model, work, star)
+                fit_star(target, bounds, (star[X], star[Y]), shape, noise, 0.0, model, work, star)
             if star[STATE] == GOOD:
                 star[STATE] = _classify_fit(
                     target, model, star, window, sigma, least_ratio, saturation_dn, lit, size
