@@ -27,6 +27,11 @@ UNUSABLE: Final = 1e9
 GOOD, NO_FIT, HOT_PIXEL, WANDERED, FAINT = range(5)
 
 _ITERATIONS: Final = 12
+_HOPEFUL_STEPS: Final = 3
+_FAR_MORE: Final = 1.2
+SHARP_SIGMA_PX: Final = 0.5
+"""Standard deviation of a spot above which a single pixel does not look like a star."""
+
 _CONVERGED_PX: Final = 1e-3
 _CONVERGED_SIGMA: Final = 0.05
 _CONVERGED_FLUX: Final = 0.01
@@ -222,6 +227,11 @@ def fit_star(
     for iteration in range(_ITERATIONS + 1):
         if iteration > 0:
             star_model(x, y, shape, window, model, work)
+        if iteration == _HOPEFUL_STEPS and least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX:
+            by_shape, by_pixel, _, _ = explained(pixels, model)
+            if by_pixel > _FAR_MORE * by_shape:
+                result[STATE] = HOT_PIXEL
+                return
         _normal_equations(pixels, model, flux, noise, sums)
         a_xx, a_xy, a_yy, a_xf, a_yf, a_ff = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
         b_x, b_y, b_f = sums[6], sums[7], sums[8]

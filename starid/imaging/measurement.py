@@ -16,6 +16,7 @@ from starid.imaging.centroid import (
     GOOD,
     HOT_PIXEL,
     PIXELS,
+    SHARP_SIGMA_PX,
     SHORT_TRAIL_PX,
     STATE,
     UNUSABLE,
@@ -57,7 +58,6 @@ _HOPELESS: Final = 0.6
 """Share of the least signal of a star below which a first guess is not fitted."""
 
 _MIN_EXPLAINED: Final = 0.55
-_SHARP_SIGMA_PX: Final = 0.5
 _WANDER_PX: Final = 1.5
 _WING_SHARE: Final = 0.6
 _EDGE_SIGMA: Final = 2.5
@@ -245,7 +245,7 @@ def _classify_fit(
             else float(HOT_PIXEL)
         )
     by_shape, by_pixel, total, used = explained(pixels, model)
-    if sigma > _SHARP_SIGMA_PX and by_pixel > by_shape:
+    if sigma > SHARP_SIGMA_PX and by_pixel > by_shape:
         return float(HOT_PIXEL)
     if by_shape < _MIN_EXPLAINED * (total - 2.0 * used * noise * noise):
         return float(NOT_A_STAR)
@@ -363,7 +363,7 @@ def measure(
                 target[:] = own
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
-            if turn == 0 and sigma > _SHARP_SIGMA_PX and _is_one_pixel(target, shape, bounds, model, work):
+            if turn == 0 and sigma > SHARP_SIGMA_PX and _is_one_pixel(target, shape, bounds, model, work):
                 star[STATE] = HOT_PIXEL
                 continue
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
