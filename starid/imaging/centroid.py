@@ -27,8 +27,7 @@ UNUSABLE: Final = 1e9
 GOOD, NO_FIT, HOT_PIXEL, WANDERED, FAINT = range(5)
 
 _ITERATIONS: Final = 12
-_HOPEFUL_STEPS: Final = 3
-_FAR_MORE: Final = 1.2
+_FAR_MORE: Final = 1.8
 SHARP_SIGMA_PX: Final = 0.5
 """Standard deviation of a spot above which a single pixel does not look like a star."""
 
@@ -37,7 +36,6 @@ _CONVERGED_SIGMA: Final = 0.05
 _CONVERGED_FLUX: Final = 0.01
 _SETTLED_PX: Final = 0.02
 _MAX_STEP_PX: Final = 1.0
-_FLOOR_FLUX: Final = 1e-6
 _MIN_PIXELS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
 SHORT_TRAIL_PX: Final = 0.5
@@ -208,7 +206,8 @@ def fit_star(
         Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
         unknown); relative error of the model in a pixel.
     least_signal : float
-        Least light of the first guess under its own model as weight, counts; without it the star is FAINT and not fitted.
+        Least light at the first guess, weighted by the model's share of its norm, counts; below it the star is FAINT
+        and not fitted. 0 to fit a known star, which is not tested for a HOT_PIXEL either.
     model : ndarray (3, m)
         Room for rows·columns pixels; on return, the model near the result.
     work : ndarray (5, side)
@@ -219,19 +218,17 @@ def fit_star(
     x, y = start
     result[STATE] = NO_FIT
     star_model(x, y, shape, window, model, work)
-    flux, signal = _best_flux(pixels, model)
-    if signal < least_signal:
+    flux, by_shape, by_pixel, _, _ = explained(pixels, model)
+    if flux <= 0.0 or by_shape < least_signal * least_signal:
         result[STATE] = FAINT
+        return
+    if least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX and by_pixel > _FAR_MORE * by_shape:
+        result[STATE] = HOT_PIXEL
         return
     sums = work[4]
     for iteration in range(_ITERATIONS + 1):
         if iteration > 0:
             star_model(x, y, shape, window, model, work)
-        if iteration == _HOPEFUL_STEPS and least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX:
-            by_shape, by_pixel, _, _ = explained(pixels, model)
-            if by_pixel > _FAR_MORE * by_shape:
-                result[STATE] = HOT_PIXEL
-                return
         _normal_equations(pixels, model, flux, noise, sums)
         a_xx, a_xy, a_yy, a_xf, a_yf, a_ff = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
         b_x, b_y, b_f = sums[6], sums[7], sums[8]
@@ -275,24 +272,11 @@ def fit_star(
 
 
 @compiled_sums
-def _best_flux(pixels: Array32, model: Array) -> tuple[float, float]:
-    """Best-fitting flux at a fixed position, with equal weights of all pixels, and it times the norm of the model."""
-    above = 0.0
-    below = 1e-12
-    for k in range(pixels.size):
-        value = float(pixels[k])
-        share = model[0, k] if value < UNUSABLE else 0.0
-        above += share * (value if value < UNUSABLE else 0.0)
-        below += share * share
-    return max(above / below, _FLOOR_FLUX), above / math.sqrt(below)
+def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float, float]:
+    """Flux of a shape, and how far it and the highest pixel alone each reduce the sum of squares of a window.
 
-
-@compiled_sums
-def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float]:
-    """Reduction of the sum of squares of a window by the fitted shape, and by its highest pixel alone.
-
-    Each has its best-fitting flux. Where the highest pixel explains more than the shape of a star, it is a hot pixel or
-    a particle's hit. The sum of squares itself and its number of pixels are returned too.
+    Each has its best-fitting flux, with equal weights of all pixels. Where the highest pixel explains more than the shape
+    of a star, it is a hot pixel or a particle's hit. The sum of squares itself and its number of pixels are returned too.
     """
     highest = product = total = used = 0.0
     shape2 = 1e-12
@@ -305,4 +289,4 @@ def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float
         shape2 += share * share
         total += value * value
         used += 1.0 if valid else 0.0
-    return product * product / shape2, highest * highest, total, used
+    return product / shape2, product * product / shape2, highest * highest, total, used

@@ -150,42 +150,6 @@ def _mask_stray_pixel(
 
 
 @compiled_ieee
-def _is_one_pixel(
-    pixels: Array32,
-    shape: tuple[float, float, float],
-    bounds: tuple[int, int, int, int],
-    model: Array,
-    work: Array,
-) -> bool:
-    """Whether one pixel holds so much of a window's light that it explains more than the shape of a star anywhere.
-
-    With u the share of the shape's norm in the pixel at its centre, the Cauchy–Schwarz inequality bounds the sum of squares
-    that the shape explains (`explained`): it is below that of the pixel alone where the pixel has more than
-    (1 + u)/2 of all. Such a window needs no fit.
-    """
-    highest = total = squares = 0.0
-    place = 0
-    for k in range(pixels.size):
-        value = float(pixels[k])
-        if value > highest:
-            highest, place = value, k
-        total += value * value
-    if not (highest < UNUSABLE and 2.0 * highest * highest > total):
-        return False
-    star_model(
-        float(bounds[0] + place % bounds[2]),
-        float(bounds[1] + place // bounds[2]),
-        shape,
-        bounds,
-        model,
-        work,
-    )
-    for k in range(pixels.size):
-        squares += model[0, k] * model[0, k]
-    return bool(2.0 * highest * highest > (1.0 + model[0, place] / math.sqrt(squares)) * total)
-
-
-@compiled_ieee
 def _is_at_rest(
     pixels: Array32,
     bounds: tuple[int, int, int, int],
@@ -244,7 +208,7 @@ def _classify_fit(
             if star[FLUX] * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn
             else float(HOT_PIXEL)
         )
-    by_shape, by_pixel, total, used = explained(pixels, model)
+    _, by_shape, by_pixel, total, used = explained(pixels, model)
     if sigma > SHARP_SIGMA_PX and by_pixel > by_shape:
         return float(HOT_PIXEL)
     if by_shape < _MIN_EXPLAINED * (total - 2.0 * used * noise * noise):
@@ -363,9 +327,6 @@ def measure(
                 target[:] = own
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
-            if turn == 0 and sigma > SHARP_SIGMA_PX and _is_one_pixel(target, shape, bounds, model, work):
-                star[STATE] = HOT_PIXEL
-                continue
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
             guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
             least = _HOPELESS * least_ratio * window[NOISE] if turn == 0 and window[PATCH] == 0.0 else 0.0
