@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
-from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
+from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated, checked_beta
 from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
 Vector = NDArray[np.float64]
@@ -74,10 +74,10 @@ class Observer:
     @cached_property
     def _motion(self) -> Vector:
         """Barycentric places (3, 3) of Earth, Sun and Moon, m, and then their velocities (3, 3), m/s, ICRS."""
+        from starhil.emulator.sky.apparent import motion_at
+
         slot, since_s = divmod(self.unix_s, SLOT_S)
-        u = since_s / SLOT_S
-        powers = np.array([[1.0, u, u**2, u**3], [0.0, 1.0 / SLOT_S, 2.0 * u / SLOT_S, 3.0 * u**2 / SLOT_S]])
-        motion: Vector = (powers @ _cubics_of(int(slot))).reshape(2, 3, 3)
+        motion: Vector = motion_at(_cubics_of(int(slot)), since_s / SLOT_S, SLOT_S)
         return motion
 
     @cached_property
@@ -106,21 +106,28 @@ class Observer:
         return velocity if self.relative_velocity_m_s is None else velocity + self.relative_velocity_m_s
 
     @cached_property
+    def _beta(self) -> Vector:
+        """Velocity (3,) over that of light."""
+        return checked_beta(self.velocity_m_s)
+
+    @cached_property
     def directions(self) -> Vector:
         """Apparent directions (9, 3) of Sun, Moon and the planets."""
+        from starhil.emulator.sky.apparent import apparent_bodies
+
         slot, since_s = divmod(self.unix_s, SLOT_S)
         places, velocities, _ = _planets_of(int(slot))
-        return self.towards(np.vstack([self.sun, self.moon, places + since_s * velocities]))
-
-    def towards(self, place_m: Vector) -> Vector:
-        """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
-        gap = place_m - self.position_m
-        return aberrated(gap / np.sqrt(np.einsum("...k,...k", gap, gap))[..., None], self.velocity_m_s)
+        position, beta = self.position_m, self._beta
+        seen: Vector = apparent_bodies(self.sun, self.moon, places, velocities, since_s, position, beta)
+        return seen
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
         """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
-        shift = parallax_rad[:, None] * (self.position_m / ASTRONOMICAL_UNIT_M)
-        return aberrated(vectors - shift, self.velocity_m_s)
+        from starhil.emulator.sky.apparent import apparent_stars
+
+        position_au = self.position_m / ASTRONOMICAL_UNIT_M
+        seen: Vector = apparent_stars(vectors, parallax_rad, position_au, self._beta)
+        return seen
 
 
 def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) -> SunGlare | None:
