@@ -111,8 +111,8 @@ class Observer:
         return checked_beta(self.velocity_m_s)
 
     @cached_property
-    def directions(self) -> Vector:
-        """Apparent directions (9, 3) of Sun, Moon and the planets."""
+    def _bodies(self) -> Vector:
+        """Apparent right ascension, declination, degrees, and direction (9, 5) of Sun, Moon and the planets."""
         from starhil.emulator.sky.apparent import apparent_bodies
 
         slot, since_s = divmod(self.unix_s, SLOT_S)
@@ -120,6 +120,17 @@ class Observer:
         position, beta = self.position_m, self._beta
         seen: Vector = apparent_bodies(self.sun, self.moon, places, velocities, since_s, position, beta)
         return seen
+
+    @cached_property
+    def directions(self) -> Vector:
+        """Apparent directions (9, 3) of Sun, Moon and the planets."""
+        return self._bodies[:, 2:]
+
+    @cached_property
+    def places_deg(self) -> list[list[float]]:
+        """Apparent right ascension and declination of Sun, Moon and the planets, degrees."""
+        places: list[list[float]] = self._bodies[:, :2].tolist()
+        return places
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
         """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
@@ -135,8 +146,8 @@ def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) ->
     share = _visible_share_of_sun(observer, earth)
     if share == 0.0:
         return None
-    light = share * style.electrons_s
-    return dataclasses.replace(style, **_place(observer.directions[0]), electrons_s=light)
+    ra_deg, dec_deg = observer.places_deg[0]
+    return dataclasses.replace(style, ra_deg=ra_deg, dec_deg=dec_deg, electrons_s=share * style.electrons_s)
 
 
 def moon_seen_by(observer: Observer, style: Moon) -> Moon:
@@ -150,9 +161,11 @@ def moon_seen_by(observer: Observer, style: Moon) -> Moon:
     degrees = math.degrees(phase)
     light = 5.0 * math.log10(distance / MOON_DISTANCE_M * sun_distance / ASTRONOMICAL_UNIT_M)
     sun, moon = observer.directions[:2]
+    ra_deg, dec_deg = observer.places_deg[1]
     return dataclasses.replace(
         style,
-        **_place(moon),
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
         diameter_deg=2.0 * math.degrees(math.asin(min(MOON_RADIUS_M / distance, 1.0))),
         magnitude=-12.73 + 0.026 * degrees + 4e-9 * degrees**4 + light,
         illuminated=0.5 * (1.0 + math.cos(phase)),
@@ -171,14 +184,14 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
     if observer.relative_velocity_m_s is not None:
         nadir = aberrated(nadir, observer.relative_velocity_m_s)
     to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
-    sun = _place(observer.directions[0])
+    sun_ra_deg, sun_dec_deg = observer.places_deg[0]
     return dataclasses.replace(
         style,
         **_place(nadir),
         radius_deg=math.degrees(math.asin(min(EARTH_RADIUS_M / distance, 1.0))),
         atmosphere_deg=math.degrees(math.atan(ATMOSPHERE_M / to_limb)),
-        sun_ra_deg=sun["ra_deg"],
-        sun_dec_deg=sun["dec_deg"],
+        sun_ra_deg=sun_ra_deg,
+        sun_dec_deg=sun_dec_deg,
     )
 
 
@@ -186,9 +199,9 @@ def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
     """Return the planets from Mercury to Neptune in their places, with their magnitudes."""
     magnitudes = _planets_of(int(observer.unix_s // SLOT_S))[2]
     return tuple(
-        PointSource(**_place(direction), magnitude=magnitude, name=name)
-        for (name, _, _), magnitude, direction in zip(
-            _PLANETS, magnitudes, observer.directions[2:], strict=True
+        PointSource(ra_deg, dec_deg, magnitude, name)
+        for (name, _, _), magnitude, (ra_deg, dec_deg) in zip(
+            _PLANETS, magnitudes, observer.places_deg[2:], strict=True
         )
     )
 

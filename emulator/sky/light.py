@@ -331,16 +331,19 @@ def _blurred(image: Image, taps: Line) -> Image:
     """Return an image convolved with weights (2 m + 1,) along both axes; beyond its edge it goes on as it is there."""
     height, width = image.shape
     reach = taps.size // 2
-    out, line = np.zeros_like(image), np.empty(width, dtype=np.float32)
+    out, line = np.zeros_like(image), np.empty(width + 2 * reach, dtype=np.float32)
+    inside = line[reach : reach + width]
     for y in range(height):
-        line[:] = 0.0
+        inside[:] = 0.0
         for k in range(taps.size):
             row = image[min(max(y + k - reach, 0), height - 1)]
             for x in range(width):
-                line[x] += taps[k] * row[x]
-        for x in range(width):
-            for k in range(taps.size):
-                out[y, x] += taps[k] * line[min(max(x + k - reach, 0), width - 1)]
+                inside[x] += taps[k] * row[x]
+        line[:reach], line[reach + width :] = inside[0], inside[-1]
+        for k in range(taps.size):
+            shifted, to = line[k : k + width], out[y]
+            for x in range(width):
+                to[x] += taps[k] * shifted[x]
     return out
 
 
