@@ -107,7 +107,7 @@ class Observer:
 
     @cached_property
     def _beta(self) -> Vector:
-        """Velocity (3,) over that of light."""
+        """Velocity (3,) as a fraction of the speed of light."""
         return checked_beta(self.velocity_m_s)
 
     @cached_property
