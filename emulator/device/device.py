@@ -163,7 +163,7 @@ class Device:
         """Called at power-on and at each reset, after parameters and time have been set."""
         self.on_reset: list[Callable[[], None]] = []
         self.unresponsive = False
-        """Whether the fault is active in which requests are neither counted nor answered."""
+        """Whether the device is unresponsive: requests are neither counted nor answered."""
         self.rate_fields = rate_fields(icd)
         """Integer fields that report a body rate: field, axis, and factor from rad/s to the field's unit."""
         self._background = background

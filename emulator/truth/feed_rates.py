@@ -93,7 +93,7 @@ class FeedRates:
             self._check_against_attitudes(before, message, given_rad_s)
         elif np.abs(rate).max() > math.radians(MAX_RATE_DEG_S):
             raise FeedError(
-                f"q jumps by {_degrees(rate)} degrees per second from the message before, "
+                f"q jumps by {_degrees(rate)} degrees per second from the previous message, "
                 f"more than {MAX_RATE_DEG_S:g}; send smaller steps"
             )
         self._rate = rate
