@@ -12,8 +12,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import numpy as np
+
 from starid.arrays import Array, Array32
-from starid.imaging.normal_table import normal
+from starid.imaging.normal_table import normal, quick_normal
 from starid.jit import compiled_ieee, compiled_sums
 
 FIT_COLUMNS: Final = 9
@@ -23,18 +25,20 @@ X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
 UNUSABLE: Final = 1e9
 """Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
 
-GOOD, NO_FIT, HOT_PIXEL, WANDERED = range(4)
+GOOD, NO_FIT, HOT_PIXEL, WANDERED, FAINT = range(5)
 
 _ITERATIONS: Final = 12
+_FAR_MORE: Final = 1.8
+SHARP_SIGMA_PX: Final = 0.5
+"""Standard deviation of a spot above which a single pixel does not look like a star."""
+
 _CONVERGED_PX: Final = 1e-3
 _CONVERGED_SIGMA: Final = 0.05
 _CONVERGED_FLUX: Final = 0.01
 _SETTLED_PX: Final = 0.02
 _MAX_STEP_PX: Final = 1.0
-_FLOOR_FLUX: Final = 1e-6
 _MIN_PIXELS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
-_FAR: Final = 5.0
 SHORT_TRAIL_PX: Final = 0.5
 """Trails shorter than this are fitted as round spots, pixels."""
 
@@ -84,7 +88,7 @@ def spot_model(
             k += 1
 
 
-@compiled_ieee
+@compiled_sums
 def trail_model(
     x: float,
     y: float,
@@ -96,37 +100,30 @@ def trail_model(
     """As `spot_model`, for a spot that moves uniformly by `trail` pixels during the exposure, centred on x, y.
 
     Along the trail the light is a Gaussian smeared over its length, across it a Gaussian; the pixel's own size
-    counts as 1/12 square pixel more of the spot's variance.
+    counts as 1/12 square pixel more of the spot's variance. The loop has no branch, so it is vectorised.
     """
     left, top, columns, rows = window
     length = math.hypot(trail[0], trail[1])
-    along_x, along_y = trail[0] / length, trail[1] / length
     inverse = 1.0 / math.sqrt(sigma * sigma + _PIXEL_VARIANCE)
-    half = 0.5 * length
-    per_length = 1.0 / length
-    k = -1
-    for j in range(rows):
-        dy = top + j - y
-        for i in range(columns):
-            k += 1
-            dx = left + i - x
-            u = dx * along_x + dy * along_y
-            v = (dy * along_x - dx * along_y) * inverse
-            head = (u + half) * inverse
-            tail = (u - half) * inverse
-            if abs(v) > _FAR or tail > _FAR or head < -_FAR:
-                model[0, k] = model[1, k] = model[2, k] = 0.0
-                continue
-            _, across = normal(v)
-            across *= inverse
-            head_cdf, head_bell = normal(head)
-            tail_cdf, tail_bell = normal(tail)
-            along = (head_cdf - tail_cdf) * per_length
-            by_u = (tail_bell - head_bell) * inverse * per_length * across
-            by_v = along * across * v * inverse
-            model[0, k] = along * across
-            model[1, k] = by_u * along_x - by_v * along_y
-            model[2, k] = by_u * along_y + by_v * along_x
+    along_x, along_y = trail[0] / length * inverse, trail[1] / length * inverse
+    half = 0.5 * length * inverse
+    scale = inverse / length
+    per_row = 1.0 / columns
+    for k in range(np.int32(rows * columns)):
+        row = np.floor((k + 0.5) * per_row)
+        dx, dy = left - x + (k - row * columns), top - y + row
+        u = dx * along_x + dy * along_y
+        v = dy * along_x - dx * along_y
+        across, _ = quick_normal(v)
+        head_bell, head_cdf = quick_normal(u + half)
+        tail_bell, tail_cdf = quick_normal(u - half)
+        across *= scale
+        share = (head_cdf - tail_cdf) * across
+        by_u = (tail_bell - head_bell) * across
+        by_v = share * v
+        model[0, k] = share
+        model[1, k] = by_u * along_x - by_v * along_y
+        model[2, k] = by_u * along_y + by_v * along_x
 
 
 @compiled_ieee
@@ -189,6 +186,7 @@ def fit_star(
     start: tuple[float, float],
     shape: tuple[float, float, float],
     noise: tuple[float, float, float],
+    least_signal: float,
     model: Array,
     work: Array,
     result: Array,
@@ -208,8 +206,11 @@ def fit_star(
     noise : (float, float, float)
         Variance of a pixel without star light (counts²); variance that a count of star light brings (1/gain, 0 if
         unknown); relative error of the model in a pixel.
-    model : ndarray (3, rows·columns)
-        On return, the model near the result.
+    least_signal : float
+        Least light at the first guess, weighted by the model's share of its norm, counts; below it the star is FAINT
+        and not fitted. 0 to fit a known star, which is not tested for a HOT_PIXEL either.
+    model : ndarray (3, m)
+        Room for rows·columns pixels; on return, the model near the result.
     work : ndarray (5, side)
         Scratch; side at least that of the window, and 11.
     result : ndarray (FIT_COLUMNS,)
@@ -218,7 +219,13 @@ def fit_star(
     x, y = start
     result[STATE] = NO_FIT
     star_model(x, y, shape, window, model, work)
-    flux = _best_flux(pixels, model)
+    flux, by_shape, by_pixel, _, _ = explained(pixels, model)
+    if flux <= 0.0 or by_shape < least_signal * least_signal:
+        result[STATE] = FAINT
+        return
+    if least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX and by_pixel > _FAR_MORE * by_shape:
+        result[STATE] = HOT_PIXEL
+        return
     sums = work[4]
     for iteration in range(_ITERATIONS + 1):
         if iteration > 0:
@@ -266,24 +273,11 @@ def fit_star(
 
 
 @compiled_sums
-def _best_flux(pixels: Array32, model: Array) -> float:
-    """Best-fitting flux at a fixed position, with equal weights of all pixels."""
-    above = 0.0
-    below = 1e-12
-    for k in range(pixels.size):
-        value = float(pixels[k])
-        share = model[0, k] if value < UNUSABLE else 0.0
-        above += share * (value if value < UNUSABLE else 0.0)
-        below += share * share
-    return max(above / below, _FLOOR_FLUX)
+def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float, float]:
+    """Flux of a shape, and how far it and the highest pixel alone each reduce the sum of squares of a window.
 
-
-@compiled_sums
-def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float]:
-    """Reduction of the sum of squares of a window by the fitted shape, and by its highest pixel alone.
-
-    Each has its best-fitting flux. If the highest pixel explains more than the shape of a star, it is a hot pixel or a
-    particle hit. The sum of squares and its number of pixels are also returned.
+    Each has its best-fitting flux, with equal weights of all pixels. If the highest pixel explains more than the shape of
+    a star, it is a hot pixel or a particle hit. The sum of squares and its number of pixels are also returned.
     """
     highest = product = total = used = 0.0
     shape2 = 1e-12
@@ -296,4 +290,4 @@ def explained(pixels: Array32, model: Array) -> tuple[float, float, float, float
         shape2 += share * share
         total += value * value
         used += 1.0 if valid else 0.0
-    return product * product / shape2, highest * highest, total, used
+    return product / shape2, product * product / shape2, highest * highest, total, used

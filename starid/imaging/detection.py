@@ -15,6 +15,7 @@ from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (
     CHI2,
+    FAINT,
     FIT_COLUMNS,
     FLUX,
     GOOD,
@@ -314,7 +315,7 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
         )
     fits = _fit_candidates(scene, peaks, heights, shape)
     if unsure and fits.suspicious:
-        shape = _trails_among_round(scene, peaks, shape)
+        shape = _trails_among_round(scene, peaks[: len(fits.stars)][fits.stars[:, STATE] != FAINT], shape)
         if shape.trail_px > 0.0:
             fits = _fit_candidates(scene, *_trail_peaks(scene, shape, hot), shape)
     return _stars_of(scene, fits, shape, len(hot))

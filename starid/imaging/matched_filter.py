@@ -7,6 +7,7 @@ noise. One sweep keeps a few rows at a time, so that everything stays in the fir
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -29,8 +30,12 @@ _HALF_WIDTH_SIGMA: Final = 2.2
 _SQRT_HALF: Final = math.sqrt(0.5)
 
 
+@lru_cache(maxsize=4)
 def spot_taps(sigma_px: float) -> Array32:
-    """Right half (r + 1,) of the filter along one axis, centre first: a Gaussian integrated over pixels, sum 1."""
+    """Right half (r + 1,) of the filter along one axis, centre first: a Gaussian integrated over pixels, sum 1.
+
+    Shared between calls: not to be changed.
+    """
     reach = max(1, math.floor(_HALF_WIDTH_SIGMA * sigma_px + 0.5))
     edges = (np.arange(reach + 2) - 0.5) / sigma_px * _SQRT_HALF
     shares = np.diff([math.erf(edge) for edge in edges])

@@ -11,10 +11,12 @@ import numpy.typing as npt
 from starid.arrays import Array, Array32, Indices, Indices32, Mask
 from starid.imaging.centroid import (
     CHI2,
+    FAINT,
     FLUX,
     GOOD,
     HOT_PIXEL,
     PIXELS,
+    SHARP_SIGMA_PX,
     SHORT_TRAIL_PX,
     STATE,
     UNUSABLE,
@@ -49,11 +51,13 @@ FRESH: Final = (0, 3)
 AGAIN: Final = (1, 4)
 """First and last round of `measure`: starting from the candidates, or from existing fits."""
 
-FAINT, NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 4, 5, 6, 7, 8
+NOT_A_STAR, TWICE, OUTSIDE, WRONG_SIZE = 5, 6, 7, 8
 """Reasons to reject a candidate, in addition to those of `starid.imaging.centroid`."""
 
+_HOPELESS: Final = 0.6
+"""Share of the least signal of a star below which a first guess is not fitted."""
+
 _MIN_EXPLAINED: Final = 0.55
-_SHARP_SIGMA_PX: Final = 0.5
 _WANDER_PX: Final = 1.5
 _WING_SHARE: Final = 0.6
 _EDGE_SIGMA: Final = 2.5
@@ -146,42 +150,6 @@ def _mask_stray_pixel(
 
 
 @compiled_ieee
-def _is_one_pixel(
-    pixels: Array32,
-    shape: tuple[float, float, float],
-    bounds: tuple[int, int, int, int],
-    model: Array,
-    work: Array,
-) -> bool:
-    """Whether a single pixel explains more of a window's light than the shape of a star can anywhere.
-
-    Let u be the share of the shape's norm in its central pixel. The Cauchy–Schwarz inequality bounds the sum of squares
-    that the shape explains (`explained`): it is less than for the pixel alone if the pixel has more than
-    (1 + u)/2 of the total. Such a window needs no fit.
-    """
-    highest = total = squares = 0.0
-    place = 0
-    for k in range(pixels.size):
-        value = float(pixels[k])
-        if value > highest:
-            highest, place = value, k
-        total += value * value
-    if not (highest < UNUSABLE and 2.0 * highest * highest > total):
-        return False
-    star_model(
-        float(bounds[0] + place % bounds[2]),
-        float(bounds[1] + place // bounds[2]),
-        shape,
-        bounds,
-        model,
-        work,
-    )
-    for k in range(pixels.size):
-        squares += model[0, k] * model[0, k]
-    return bool(2.0 * highest * highest > (1.0 + model[0, place] / math.sqrt(squares)) * total)
-
-
-@compiled_ieee
 def _is_at_rest(
     pixels: Array32,
     bounds: tuple[int, int, int, int],
@@ -196,7 +164,7 @@ def _is_at_rest(
     bad = BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
     if star[STATE] != GOOD or star[CHI2] <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
         return False
-    fit_star(pixels, bounds, (star[X], star[Y]), (shape[0], 0.0, 0.0), noise, model, work, spot)
+    fit_star(pixels, bounds, (star[X], star[Y]), (shape[0], 0.0, 0.0), noise, 0.0, model, work, spot)
     return bool(spot[STATE] == GOOD and spot[CHI2] <= min(bad, _AT_REST * star[CHI2]))
 
 
@@ -240,8 +208,8 @@ def _classify_fit(
             if star[FLUX] * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn
             else float(HOT_PIXEL)
         )
-    by_shape, by_pixel, total, used = explained(pixels, model)
-    if sigma > _SHARP_SIGMA_PX and by_pixel > by_shape:
+    _, by_shape, by_pixel, total, used = explained(pixels, model)
+    if sigma > SHARP_SIGMA_PX and by_pixel > by_shape:
         return float(HOT_PIXEL)
     if by_shape < _MIN_EXPLAINED * (total - 2.0 * used * noise * noise):
         return float(NOT_A_STAR)
@@ -334,7 +302,7 @@ def measure(
         if windows[k, COLUMNS] > 0.0:
             largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
             side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
-    models = np.empty((3, largest))
+    model = np.empty((3, largest))
     lights = np.empty((3, largest))
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
@@ -352,7 +320,6 @@ def measure(
             count = bounds[2] * bounds[3]
             begin = int(window[OFFSET])
             own = pixels[begin : begin + count]
-            model = models[:, :count]
             shape = (sigma, window[TRAIL_X], window[TRAIL_Y])
             target = own
             if not alone:
@@ -360,19 +327,17 @@ def measure(
                 target[:] = own
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
-            if turn == 0 and sigma > _SHARP_SIGMA_PX and _is_one_pixel(target, shape, bounds, model, work):
-                star[STATE] = HOT_PIXEL
-                continue
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)
             guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
-            fit_star(target, bounds, guess, shape, noise, model, work, star)
+            least = _HOPELESS * least_ratio * window[NOISE] if turn == 0 and window[PATCH] == 0.0 else 0.0
+            fit_star(target, bounds, guess, shape, noise, least, model, work, star)
             if (
                 last
                 and star[STATE] == GOOD
                 and star[CHI2] > BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
                 and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
             ):
-                fit_star(target, bounds, (star[X], star[Y]), shape, noise, model, work, star)
+                fit_star(target, bounds, (star[X], star[Y]), shape, noise, 0.0, model, work, star)
             if star[STATE] == GOOD:
                 star[STATE] = _classify_fit(
                     target, model, star, window, sigma, least_ratio, saturation_dn, lit, size

@@ -87,8 +87,8 @@ def fit_pair(
     ----------
     pixels, window, shape, noise, work
         As in `fit_star`.
-    models : ndarray (6, rows·columns)
-        On return, the models of both stars.
+    models : ndarray (6, m)
+        Room for rows·columns pixels; on return, the models of both stars.
     enough : float
         CHI2 that a fit has to reach in its first steps, or it is abandoned.
     pair : ndarray (2, FIT_COLUMNS)
@@ -356,7 +356,7 @@ def split_pairs(
             continue
         noises = (windows[k, NOISE] ** 2, per_dn, model_error)
         enough = _BETTER * stars[k, CHI2]
-        fitted = fit_pair(target, bounds, shape, noises, models[:, :count], work, enough, pair)
+        fitted = fit_pair(target, bounds, shape, noises, models, work, enough, pair)
         if not fitted or not _is_better(pair, stars[k, CHI2], sigma, models, target):
             continue
         todo[k] = False

@@ -15,8 +15,9 @@ import numpy as np
 
 from starid.arrays import Array, Array32, GreyImage, Indices32, Mask
 from starid.imaging.background import interpolate_at, median
-from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, mismatch, typical_trail
-from starid.jit import compiled_ieee
+from starid.imaging.normal_table import gaussian
+from starid.imaging.trail_flow import FLOW_TERMS, fit_flow, lengths_and_mismatches
+from starid.jit import compiled_ieee, compiled_sums
 
 MOMENT_COLUMNS: Final = 5
 _PIXEL_VARIANCE: Final = 1.0 / 12.0
@@ -53,6 +54,40 @@ class SpotShape:
     flow: Array
     trail_px: float
     stars: int
+
+
+@compiled_sums
+def _weighted_sums(
+    image: GreyImage,
+    box: tuple[int, int, int, int],
+    x: float,
+    y: float,
+    inverse: tuple[float, float, float],
+    background: float,
+    saturation: float,
+) -> tuple[float, float, float, float, float, float]:
+    """Sum of the light under a Gaussian weight about (x, y), and of it times dx, dy, dx², dx·dy and dy².
+
+    `box` holds the first and last column and row, `inverse` xx, xy and yy of the weight's inverse covariance. The first sum is 0 where a saturated pixel has weight.
+    """
+    total = m_x = m_y = m_xx = m_xy = m_yy = saturated = 0.0
+    for row in range(box[2], box[3] + 1):
+        dy = row - y
+        line = image[row, box[0] : box[1] + 1]
+        for column in range(np.int32(line.size)):
+            dx = box[0] - x + column
+            distance2 = inverse[0] * dx * dx + 2.0 * inverse[1] * dx * dy + inverse[2] * dy * dy
+            value = float(line[column])
+            weight = gaussian(distance2) if distance2 <= _WEIGHT_END else 0.0
+            saturated += weight if value >= saturation else 0.0
+            light = weight * (value - background)
+            total += light
+            m_x += light * dx
+            m_y += light * dy
+            m_xx += light * dx * dx
+            m_xy += light * dx * dy
+            m_yy += light * dy * dy
+    return 0.0 if saturated > 0.0 else total, m_x, m_y, m_xx, m_xy, m_yy
 
 
 @compiled_ieee
@@ -95,24 +130,10 @@ def adaptive_moments(
         determinant = c_xx * c_yy - c_xy * c_xy
         if not determinant > 1e-4:  # the covariance of a line has no inverse
             return False
-        i_xx, i_xy, i_yy = c_yy / determinant, -c_xy / determinant, c_xx / determinant
-        total = m_x = m_y = m_xx = m_xy = m_yy = 0.0
-        for row in range(top, bottom + 1):
-            dy = row - y
-            for column in range(left, right + 1):
-                dx = column - x
-                distance2 = i_xx * dx * dx + 2.0 * i_xy * dx * dy + i_yy * dy * dy
-                if distance2 > _WEIGHT_END:
-                    continue
-                if image[row, column] >= saturation:
-                    return False
-                light = math.exp(-0.5 * distance2) * (image[row, column] - background)
-                total += light
-                m_x += light * dx
-                m_y += light * dy
-                m_xx += light * dx * dx
-                m_xy += light * dx * dy
-                m_yy += light * dy * dy
+        inverse = (c_yy / determinant, -c_xy / determinant, c_xx / determinant)
+        total, m_x, m_y, m_xx, m_xy, m_yy = _weighted_sums(
+            image, (left, right, top, bottom), x, y, inverse, background, saturation
+        )
         if not total > 0.0:
             return False
         m_x /= total
@@ -193,8 +214,9 @@ def shape_from_moments(
         positions, trails, length = _trails(table, width, height, across)
         flow = np.zeros(FLOW_TERMS)
         fit_flow(positions, trails, flow)
-        typical, off = typical_trail(flow, positions, trails)
-        if typical > _ROUND_BELOW_PX and off < _UNEXPLAINED * median(length):
+        lengths, off = lengths_and_mismatches(flow, positions, trails)
+        typical = median(lengths)
+        if typical > _ROUND_BELOW_PX and median(off) < _UNEXPLAINED * median(length):
             return SpotShape(_sigma(across, known_sigma_px), flow, typical, len(table))
     return SpotShape(_sigma(median(mean), known_sigma_px), still, 0.0, len(table))
 
@@ -222,8 +244,7 @@ def trails_among_round(table: Array, width: int, height: int, shape: SpotShape) 
         return shape
     found = shape_from_moments(longest, width, height, shape.sigma_px, shape.sigma_px)
     positions, trails, length = _trails(longest, width, height, shape.sigma_px**2 + _PIXEL_VARIANCE)
-    off = np.array([mismatch(found.flow, positions, trails, k)[0] for k in range(len(positions))])
-    agree = np.count_nonzero(off < _AGREES * length)
+    agree = np.count_nonzero(lengths_and_mismatches(found.flow, positions, trails)[1] < _AGREES * length)
     return found if found.trail_px > 0.0 and agree >= max(_MIN_LONG, _MAX_AGREE * len(longest)) else shape
 
 

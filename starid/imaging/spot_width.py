@@ -56,7 +56,7 @@ def _one_width(
         work = np.empty((5, max(side, 11)))
         place = (float(column), float(row))
         noises = (noise * noise, 0.0, _MODEL_ERROR)
-        fit_star(pixels, window, place, (sigma, 0.0, 0.0), noises, model, work, result)
+        fit_star(pixels, window, place, (sigma, 0.0, 0.0), noises, 0.0, model, work, result)
         if result[STATE] != GOOD or not result[FLUX] > 0.0:
             return math.nan
         x, y, flux = result[X], result[Y], result[FLUX]

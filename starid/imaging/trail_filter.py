@@ -19,6 +19,7 @@ from starid.jit import compiled_ieee
 
 _TILE_COLUMNS: Final = 128
 _TILE_ROWS: Final = 32
+_TILE_PIXELS: Final = _TILE_COLUMNS * _TILE_ROWS
 _MAX_STEPS: Final = 96
 
 
@@ -31,34 +32,33 @@ def _sum_along(
     sums: npt.NDArray[np.uint16] | npt.NDArray[np.uint32],
     out: npt.NDArray[np.uint16],
 ) -> None:
-    """Sum of the image at `steps` positions along the trail of each tile, shifted right; `sums` is a tile's row.
+    """Sum of the image at `steps` positions along the trail of each tile, shifted right; `sums` is a tile.
 
     Indices are unsigned: without the case of negative ones the loops become vector instructions.
     """
     height, width = image.shape
     pixels, target = image.reshape(image.size), out.reshape(out.size)
-    offset = np.empty((2, steps), np.int64)
     for top in range(0, height, _TILE_ROWS):
         for left in range(0, width, _TILE_COLUMNS):
             bottom, columns = min(top + _TILE_ROWS, height), min(_TILE_COLUMNS, width - left)
             middle_x, middle_y = left + 0.5 * (columns - 1), 0.5 * (top + bottom - 1)
             trail_x, trail_y = trail_at(flow, middle_x, middle_y, width, height)
+            sums[:] = 0
             for step in range(steps):
                 part = (step + 0.5) / steps - 0.5
-                offset[0, step], offset[1, step] = round(part * trail_x), round(part * trail_y)
-            for y in range(top, bottom):
-                sums[:] = 0
-                for step in range(steps):
-                    row = min(max(y + offset[1, step], 0), height - 1)
-                    start = left + offset[0, step]
-                    first = min(max(0, -start), columns)
-                    last = max(min(columns, width - start), first)
-                    to, source = np.uint64(first), np.uint64(row * width + start + first)
-                    for k in range(np.uint64(last - first)):
+                start, down = left + round(part * trail_x), round(part * trail_y)
+                first = min(max(0, -start), columns)
+                count = np.uint64(max(min(columns, width - start) - first, 0))
+                for y in range(top, bottom):
+                    row = min(max(y + down, 0), height - 1)
+                    to = np.uint64((y - top) * _TILE_COLUMNS + first)
+                    source = np.uint64(row * width + start + first)
+                    for k in range(count):
                         sums[to + k] += pixels[source + k]
-                begin = np.uint64(y * width + left)
+            for y in range(top, bottom):
+                begin, place = np.uint64(y * width + left), np.uint64((y - top) * _TILE_COLUMNS)
                 for k in range(np.uint64(columns)):
-                    target[begin + k] = sums[k] >> shift
+                    target[begin + k] = sums[place + k] >> shift
 
 
 def trail_steps(flow: Array, width: int, height: int) -> int:
@@ -91,10 +91,10 @@ def sum_along_trails(image: GreyImage, flow: Array, steps: int) -> tuple[npt.NDA
     """
     out = np.empty(image.shape, dtype=np.uint16)
     if image.dtype == np.uint8:
-        _sum_along(image, flow, steps, 0, np.empty(_TILE_COLUMNS, np.uint16), out)
+        _sum_along(image, flow, steps, 0, np.empty(_TILE_PIXELS, np.uint16), out)
         return out, float(steps)
     shift = math.ceil(math.log2(steps))
-    _sum_along(image, flow, steps, shift, np.empty(_TILE_COLUMNS, np.uint32), out)
+    _sum_along(image, flow, steps, shift, np.empty(_TILE_PIXELS, np.uint32), out)
     return out, steps / 2.0**shift
 
 

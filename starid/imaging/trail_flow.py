@@ -62,7 +62,7 @@ def _rows(u: float, v: float, rows: Array) -> None:
 
 
 @compiled_ieee
-def mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[float, float]:
+def _mismatch(flow: Array, positions: Array, trails: Array, k: int) -> tuple[float, float]:
     """Distance between the measured trail k and the flow's, and the sense (±1) that minimises it."""
     dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
     forth = math.hypot(trails[k, 0] - dx, trails[k, 1] - dy)
@@ -129,7 +129,7 @@ def _mean_mismatch(flow: Array, positions: Array, trails: Array) -> float:
     """Mean distance between the measured trails and the flow, each limited to half its length."""
     total = 0.0
     for k in range(positions.shape[0]):
-        off, _ = mismatch(flow, positions, trails, k)
+        off, _ = _mismatch(flow, positions, trails, k)
         total += min(off, 0.5 * math.hypot(trails[k, 0], trails[k, 1]))
     return float(total / positions.shape[0])
 
@@ -169,7 +169,7 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
     off = np.empty(count)
     for _ in range(_ROUNDS):
         for k in range(count):
-            off[k], senses[k] = mismatch(flow, positions, trails, k)
+            off[k], senses[k] = _mismatch(flow, positions, trails, k)
         limit = max(_CLIP * np.median(off), _MIN_CLIP_PX)
         kept = 0
         for k in range(count):
@@ -183,12 +183,12 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
 
 
 @compiled_ieee
-def typical_trail(flow: Array, positions: Array, trails: Array) -> tuple[float, float]:
-    """Median length of a flow's trails at positions (n, 2), and median distance from the measured ones (n, 2), pixels."""
+def lengths_and_mismatches(flow: Array, positions: Array, trails: Array) -> tuple[Array, Array]:
+    """Lengths (n,) of a flow's trails at positions (n, 2), and their distances (n,) from the measured ones (n, 2), pixels."""
     lengths = np.empty(positions.shape[0])
     off = np.empty(positions.shape[0])
     for k in range(positions.shape[0]):
         dx, dy = _flow_trail(flow, positions[k, 0], positions[k, 1])
         lengths[k] = math.hypot(dx, dy)
-        off[k], _ = mismatch(flow, positions, trails, k)
-    return float(np.median(lengths)), float(np.median(off))
+        off[k], _ = _mismatch(flow, positions, trails, k)
+    return lengths, off
