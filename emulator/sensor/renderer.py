@@ -193,6 +193,13 @@ class Renderer:
         step = max(float(self._pattern.sensitivity.max()), 1.0) / np.iinfo(np.uint16).max
         return np.rint(self._pattern.sensitivity / np.float32(step)).astype(np.uint16), step
 
+    @cached_property
+    def _dark_roots(self) -> tuple[npt.NDArray[np.uint16], float]:
+        """Square roots (h, w) of the dark current at the reference temperature in 65535 steps, and electrons/s at one of them."""
+        step = max(math.sqrt(float(self._pattern.dark_e_s.max())), 1e-3) / np.iinfo(np.uint16).max
+        roots = np.sqrt(np.maximum(self._pattern.dark_e_s, 0.0)) / np.float32(step)
+        return np.rint(roots).astype(np.uint16), step**2
+
     def sensor_magnitudes(self) -> npt.NDArray[np.float64]:
         """Magnitudes (n,) of all catalogue stars in the sensor's band."""
         colour = np.nan_to_num(self.catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
@@ -349,6 +356,8 @@ class Renderer:
             backdrop = Backdrop(
                 self._still,
                 *self._sensitivity,
+                dark=self._dark_roots[0],
+                dark_unit_e=self._dark_roots[1] * self.sensor.dark_factor(temperature_c) * exposure_s,
                 sky_e_s=float(self._sky_e_s),
                 exposure_s=exposure_s,
                 min_glare_e=_GLARE_SHARE * self.sensor.read_noise_e,

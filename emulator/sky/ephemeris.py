@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
-from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated
+from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated, checked_beta
 from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
 Vector = NDArray[np.float64]
@@ -74,10 +74,10 @@ class Observer:
     @cached_property
     def _motion(self) -> Vector:
         """Barycentric places (3, 3) of Earth, Sun and Moon, m, and then their velocities (3, 3), m/s, ICRS."""
+        from starhil.emulator.sky.apparent import motion_at
+
         slot, since_s = divmod(self.unix_s, SLOT_S)
-        u = since_s / SLOT_S
-        powers = np.array([[1.0, u, u**2, u**3], [0.0, 1.0 / SLOT_S, 2.0 * u / SLOT_S, 3.0 * u**2 / SLOT_S]])
-        motion: Vector = (powers @ _cubics_of(int(slot))).reshape(2, 3, 3)
+        motion: Vector = motion_at(_cubics_of(int(slot)), since_s / SLOT_S, SLOT_S)
         return motion
 
     @cached_property
@@ -106,21 +106,39 @@ class Observer:
         return velocity if self.relative_velocity_m_s is None else velocity + self.relative_velocity_m_s
 
     @cached_property
-    def directions(self) -> Vector:
-        """Apparent directions (9, 3) of Sun, Moon and the planets."""
+    def _beta(self) -> Vector:
+        """Velocity (3,) over that of light."""
+        return checked_beta(self.velocity_m_s)
+
+    @cached_property
+    def _bodies(self) -> Vector:
+        """Apparent right ascension, declination, degrees, and direction (9, 5) of Sun, Moon and the planets."""
+        from starhil.emulator.sky.apparent import apparent_bodies
+
         slot, since_s = divmod(self.unix_s, SLOT_S)
         places, velocities, _ = _planets_of(int(slot))
-        return self.towards(np.vstack([self.sun, self.moon, places + since_s * velocities]))
+        position, beta = self.position_m, self._beta
+        seen: Vector = apparent_bodies(self.sun, self.moon, places, velocities, since_s, position, beta)
+        return seen
 
-    def towards(self, place_m: Vector) -> Vector:
-        """Return the apparent direction (…, 3) of a barycentric place from which light arrives now."""
-        gap = place_m - self.position_m
-        return aberrated(gap / np.sqrt(np.einsum("...k,...k", gap, gap))[..., None], self.velocity_m_s)
+    @cached_property
+    def directions(self) -> Vector:
+        """Apparent directions (9, 3) of Sun, Moon and the planets."""
+        return self._bodies[:, 2:]
+
+    @cached_property
+    def places_deg(self) -> list[list[float]]:
+        """Apparent right ascension and declination of Sun, Moon and the planets, degrees."""
+        places: list[list[float]] = self._bodies[:, :2].tolist()
+        return places
 
     def apparent_stars(self, vectors: Vector, parallax_rad: Vector) -> Vector:
         """Return the directions (n, 3) of stars with parallax and aberration, as vectors of length 1 but for the parallax."""
-        shift = parallax_rad[:, None] * (self.position_m / ASTRONOMICAL_UNIT_M)
-        return aberrated(vectors - shift, self.velocity_m_s)
+        from starhil.emulator.sky.apparent import apparent_stars
+
+        position_au = self.position_m / ASTRONOMICAL_UNIT_M
+        seen: Vector = apparent_stars(vectors, parallax_rad, position_au, self._beta)
+        return seen
 
 
 def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) -> SunGlare | None:
@@ -128,8 +146,8 @@ def sun_seen_by(observer: Observer, style: SunGlare, earth: EarthLimb | None) ->
     share = _visible_share_of_sun(observer, earth)
     if share == 0.0:
         return None
-    light = share * style.electrons_s
-    return dataclasses.replace(style, **_place(observer.directions[0]), electrons_s=light)
+    ra_deg, dec_deg = observer.places_deg[0]
+    return dataclasses.replace(style, ra_deg=ra_deg, dec_deg=dec_deg, electrons_s=share * style.electrons_s)
 
 
 def moon_seen_by(observer: Observer, style: Moon) -> Moon:
@@ -143,9 +161,11 @@ def moon_seen_by(observer: Observer, style: Moon) -> Moon:
     degrees = math.degrees(phase)
     light = 5.0 * math.log10(distance / MOON_DISTANCE_M * sun_distance / ASTRONOMICAL_UNIT_M)
     sun, moon = observer.directions[:2]
+    ra_deg, dec_deg = observer.places_deg[1]
     return dataclasses.replace(
         style,
-        **_place(moon),
+        ra_deg=ra_deg,
+        dec_deg=dec_deg,
         diameter_deg=2.0 * math.degrees(math.asin(min(MOON_RADIUS_M / distance, 1.0))),
         magnitude=-12.73 + 0.026 * degrees + 4e-9 * degrees**4 + light,
         illuminated=0.5 * (1.0 + math.cos(phase)),
@@ -164,14 +184,14 @@ def earth_seen_by(observer: Observer, style: EarthLimb) -> EarthLimb | None:
     if observer.relative_velocity_m_s is not None:
         nadir = aberrated(nadir, observer.relative_velocity_m_s)
     to_limb = math.sqrt(max(distance**2 - EARTH_RADIUS_M**2, EARTH_RADIUS_M * ATMOSPHERE_M))
-    sun = _place(observer.directions[0])
+    sun_ra_deg, sun_dec_deg = observer.places_deg[0]
     return dataclasses.replace(
         style,
         **_place(nadir),
         radius_deg=math.degrees(math.asin(min(EARTH_RADIUS_M / distance, 1.0))),
         atmosphere_deg=math.degrees(math.atan(ATMOSPHERE_M / to_limb)),
-        sun_ra_deg=sun["ra_deg"],
-        sun_dec_deg=sun["dec_deg"],
+        sun_ra_deg=sun_ra_deg,
+        sun_dec_deg=sun_dec_deg,
     )
 
 
@@ -179,9 +199,9 @@ def planets_seen_by(observer: Observer) -> tuple[PointSource, ...]:
     """Return the planets from Mercury to Neptune in their places, with their magnitudes."""
     magnitudes = _planets_of(int(observer.unix_s // SLOT_S))[2]
     return tuple(
-        PointSource(**_place(direction), magnitude=magnitude, name=name)
-        for (name, _, _), magnitude, direction in zip(
-            _PLANETS, magnitudes, observer.directions[2:], strict=True
+        PointSource(ra_deg, dec_deg, magnitude, name)
+        for (name, _, _), magnitude, (ra_deg, dec_deg) in zip(
+            _PLANETS, magnitudes, observer.places_deg[2:], strict=True
         )
     )
 

@@ -40,6 +40,9 @@ _SMOOTH_PX: Final = 13.0 * GLARE_STEP
 _EDGE_PX: Final = 8.0
 """Pixels around the Moon's disc into which its edge is blurred."""
 
+_BLUR_SIGMAS: Final = 4.0
+"""Reach of the blur of the Moon's edge, standard deviations of a spot."""
+
 _SPOT_SIGMAS: Final = 2.0
 """Width of a spot in units of its standard deviation."""
 
@@ -145,7 +148,8 @@ class AreaLight:
             hidden = none if self.earth is None else self.earth.grid[2]
             exposure_s = backdrop.unit * backdrop.exposure_s
             smooth = none if glare is None else glare
-            fill(mean, backdrop.still, backdrop.sensitivity, smooth, hidden, exposure_s)
+            planes = backdrop.still, backdrop.dark, backdrop.sensitivity
+            fill(mean, planes, smooth, hidden, (backdrop.dark_unit_e, backdrop.sky_e_s, exposure_s))
         for near in self.near:
             _refine_glare(mean, backdrop.sensitivity, near, backdrop.unit * backdrop.exposure_s)
         for layer in self._layers:
@@ -323,6 +327,27 @@ def _draw_moon(
 
 
 @compiled_ieee
+def _blurred(image: Image, taps: Line) -> Image:
+    """Return an image convolved with weights (2 m + 1,) along both axes; beyond its edge it goes on as it is there."""
+    height, width = image.shape
+    reach = taps.size // 2
+    out, line = np.zeros_like(image), np.empty(width + 2 * reach, dtype=np.float32)
+    inside = line[reach : reach + width]
+    for y in range(height):
+        inside[:] = 0.0
+        for k in range(taps.size):
+            row = image[min(max(y + k - reach, 0), height - 1)]
+            for x in range(width):
+                inside[x] += taps[k] * row[x]
+        line[:reach], line[reach + width :] = inside[0], inside[-1]
+        for k in range(taps.size):
+            shifted, to = line[k : k + width], out[y]
+            for x in range(width):
+                to[x] += taps[k] * shifted[x]
+    return out
+
+
+@compiled_ieee
 def _add_earth(
     electrons_s: Image,
     transmission: Image,
@@ -419,6 +444,13 @@ class AreaPainter:
         steps = (GLARE_STEP * np.arange(-(-size // GLARE_STEP) + 1) for size in self._size)
         return self._directions_of(*steps)
 
+    @cached_property
+    def _spot_taps(self) -> Line:
+        """Weights (2 m + 1,) of a Gaussian as wide as a spot."""
+        reach = math.ceil(_BLUR_SIGMAS * self._psf_sigma_px)
+        weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / self._psf_sigma_px) ** 2)
+        return np.asarray(weights / weights.sum(), dtype=np.float32)
+
     @property
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
@@ -488,8 +520,6 @@ class AreaPainter:
 
     def _moon_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
         """Return the Moon's disc with the terminator; nothing if it is outside the image."""
-        import cv2
-
         source, scale = attitude.to_sensor(moon.direction), moon.radius_rad / self._camera.pixel_scale_rad
         box = self._box_around(source, moon.radius_rad + _EDGE_PX * self._camera.pixel_scale_rad)
         if box is None:
@@ -503,8 +533,7 @@ class AreaPainter:
         shape = (scale, moon.illuminated, self._moonlight(moon) / area)
         disc, passed = np.empty((2, box[1] - box[0], box[3] - box[2]), dtype=np.float32)
         _draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
-        light = np.asarray(cv2.GaussianBlur(disc, (0, 0), self._psf_sigma_px), dtype=np.float32)
-        return (Patch(box, light, passed, hides_glare=False),)
+        return (Patch(box, _blurred(disc, self._spot_taps), passed, hides_glare=False),)
 
     def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
         """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""

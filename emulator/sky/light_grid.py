@@ -16,6 +16,9 @@ Image = npt.NDArray[np.float32]
 Sensitivity = npt.NDArray[np.uint16]
 """Relative signal of each pixel (h, w) in a unit of its own: two bytes are read faster than four."""
 
+Roots = npt.NDArray[np.uint16]
+"""Square roots of the dark current of each pixel (h, w): two bytes state it far more finely than its noise."""
+
 GLARE_STEP: Final = 8
 """Pixels between the points at which smooth light is computed."""
 
@@ -32,6 +35,10 @@ class Backdrop:
         Relative signal of each pixel, in units of `unit`.
     unit : float
         Relative signal of a sensitivity of 1.
+    dark : ndarray (h, w), uint16
+        Square roots of the dark current of each pixel.
+    dark_unit_e : float
+        Electrons at a root of 1.
     sky_e_s : float
         Light of the sky, electrons/s in a pixel of mean sensitivity.
     exposure_s : float
@@ -45,6 +52,8 @@ class Backdrop:
     still: Image
     sensitivity: Sensitivity
     unit: float
+    dark: Roots
+    dark_unit_e: float
     sky_e_s: float
     exposure_s: float
     min_glare_e: float = 0.0
@@ -62,14 +71,21 @@ def expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32], first: i
 
 @compiled_ieee
 def fill(
-    out: Image, still: Image, sensitivity: Sensitivity, glare: Image, height: Image, exposure_s: float
+    out: Image,
+    planes: tuple[Image, Roots, Sensitivity],
+    glare: Image,
+    height: Image,
+    units: tuple[float, float, float],
 ) -> None:
-    """Fill (h, w) with `still` plus smooth light, interpolated linearly between the points of its grid.
+    """Fill (h, w) with dark current, sky and smooth light, interpolated linearly between the points of its grid.
 
-    `exposure_s` is that of a pixel with a sensitivity of 1.
-    Without `glare` (of size 0) there is no light. Where all corners of a cell have a `height` of at most 0 the image is
-    left as it is, unless that has size 0.
+    `planes` are `still`, `dark` and `sensitivity` of a `Backdrop`; `units` the electrons at a root of 1, the light of the
+    sky and the exposure at a sensitivity of 1. Without `glare` (of size 0), `still` is copied. Where all corners of
+    a cell have a `height` of at most 0 the image is left as it is, unless that has size 0.
     """
+    still, dark, sensitivity = planes
+    exposure_s = units[2]
+    per_root, sky = np.float32(units[0]), np.float32(units[1] * exposure_s)
     rows, width = out.shape
     cells = (width + GLARE_STEP - 1) // GLARE_STEP
     upper = np.empty(cells * GLARE_STEP, dtype=np.float32)
@@ -91,14 +107,16 @@ def fill(
             run = slice(start * GLARE_STEP, min(end * GLARE_STEP, width))
             above, below = upper[run], lower[run]
             for y in range(band * GLARE_STEP, min((band + 1) * GLARE_STEP, rows)):
-                to, base, gain = out[y, run], still[y, run], sensitivity[y, run]
+                to, root, gain = out[y, run], dark[y, run], sensitivity[y, run]
                 if not glare.size:
-                    to[:] = base
+                    to[:] = still[y, run]
                     continue
                 share = np.float32(y % GLARE_STEP) * np.float32(exposure_s / GLARE_STEP)
                 rest = np.float32(exposure_s) - share
                 for x in range(to.size):
-                    to[x] = base[x] + np.float32(gain[x]) * (rest * above[x] + share * below[x])
+                    own = np.float32(root[x])
+                    light = sky + rest * above[x] + share * below[x]
+                    to[x] = per_root * own * own + np.float32(gain[x]) * light
 
 
 @inner

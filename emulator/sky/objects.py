@@ -5,6 +5,7 @@ All are plain values for profiles and tests; `starhil.emulator.sky.light` render
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterator, Mapping
@@ -294,6 +295,12 @@ class SkyObjects:
             fields["false_star_magnitudes"] = _pair("false_star_magnitudes", fields["false_star_magnitudes"])
         objects: Self = _from_table("", cls, fields)
         return objects
+
+    def with_computed(self, **fields: Any) -> Self:
+        """Return a copy with other values for some fields, computed ones whose ranges are not checked."""
+        changed = copy.copy(self)
+        changed.__dict__.update(fields)
+        return changed
 
     @property
     def has_extended_objects(self) -> bool:

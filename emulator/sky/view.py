@@ -128,7 +128,7 @@ class Sky:
             moon = moon_seen_by(observer, self._styles["moon"])
             if not hidden_by(earth, moon):
                 changes["moon"] = moon
-        return dataclasses.replace(objects, **changes)
+        return objects.with_computed(**changes)
 
 
 def _styled(name: str, style: Any, fields: dict[str, Any]) -> Any:

@@ -94,6 +94,7 @@ def test_a_wide_earth_matches_a_computation_per_pixel(
     earth = EarthLimb(83.8, -1.0 - radius_deg, radius_deg=radius_deg, atmosphere_deg=0.2, **lit)
     objects = SkyObjects(earth=earth, sun=SunGlare(83.8, 60.0, 2000.0))
     flat = np.ones((camera.height, camera.width), dtype=np.float32)
+    ones = flat.astype(np.uint16)
     pixels = np.argwhere(flat)[::97, ::-1].astype(np.float64)
 
     def painted(wide_from_deg: float) -> tuple[np.ndarray, np.ndarray, float]:
@@ -101,7 +102,7 @@ def test_a_wide_earth_matches_a_computation_per_pixel(
         light = AreaPainter(camera, 1.8e6, 0.8).paint(objects, ORION)
         assert (light.earth is None) == (wide_from_deg > radius_deg)
         mean = np.zeros_like(flat)
-        light.draw(mean, Backdrop(flat, flat.astype(np.uint16), 1.0, sky_e_s=1.0, exposure_s=1.0))
+        light.draw(mean, Backdrop(flat, ones, 1.0, 0 * ones, 0.0, sky_e_s=1.0, exposure_s=1.0))
         return mean, light.seen_at(pixels), light.covered_share
 
     mean, visible, share = painted(0.0)
@@ -117,8 +118,8 @@ def test_glare_around_a_source_in_the_field_matches_a_computation_per_pixel(rend
     camera, moon = DEFAULT_CAMERA, Moon(80.0, 2.0, magnitude=-12.7)
     light = AreaPainter(camera, renderer.sensor.zero_magnitude_e_s, 0.8).paint(SkyObjects(moon=moon), ORION)
     zero = np.zeros((camera.height, camera.width), dtype=np.float32)
-    mean = zero.copy()
-    light.draw(mean, Backdrop(zero, np.ones(zero.shape, dtype=np.uint16), 1.0, sky_e_s=0.0, exposure_s=0.2))
+    mean, ones = zero.copy(), np.ones(zero.shape, dtype=np.uint16)
+    light.draw(mean, Backdrop(zero, ones, 1.0, 0 * ones, 0.0, sky_e_s=0.0, exposure_s=0.2))
     x, y = np.meshgrid(np.arange(0, 937, 3), np.arange(0, 937, 3))
     seen = camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
     chord2 = np.sum((seen - ORION.to_sensor(icrs_vector(80.0, 2.0))) ** 2, axis=1)
