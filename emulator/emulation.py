@@ -235,7 +235,7 @@ class Emulation:
         """
         leader = self.leader
         truth = await leader._open_truth(config)  # noqa: SLF001 (of this class)
-        self._enter(
+        self._record_entry(
             "truth", config=config.model_dump(mode="json"), start_s=getattr(truth, "start_s", self._now_s())
         )
         leader.replace_truth(truth, config)
@@ -290,14 +290,14 @@ class Emulation:
         self.feed = feed
         return truth
 
-    def _enter(self, kind: str, **values: object) -> None:
+    def _record_entry(self, kind: str, **values: object) -> None:
         """Record an entry on the tape, if there is one."""
         if self.tape is not None:
             self.tape.enter(kind, **values)
 
     def _message_received(self, data: bytes) -> None:
         """Record a message of the feed."""
-        self._enter("feed", data=data.decode("latin-1"))
+        self._record_entry("feed", data=data.decode("latin-1"))
 
     def _now_s(self) -> float:
         """Return the simulation time, seconds."""
@@ -423,7 +423,7 @@ class Emulation:
         try:
             self.warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
-            self._enter("ready")
+            self._record_entry("ready")
             device.on_mode.append(
                 lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
             )

@@ -105,7 +105,7 @@ class TruthLog:
 
     def __init__(self, path: Path, *, overwrite: bool = False, wall_times: bool = True) -> None:
         self._path = path
-        self._left_out = () if wall_times else WALL_TIMES
+        self._empty_columns = () if wall_times else WALL_TIMES
         self._size = 0
         self._file: io.FileIO | None = None
         try:
@@ -122,7 +122,7 @@ class TruthLog:
         if self._file is None:
             return
         try:
-            row = compare(measurement) | dict.fromkeys(self._left_out)
+            row = compare(measurement) | dict.fromkeys(self._empty_columns)
             self._write_row([_format_cell(name, value) for name, value in row.items()])
         except OSError as error:
             log.warning(

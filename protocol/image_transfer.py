@@ -1,7 +1,7 @@
 """Transfer of images and files, for both ends: image frames with a checksum, burst packets and the hole map.
 
 Image frames follow the CubeSense node, bursts the CubeComputer. The checksum algorithms are not public; both
-are ours.
+are our own choice.
 """
 
 from __future__ import annotations

@@ -238,7 +238,7 @@ def _rms(values: Array) -> float:
 
 
 def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
-    """Plot error and bound over magnitude, one panel per rate, to an image or PDF file."""
+    """Plot error and bound against magnitude, one panel per rate, to an image or PDF file."""
     import matplotlib as mpl
 
     mpl.use("Agg")

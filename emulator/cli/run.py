@@ -226,7 +226,7 @@ def _absolute_folder(unit: str) -> str:
 
 
 def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
-    """Return the MCAP file of `--record`, or its folder; None without."""
+    """Return the MCAP file of `--record`, or its folder; None without the option."""
     from starhil.emulator.errors import EmulatorError
 
     found = [path for path in paths or () if (path.suffix == ".mcap") == mcap]

@@ -206,13 +206,13 @@ class McapRecorder:
         if not self._room.acquire(blocking=False):
             self.dropped += 1
             return
-        write = functools.partial(self._add, topic, schema, at_ns, content)
+        write = functools.partial(self._add_to_file, topic, schema, at_ns, content)
         self._disk.submit(self._on_disk, write).add_done_callback(self._written)
 
     def _written(self, _future: object) -> None:
         self._room.release()
 
-    def _add(self, topic: str, schema: str, at_ns: int, content: dict[str, Any]) -> None:
+    def _add_to_file(self, topic: str, schema: str, at_ns: int, content: dict[str, Any]) -> None:
         if topic not in self._channels:
             self._channels[topic] = self._writer.register_channel(
                 topic=topic, message_encoding="json", schema_id=self._schemas[schema]

@@ -62,9 +62,9 @@ class Runs:
             raise EmulatorError("report: must be an object with `run` and `event`")
         match event.get("event"):
             case "begin":
-                self._begin(event)
+                self._begin_run(event)
             case "result":
-                self._result(event)
+                self._add_result(event)
             case "end":
                 run = self._find(event)
                 run.end_s = time.time()
@@ -76,7 +76,7 @@ class Runs:
         for listener in self.listeners:
             listener(message)
 
-    def _begin(self, event: dict[str, Any]) -> None:
+    def _begin_run(self, event: dict[str, Any]) -> None:
         planned = event.get("planned")
         run = Run(
             run=str(event["run"])[:80],
@@ -91,7 +91,7 @@ class Runs:
             self._runs.popitem(last=False)
         self._broadcast({"type": "run", **run.head()})
 
-    def _result(self, event: dict[str, Any]) -> None:
+    def _add_result(self, event: dict[str, Any]) -> None:
         run = self._find(event)
         result = event.get("result")
         if not isinstance(result, dict) or result.get("status") not in STATUSES:

@@ -166,7 +166,7 @@ class ConsoleServer:
             tasks.add(asyncio.create_task(_pump(viewer, socket)))
             await _receive(console, socket, viewer, tasks)
         except ConnectionError:
-            pass  # the page has gone
+            pass  # the page was closed
         finally:
             console.leave(viewer)
             for task in tasks:

@@ -137,14 +137,14 @@ class ControlServer:
             path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
             self._socket = ControlSocket(path)
             self._server = await asyncio.start_unix_server(
-                self._serve, sock=self._socket.socket, limit=MAX_LINE
+                self._serve_connection, sock=self._socket.socket, limit=MAX_LINE
             )
             return f"unix:{path}"
         host, _, port = where.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
         try:
-            self._server = await asyncio.start_server(self._serve, host, int(port), limit=MAX_LINE)
+            self._server = await asyncio.start_server(self._serve_connection, host, int(port), limit=MAX_LINE)
         except (OSError, ValueError) as error:  # an invalid host name is a ValueError
             raise EmulatorError(
                 f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"
@@ -161,7 +161,7 @@ class ControlServer:
         for writer in list(self._writers):
             writer.transport.abort()
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         try:
             async for line in read_lines(reader):
@@ -308,13 +308,13 @@ class ControlServer:
     async def _fault(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         wanted = _parse(_FAULT, FaultRequest, request)
         target.faults.check(wanted)
-        _note(target, "fault", request=request)
+        _record_command(target, "fault", request=request)
         target.faults.inject(wanted)
         return {"faults": target.faults.describe()}
 
     async def _clear_faults(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request)
-        _note(target, "clear_faults")
+        _record_command(target, "clear_faults")
         target.faults.clear()
         return {"faults": target.faults.describe()}
 
@@ -335,7 +335,7 @@ class ControlServer:
         return {}
 
 
-def _note(target: ControlTarget, kind: str, **values: Any) -> None:
+def _record_command(target: ControlTarget, kind: str, **values: Any) -> None:
     """Record a command on the tape, if there is one."""
     if target.emulation.tape is not None:
         target.emulation.tape.enter(kind, **values)

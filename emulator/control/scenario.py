@@ -55,7 +55,7 @@ class ScenarioEvent(Strict):
     """New truth, as in `set_truth` on the control channel; not `live` or `42`."""
 
     @model_validator(mode="after")
-    def _something(self) -> Self:
+    def _check_content(self) -> Self:
         if self.fault is None and self.truth is None and not self.clear_faults:
             raise ValueError("give fault, truth or clear_faults = true")
         if isinstance(self.truth, FeedConfig):

@@ -397,22 +397,22 @@ class FrameCycle:
         if frame.result is None:
             frame.waiting_since_ns = due_ns
             return
-        known_ns = due_ns + round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
+        complete_ns = due_ns + round(self._timing.detect_per_star_s * frame.result.detected * NANOSECONDS)
         now_ns = self._now_ns()
-        if known_ns > now_ns:
-            self._scheduler.at(known_ns, self._until_stopped(partial(self._publish_in_order, frame)))
+        if complete_ns > now_ns:
+            self._scheduler.at(complete_ns, self._until_stopped(partial(self._publish_in_order, frame)))
             return
         if frame.waiting_since_ns is not None:
             frame.late = True
-            known_ns = now_ns
-        self._publish_in_order(frame, known_ns)
+            complete_ns = now_ns
+        self._publish_in_order(frame, complete_ns)
 
-    def _publish_in_order(self, frame: _Frame, known_ns: int) -> None:
+    def _publish_in_order(self, frame: _Frame, complete_ns: int) -> None:
         """Publish a result, after the results of all earlier exposures."""
-        frame.finished_ns = known_ns
+        frame.finished_ns = complete_ns
         while self._in_flight and self._in_flight[0].finished_ns is not None:
             first = self._in_flight.popleft()
-            self._publish_frame(first, max(known_ns, first.finished_ns or 0))
+            self._publish_frame(first, max(complete_ns, first.finished_ns or 0))
 
     def _publish_frame(self, frame: _Frame, published_ns: int) -> None:
         result = frame.result or FrameResult(frame.index)

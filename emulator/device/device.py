@@ -163,7 +163,7 @@ class Device:
         """Called at power-on and at each reset, after parameters and time have been set."""
         self.on_reset: list[Callable[[], None]] = []
         self.unresponsive = False
-        """Whether the fault is active in which requests are neither counted nor answered."""
+        """Whether the device is unresponsive: requests are neither counted nor answered."""
         self.rate_fields = rate_fields(icd)
         """Integer fields that report a body rate: field, axis, and factor from rad/s to the field's unit."""
         self._background = background
@@ -175,7 +175,7 @@ class Device:
 
     def power_on(self) -> None:
         """Load the stored state, count the start and boot."""
-        self._start("power_on", self.store.load())
+        self._start_up("power_on", self.store.load())
 
     def withdraw_start(self) -> None:
         """Do not count the last start: it failed because a port or file is not available."""
@@ -184,11 +184,11 @@ class Device:
 
     def reset(self, cause: str) -> None:
         """Restart with a cause named in the enumeration `reset_cause`."""
-        self._start(cause, self._persistent_state())
+        self._start_up(cause, self._persistent_state())
         for observer in self.on_reset:
             call_guarded("reset", observer)
 
-    def _start(self, cause: str, state: Mapping[str, object]) -> None:
+    def _start_up(self, cause: str, state: Mapping[str, object]) -> None:
         count, stored = state.get("boot_count"), state.get("parameters")
         self.boot_count = ((count if isinstance(count, int) else 0) + 1) & 0xFFFF
         self.reset_cause = cause

@@ -1,7 +1,7 @@
 """Download of files in blocks: loading, bursts of numbered packets, and the hole map of received packets.
 
 The files are the stored image as `bmp`, and an `index` with 12 bytes per file: `<type u8, counter u8, edge u16,
-size u32, frame u32>`. The layout of the index is not public; this one is ours.
+size u32, frame u32>`. The layout of the index is not public; this one is our own choice.
 """
 
 from __future__ import annotations

@@ -124,11 +124,11 @@ class ThermalModel:
 
     def set_power(self, now_ns: int, power_w: float) -> None:
         """Change the mean power."""
-        self._rise_c = self._rise(now_ns)
+        self._rise_c = self._temperature_rise(now_ns)
         self._since_ns = now_ns
         self._towards_c = power_w * self._config.heating_c_w
 
-    def _rise(self, now_ns: int) -> float:
+    def _temperature_rise(self, now_ns: int) -> float:
         elapsed_s = max(now_ns - self._since_ns, 0) / NANOSECONDS
         left = math.exp(-elapsed_s / self._config.time_constant_s)
         return self._towards_c + (self._rise_c - self._towards_c) * left
@@ -141,4 +141,4 @@ class ThermalModel:
 
     def temperature_c(self, now_ns: int) -> float:
         """Return the temperature of detector and lens, °C."""
-        return self.mounting_c(now_ns) + self._rise(now_ns)
+        return self.mounting_c(now_ns) + self._temperature_rise(now_ns)

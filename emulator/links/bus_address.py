@@ -10,9 +10,8 @@ from starhil.emulator.symlink_lock import LockError, lock_name
 
 log = logging.getLogger("starhil.link")
 
-OWN_PROCESS: Final = "virtual:"
+PRIVATE_BUS: Final = "virtual:"
 """Prefix of buses that no other process can join."""
-
 
 HIGHEST: Final = 126
 """Highest address that a warning suggests; valid for both CAN protocols."""
@@ -35,24 +34,24 @@ class BusAddress:
         self._lock: socket.socket | None = None
         self._bus = ""
         self.number = 0
-        self.seen_elsewhere = False
+        self.duplicate_reported = False
         """Whether a CAN frame from another node with this address has been reported."""
 
-    def take(self, bus: str, number: int) -> None:
+    def acquire(self, bus: str, number: int) -> None:
         """Use a new address on a bus; warn if another emulator uses it."""
         self.release()
-        self._bus, self.number, self.seen_elsewhere = bus, number, False
-        if not number or bus.startswith(OWN_PROCESS):
+        self._bus, self.number, self.duplicate_reported = bus, number, False
+        if not number or bus.startswith(PRIVATE_BUS):
             return
         try:
             self._lock = lock_name(self._what, f"{bus} {number}".encode())
         except LockError as error:
             self._warn(str(error))
 
-    def report_elsewhere(self) -> None:
+    def report_duplicate(self) -> None:
         """Warn, once per address, of a CAN frame from another node with this address."""
-        if not self.seen_elsewhere:
-            self.seen_elsewhere = True
+        if not self.duplicate_reported:
+            self.duplicate_reported = True
             self._warn("also used by another node, whose frames arrive here")
 
     def release(self) -> None:

@@ -80,7 +80,7 @@ class CanLink(DeviceLink[CanFrame, int]):
     async def start(self) -> str:
         """Join the bus; return its description."""
         bus = await super().start()
-        self._address.take(bus, self._reply_style())
+        self._address.acquire(bus, self._reply_style())
         return bus
 
     async def close(self) -> None:
@@ -92,7 +92,7 @@ class CanLink(DeviceLink[CanFrame, int]):
 
     def _receive(self, item: CanFrame) -> None:
         if item.extended and CanId.unpack(item.id).source == self._address.number:
-            self._address.report_elsewhere()
+            self._address.report_duplicate()
         super()._receive(item)
 
     def _new_receiver(self) -> CanDeviceReceiver:
@@ -120,4 +120,4 @@ class CanLink(DeviceLink[CanFrame, int]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:
             self._receiver = self._new_receiver()
-            self._address.take(self.transport.description, self._reply_style())
+            self._address.acquire(self.transport.description, self._reply_style())

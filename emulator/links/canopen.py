@@ -237,7 +237,7 @@ class CanopenLink:
         """Join the bus and send the boot-up message; return the description of the bus."""
         await self.transport.start(self._receive, self._log_transport_error)
         node = self.slave.node_id
-        self._node.take(self.transport.description, 0 if node == UNCONFIGURED else node)
+        self._node.acquire(self.transport.description, 0 if node == UNCONFIGURED else node)
         self._run_action(self.slave.start)
         return self.transport.description
 

@@ -265,11 +265,11 @@ class ThreadImager(_RequestQueue):
 
     def _run_thread(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
         try:
-            self._serve(requests)
+            self._serve_requests(requests)
         except BaseException as error:  # noqa: BLE001 (its pending requests must fail)
             self._in_loop(self._pipeline_ended, f"pipeline thread: ended: {one_line(error)}")
 
-    def _serve(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
+    def _serve_requests(self, requests: queue.SimpleQueue[PipelineRequest | None]) -> None:
         from starhil.emulator.pipeline.pipeline import make_pipeline
 
         made = make_pipeline(self._setup)

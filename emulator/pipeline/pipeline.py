@@ -83,7 +83,7 @@ def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Fail
         pipeline = Pipeline(setup)
         images = open_images(setup.images, pipeline.camera)
         if images is not None:
-            images.image(0)  # one of another size fails before the long start
+            images.image(0)  # an image of the wrong size fails before the long start
         pipeline.warm_up()
         pipeline.images = images
     except (EmulatorError, StaridError) as error:

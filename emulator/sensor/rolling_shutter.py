@@ -52,7 +52,7 @@ def at_row_times(
 def turned(
     vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Return directions in the frame of a sensor after rotation, for a different time each.
+    """Return directions in the frame of a rotating sensor, each at its own time.
 
     Parameters
     ----------

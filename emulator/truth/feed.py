@@ -87,7 +87,7 @@ class LiveFeed:
                 address = transport.get_extra_info("sockname")
             else:
                 self._server = await asyncio.start_server(
-                    self._serve, host, port, limit=self.truth.format.max_size
+                    self._serve_connection, host, port, limit=self.truth.format.max_size
                 )
                 address = self._server.sockets[0].getsockname()
         except (OSError, ValueError) as error:  # ValueError: not a valid host name
@@ -127,10 +127,10 @@ class LiveFeed:
                 reported = True
             else:
                 reported = False
-                await self._serve(reader, writer)
+                await self._serve_connection(reader, writer)
             await asyncio.sleep(RETRY_S)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+    async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._writers.add(writer)
         try:
             async for data in read_lines(reader, self.truth.format.end):

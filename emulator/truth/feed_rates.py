@@ -93,7 +93,7 @@ class FeedRates:
             self._check_against_attitudes(before, message, given_rad_s)
         elif np.abs(rate).max() > math.radians(MAX_RATE_DEG_S):
             raise FeedError(
-                f"q jumps by {_degrees(rate)} degrees per second from the message before, "
+                f"q jumps by {_degrees(rate)} degrees per second from the previous message, "
                 f"more than {MAX_RATE_DEG_S:g}; send smaller steps"
             )
         self._rate = rate
@@ -114,7 +114,7 @@ class FeedRates:
         while len(self._seen) > 1:
             self._seen.popleft()
         if self._reference is None or before is None or before.rate_rad_s is None:
-            self._begin(message)
+            self._set_reference(message)
             return
         step_s = max(message.at_s - before.at_s, SHORTEST_S)
         self._expected = self._expected + 0.5 * step_s * (before.rate_rad_s + rate)
@@ -128,7 +128,7 @@ class FeedRates:
             self._contradicts = self._disagree(turned)
         expected = self._expected
         if conclusive or self._contradicts:
-            self._begin(message)
+            self._set_reference(message)
         if self._contradicts:
             raise FeedError(
                 f"rate contradicts q, which turned by {_degrees(turned)} degrees instead of {_degrees(expected)}; "
@@ -147,7 +147,7 @@ class FeedRates:
         allowed = NOISE_RAD + factor * (self._change_rad + DIRECTION_TOLERANCE * expected)
         return float(np.linalg.norm(turned - factor * self._expected)) > allowed
 
-    def _begin(self, message: _Message) -> None:
+    def _set_reference(self, message: _Message) -> None:
         self._reference = message
         self._expected = np.zeros(3)
         self._change_rad = 0.0

@@ -44,12 +44,12 @@ class LockStep:
         """Process one message; return the fault of a rejected message, otherwise an empty text."""
         async with self._lock:
             try:
-                return await self._process(data)
+                return await self._apply_message(data)
             except (FeedError, EmulatorError) as fault:
                 self._truth.reject(str(fault))
                 return str(fault)
 
-    async def _process(self, data: bytes) -> str:
+    async def _apply_message(self, data: bytes) -> str:
         message = self._truth.format.decode(data)
         if message.t is None:
             raise FeedError("t is missing; lock-step needs the sender's time")

@@ -29,7 +29,7 @@ _MAX_BINS: Final = 1_048_576
 
 
 def pair_count(objects: int) -> int:
-    """Number of feature vectors of a frame, L = (N_o over 2), eq. 3.7."""
+    """Number of feature vectors of a frame, L = (N_o choose 2), eq. 3.7."""
     return objects * (objects - 1) // 2
 
 

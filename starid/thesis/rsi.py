@@ -243,7 +243,7 @@ class RecursiveIdentification:
         return not self._searches_all or predicted.votes >= _MIN_VOTES
 
     def _voted(self, estimate: LsiEstimate, features: FeatureVector) -> tuple[LsiEstimate, float]:
-        """Remember a valid answer; return answer and roll, with a memory those with most votes."""
+        """Remember a valid answer; return the answer and roll or, with a memory, those with the most votes."""
         roll = (features.theta_deg - math.degrees(estimate.theta_rad) + 180.0) % 360.0 - 180.0
         if estimate.error_psi <= self.settings.invalid_factor * self.settings.tau:
             self._memory.add(estimate.right_ascension_deg, estimate.declination_deg, roll)

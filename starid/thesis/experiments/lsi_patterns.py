@@ -1,4 +1,4 @@
-"""Does ε_ψ reveal a bad answer? Patterns 6.20–6.27 and B, errors over thresholds 6.28–6.30 and C."""
+"""Does ε_ψ reveal a bad answer? Patterns 6.20–6.27 and B, errors against thresholds 6.28–6.30 and C."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _thresholds(context: Context, results: Mapping[str, Results], quantity: str)
 
 
 def pattern_files(context: Context, results: Mapping[str, Results]) -> list[str]:
-    """Draw the patterns and the errors over thresholds; return the names of the files."""
+    """Draw the patterns and the errors against thresholds; return the names of the files."""
     files = [_patterns(context, results, grid) for grid in (ON, OFF)]
     for quantity in ("f", "theta"):
         files += _thresholds(context, results, quantity)

@@ -25,16 +25,16 @@ def clashes(caplog) -> list[str]:
 
 def test_an_address_is_reported_while_another_uses_it_and_free_afterwards(caplog):
     first, second = (BusAddress("address", "links.can.address") for _ in range(2))
-    first.take(BUS, 4)
-    second.take(BUS, 5)
+    first.acquire(BUS, 4)
+    second.acquire(BUS, 5)
     assert clashes(caplog) == []
-    second.take(BUS, 4)
+    second.acquire(BUS, 4)
     [text] = clashes(caplog)
     assert text.startswith(f"CAN {BUS}: address 4: in use by another emulator, process ")
     assert text.endswith("change one of them: --set links.can.address=5")
     second.release()
     first.release()
-    second.take(BUS, 4)
+    second.acquire(BUS, 4)
     assert len(clashes(caplog)) == 1
     second.release()
 
@@ -43,7 +43,7 @@ def test_an_address_is_reported_while_another_uses_it_and_free_afterwards(caplog
 def test_a_bus_of_one_process_and_a_node_that_is_off_have_no_clash(bus, number, caplog):
     addresses = [BusAddress("node", "links.canopen.node") for _ in range(2)]
     for address in addresses:
-        address.take(bus, number)
+        address.acquire(bus, number)
     for address in addresses:
         address.release()
     assert clashes(caplog) == []
