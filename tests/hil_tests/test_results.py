@@ -77,7 +77,7 @@ def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_reports_t
         process.ready.clear()  # it opened no link
         return process
 
-    monkeypatch.setattr(conformance_run, "_start", start)
+    monkeypatch.setattr(conformance_run, "_start_emulator", start)
     reported = []
     outcomes = run_conformance(ConformanceRequest(serial="auto", start=True), reported.append).outcomes
     assert [(outcome.id, outcome.status) for outcome in outcomes] == [("emulator.end", "failed")]
