@@ -13,6 +13,8 @@ from starid.jit import compiled_ieee, inner
 
 Image = npt.NDArray[np.float32]
 
+Line = npt.NDArray[np.float32]
+
 Sensitivity = npt.NDArray[np.uint16]
 """Relative signal of each pixel (h, w) in a unit of its own: two bytes are read faster than four."""
 

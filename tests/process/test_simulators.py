@@ -45,6 +45,7 @@ def write_files(folder: Path, *names: str, **instead: str) -> None:
 
 
 def start(folder: Path, *command: str) -> subprocess.Popen[str]:
+    # SIGINT as in a terminal, even if the tests run with it ignored
     return subprocess.Popen(
         [sys.executable, *command], cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         env={**os.environ, "MPLBACKEND": "Agg"}, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
