@@ -19,7 +19,8 @@ Sensitivity = npt.NDArray[np.uint16]
 """Relative signal of each pixel (h, w) in a unit of its own: two bytes are read faster than four."""
 
 Roots = npt.NDArray[np.uint16]
-"""Square roots of the dark current of each pixel (h, w): two bytes state it far more finely than its noise."""
+"""Square roots of the dark current of each pixel (h, w): two bytes. Rounding costs at most 0.2 % of
+the noise in 0.2 s at 20 °C, 4 % in 1 s at 60 °C, for the pixels of `ideal`."""
 
 GLARE_STEP: Final = 8
 """Pixels between the points at which smooth light is computed."""
