@@ -212,11 +212,9 @@ def test_two_runs_of_one_seed_give_the_same_bytes():
     assert first == run_bytes()
 
 
-@pytest.mark.parametrize("algorithm", ["lsi", "rsi"])
-def test_the_algorithms_of_the_thesis_run_in_the_device(algorithm):
-    emulator = Emulator(
-        "--clock", "stepped", "--set", f"run.algorithm={algorithm}", "--set", "links.serial.dialect=a"
-    )
+def test_another_algorithm_runs_in_the_device():
+    """RSI runs in `tests/process/test_recursive_session.py`."""
+    emulator = Emulator("--clock", "stepped", "--set", "run.algorithm=lsi", "--set", "links.serial.dialect=a")
     emulator.do("step", seconds=1.0)
     assert emulator.command("set_mode", mode="lost_in_space") == 0
     emulator.do("step", seconds=4.0)
