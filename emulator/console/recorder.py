@@ -172,7 +172,8 @@ class McapRecorder:
         }
         self._write("/truth", "foxglove.FrameTransform", at_ns, truth)
         row = dict(zip(COLUMNS, json_row(self._history.add(measurement)), strict=True))
-        values: dict[str, Any] = {**row, "valid": measurement.valid, "reason": measurement.reason}
+        known = {name: value for name, value in row.items() if value is not None}  # a schema has no null
+        values: dict[str, Any] = {**known, "valid": measurement.valid, "reason": measurement.reason}
         values["mode"] = MODES[int(row["mode"] or 0)]
         self._write("/measurement", "starhil.Measurement", at_ns, values)
 

@@ -15,6 +15,7 @@ from tests.emulator.conftest import ORION, PREVIEW
 from tests.emulator.runs import command
 
 WITHIN_S = 20.0
+JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": int, "boolean": bool}
 
 
 def options(path, **more):
@@ -28,6 +29,10 @@ def messages(path):
             found.setdefault(channel.topic, []).append(
                 (schema.name, message.log_time, json.loads(message.data))
             )
+            properties = json.loads(schema.data)["properties"]
+            for name, value in found[channel.topic][-1][2].items():
+                wanted = properties.get(name, {}).get("type")
+                assert wanted is None or isinstance(value, JSON_TYPES[wanted]), (channel.topic, name, value)
         return found
 
 
