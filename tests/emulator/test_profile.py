@@ -209,7 +209,9 @@ def test_an_impossible_value_is_named_with_its_bound(override):
     assert "must be at " in message
 
 
-@pytest.mark.parametrize("override", ["run.start_unix_s=1e300", "run.start_unix_s=5e9", "run.start_unix_s=soon"])
+@pytest.mark.parametrize(
+    "override", ["run.start_unix_s=1e300", "run.start_unix_s=5e9", "run.start_unix_s=soon"]
+)
 def test_an_impossible_date_is_named_with_its_bounds(override):
     message = refusal("cubestar", [override])
     assert message.startswith(f"--set {override}: run.start_unix_s: must be a date from 1970 to 2100")
