@@ -135,24 +135,34 @@ def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise EmulatorError(f"--record {folder}: not empty; choose another folder")
-        values = profile.model_dump(mode="json")
-        if isinstance(profile.truth, FileConfig):
-            shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
-            values["truth"]["path"] = TRUTH_SOURCE_FILE
-        state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
-        if state is not None and state.is_dir():
-            shutil.copytree(state, folder / STATE_FOLDER)
-        if scenario:
-            text = load_scenario(scenario).model_dump_json()
-            (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
-        run = {
-            "starhil": importlib.metadata.version("starhil"),
-            "folder": str(profile.folder.resolve()),
-            "profile": values,
-        }
-        (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+    try:
+        _copy_inputs(folder, profile, scenario)
+    except (EmulatorError, OSError) as error:
+        shutil.rmtree(folder, ignore_errors=True)  # everything in it is from here
+        if isinstance(error, EmulatorError):
+            raise
+        raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+
+
+def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
+    values = profile.model_dump(mode="json")
+    if isinstance(profile.truth, FileConfig):
+        shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
+        values["truth"]["path"] = TRUTH_SOURCE_FILE
+    state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
+    if state is not None and state.is_dir():
+        shutil.copytree(state, folder / STATE_FOLDER)
+    if scenario:
+        text = load_scenario(scenario).model_dump_json()
+        (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
+    run = {
+        "starhil": importlib.metadata.version("starhil"),
+        "folder": str(profile.folder.resolve()),
+        "profile": values,
+    }
+    (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
 
 class Player:
