@@ -218,7 +218,7 @@ class SerialConfig(Strict):
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
-    """Whether transmission is limited to the bit rate."""
+    """Whether a message arrives, whole, only at the time at which its last byte would at the bit rate."""
     symlink: str = ""
     """Path of a symbolic link to the pty, created at the start and removed at the end."""
 
