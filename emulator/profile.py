@@ -164,7 +164,7 @@ class ImagesConfig(Strict):
     """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
     folder: str = ""
-    """Folder of PNG, TIFF or JPEG images, used in the order of their names; relative to the profile."""
+    """Folder of PNG, TIFF, JPEG or BMP images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
