@@ -48,6 +48,7 @@ from starid.attitude import Attitude
 
 log = logging.getLogger("starhil.run")
 
+
 class Emulation:
     """A device with its pipeline, links, truth and clock.
 
@@ -74,6 +75,8 @@ class Emulation:
         The heads that share clock and truth, the leader first.
     body_truth
         Truth of the body on which the heads are mounted.
+    time_passes
+        Set when the pipeline of every head is ready, which starts the clock.
     """
 
     def __init__(
@@ -116,7 +119,7 @@ class Emulation:
         self._warm_up_task: asyncio.Task[None] | None = None
         self._revival: PipelineRevival | None = None
         self._awake = asyncio.Event()
-        self._time_passes: asyncio.Event = asyncio.Event() if leader is None else leader._time_passes
+        self.time_passes: asyncio.Event = asyncio.Event() if leader is None else leader.time_passes
 
     @property
     def requests(self) -> Requests:
@@ -186,7 +189,7 @@ class Emulation:
             if self.leader is self:
                 stepped = [(head.device.scheduler, head.imager) for head in self.heads]
                 transports = [link.transport for head in self.heads for link in head.links]
-                self.stepper = StepPump(stepped, self.clock, self._time_passes, transports, self.tape)
+                self.stepper = StepPump(stepped, self.clock, self.time_passes, transports, self.tape)
         else:
             passing = self.clock.source if isinstance(self.clock, LatchedClock) else self.clock
             self._pump = ClockPump(device.scheduler, passing, self.tape)
@@ -291,7 +294,7 @@ class Emulation:
     def _message_received(self, data: bytes) -> None:
         """Record a message of the feed; until time passes, each message replaces the earlier ones."""
         self._record_entry("feed", data=data.decode("latin-1"))
-        if not self._time_passes.is_set() and self.feed is not None and self.feed.truth.timeline == "anchor":
+        if not self.time_passes.is_set() and self.feed is not None and self.feed.truth.timeline == "anchor":
             self.feed.truth.begin_timeline()
 
     def _now_s(self) -> float:
@@ -434,9 +437,9 @@ class Emulation:
         """Pass the camera of a ready pipeline to the device; time starts when every head has one."""
         self.warm = warm
         self.device.pipeline_ready(camera_constants(warm))
-        if self._time_passes.is_set() or any(head.warm is None for head in self.heads):
+        if self.time_passes.is_set() or any(head.warm is None for head in self.heads):
             return
-        self._time_passes.set()
+        self.time_passes.set()
         self.clock.start()
         for head in self.heads:
             if head._pump is not None:  # noqa: SLF001 (of this class)

@@ -82,7 +82,9 @@ def warm(
             await imager.close()
 
     asyncio.run(start())
-    print(f"{kernels_written_since(begin_s)} kernels compiled in {time.time() - begin_s:.1f} s, in {cache_dir()}")
+    print(
+        f"{kernels_written_since(begin_s)} kernels compiled in {time.time() - begin_s:.1f} s, in {cache_dir()}"
+    )
 
 
 @group.command("clear")

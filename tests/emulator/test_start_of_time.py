@@ -48,7 +48,7 @@ def slow_start(monkeypatch):
 @pytest.mark.parametrize("clock", CLOCKS)
 def test_events_of_a_scenario_wait_for_a_slow_start(run, slow_start, tmp_path, clock):
     path = tmp_path / "day.toml"
-    path.write_text('[[at]]\nrun_time_s = 10.0\nfault = { device = { stuck = true } }\n')
+    path.write_text("[[at]]\nrun_time_s = 10.0\nfault = { device = { stuck = true } }\n")
 
     async def scenario(emulation, _line):
         return emulation.device.unresponsive, emulation.clock.now_ns() * 1e-9
