@@ -109,7 +109,7 @@ class DeviceConfig(Strict):
     firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
     """Reported in `identification` (128)."""
     boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
-    """Minimum time in boot mode."""
+    """Time in boot mode after a start or reset, in simulation time."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
