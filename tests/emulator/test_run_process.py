@@ -19,7 +19,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
 from starid.attitude import Attitude
-from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.cli.command_line import log_lines, run_command_line
 
 pytestmark = pytest.mark.process
 
@@ -28,11 +28,6 @@ READY_WITHIN_S = 300.0
 REPLY_WITHIN_S = 30.0
 ACCURACY_ARCSEC = 20.0
 ICD = load_unit()
-
-
-def log_lines(errors: str) -> list[str]:
-    """Lines on stderr, but for the progress of a slow start."""
-    return [line for line in errors.splitlines() if not line.startswith("starting:")]
 
 
 class Emulator:
