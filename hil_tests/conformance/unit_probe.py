@@ -262,10 +262,6 @@ class SerialUnitProbe(SerialWire, UnitProbe):
             self._receive(left)
         return self._replies.popleft() if self._replies else None
 
-    def answers(self, row: Row) -> tuple[str, ...]:
-        """Return the answers of a row on this link."""
-        return row.answers
-
     def can_refuse(self, klass: str) -> bool:
         """Return whether replies of a class can express a refusal."""
         stack = self.stack
