@@ -236,7 +236,7 @@ class FrameResult:
     background_dn, noise_dn
         Level and noise of the background, counts.
     in_field
-        Bodies in or at the field of view: `sun`, `moon`, `earth`.
+        Bodies in the field of view or within their exclusion angles: `sun`, `moon`, `earth`.
     render_s, detect_s, identify_s
         Wall time of each step, for the log but not for telemetry.
     preview

@@ -72,8 +72,11 @@ _WARM_UP_BODIES: Final = SkyObjects(
 )
 """Bodies in and near the field of the identity attitude."""
 
-_WARM_UP_RATES_RAD_S: Final = ((1e-3, 0.0, 0.0), (0.03, 0.0, 0.0))
-"""Rates at which stars in a default exposure are round, or leave trails of a few pixels."""
+_WARM_UP_EXPOSURE_S: Final = 1.0
+"""Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
+
+_WARM_UP_RATES_RAD_S: Final = ((1e-4, 0.0, 0.0), (3e-3, 0.0, 0.0))
+"""Rates at which stars in this exposure are round, or leave trails of a few pixels."""
 
 
 def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Failure:
@@ -150,14 +153,14 @@ class Pipeline:
             index=0,
             attitude_xyzw=attitude,
             rate_rad_s=ZERO,
-            exposure_s=0.1,
+            exposure_s=_WARM_UP_EXPOSURE_S,
             gain=self._sensor.gain,
             settings=settings,
             preview=self._setup.previews,
         )
         if helper is not None:
             for rate in _WARM_UP_RATES_RAD_S:
-                frame = self._renderer.render(Attitude.identity(), rate)
+                frame = self._renderer.render(Attitude.identity(), rate, exposure_s=_WARM_UP_EXPOSURE_S)
                 detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
             helper.wait()  # kernels it compiled are loaded below; any others are compiled there
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):

@@ -66,6 +66,24 @@ def test_the_earth_across_the_field_blinds_the_sensor(pipeline):
     assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("earth",))
 
 
+@pytest.mark.parametrize("off_deg", [0.0, 2.0, 20.5])
+def test_the_sun_in_the_field_blinds_the_sensor(pipeline, off_deg):
+    sun = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg}
+    result = pipeline.handle(replace(REQUEST, faults={"sun": sun}))
+    assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("sun",))
+
+
+def test_the_sun_within_its_exclusion_angle_blinds_the_sensor_unless_the_lens_is_covered(pipeline):
+    def seen(off_deg, **others):
+        sun = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg, "exclusion_deg": 40.0, "electrons_s": 100.0}
+        return pipeline.handle(replace(REQUEST, faults={"sun": sun, **others}))
+
+    assert (seen(39.0).valid, seen(39.0).reason, seen(39.0).in_field) == (False, "blinded", ("sun",))
+    assert (seen(41.0).valid, seen(41.0).in_field) == (True, ())
+    covered = seen(10.0, blank=True)
+    assert (covered.reason, covered.in_field) == ("too_few_stars", ())
+
+
 def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline):
     for index, predicted in ((10, None), (11, as_quaternion(ORION)), (12, None), (13, as_quaternion(ORION))):
         for cover in ({"blank": True}, {"blocked_share": 1.0}):
