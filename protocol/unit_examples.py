@@ -9,7 +9,7 @@ from starhil.protocol.can_framing import encode_reply_frames, encode_request_fra
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
+from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack, serial_answers
 
 HOST_ADDRESS, DEVICE_ADDRESS = 1, 4
 """CAN addresses in the examples."""
@@ -33,8 +33,8 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
     for row in icd.rows:
         data = row.encode(row.example())
         request = icd.request(row, data if row.kind == "telecommand" else b"")
-        replies = [_reply(icd, row, answer, request) for answer in row.answers]
         if icd.link.serial is not None:
+            replies = [_reply(icd, row, answer, request) for answer in serial_answers(icd, row)]
             stack = build_serial_stack(icd)
             link = "serial, dialect b" if isinstance(stack, CubeSpaceStack) else "serial"
             encoded = [stack.encode_reply(reply) for reply in replies]
@@ -45,6 +45,7 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
                 tuple(_hex(item) for item in encoded if item),
             )
         if icd.link.can is not None and icd.link.can.kind == "cubespace":
+            replies = [_reply(icd, row, answer, request) for answer in row.answers]
             sent = encode_request_frames(request, HOST_ADDRESS, DEVICE_ADDRESS)
             came = [
                 frame
