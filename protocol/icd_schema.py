@@ -41,7 +41,8 @@ class UnitModel(_Model):
     provenance: Provenance | None = None
     """Default provenance of rows."""
     plugin: str | None = None
-    """Python file beside the definition, with custom quantities, actions, framings or checks."""
+    """Name of a Python file beside the definition, with custom quantities, actions, framings or checks. Reading the
+    definition runs this file."""
 
 
 class ConventionsModel(_Model):
@@ -195,7 +196,7 @@ class RowModel(_Model):
     """Public source of the row."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
-    fields: list[FieldModel] | None = None
+    fields: list[FieldModel] = []
     """Fields in wire order, after the fields of `include`; each is a table or a string (`text`)."""
     include: list[str] | None = None
     """Rows whose fields this row concatenates, in order."""

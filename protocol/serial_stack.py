@@ -6,13 +6,12 @@ other unit is composed of parts from `framings`, `checks` and `envelope` (`compo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from starhil.protocol.checks import CheckFunction
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
-from starhil.protocol.framings import Framing
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import CubeSpaceFraming, Order, SerialLinkModel
 from starhil.protocol.messages import (
@@ -79,7 +78,7 @@ def build_stack(
     rows: Sequence[RowShape] = (),
     byte_order: Order = "little",
     *,
-    framings: Mapping[str, Framing] | None = None,
+    framings: Mapping[str, Callable[[], object]] | None = None,
     checks: Mapping[str, CheckFunction] | None = None,
 ) -> SerialStack:
     """Return the serial link of a unit.

@@ -13,7 +13,7 @@ from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.protocol.checks import crc
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.device_model import PARAMETER
+from starhil.protocol.device_model import HEALTH, HEALTH_DEFAULTS, PARAMETER
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd_bindings import quantity_of
 from starhil.protocol.icd_layout import text_of
@@ -60,11 +60,26 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
         return None
     own = icd.plugin.quantities.get(name)
     getter: Getter = getter_of(name) if own is None else own.function
+    if own is None and name.startswith(HEALTH):
+        return _health(getter, field, icd)
     declared = quantity_of(name, icd.model, icd.plugin)
     scale = None if declared is None else factor(declared.unit, field.unit)
     if scale not in (None, 1.0):
         getter = _scaled(getter, float(scale or 1.0))
     return getter if field.enum is None else _named(getter, field)
+
+
+def _health(given: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
+    """Return a getter for a number of the profile's `[health]`.
+
+    If the profile has none, the value is the field's default, otherwise the modelled quantity of its unit.
+    """
+    for name in HEALTH_DEFAULTS if field.default is None else ():
+        scale = factor(icd.model.quantities[name].unit, field.unit)
+        if scale is not None:
+            modelled = _scaled(getter_of(name), scale)
+            return lambda shot: modelled(shot) if (value := given(shot)) is None else value
+    return given
 
 
 def _accepted(telecommand: str, name: str) -> Getter:

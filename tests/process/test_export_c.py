@@ -93,14 +93,15 @@ def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) 
     )
     assert (done.returncode, done.stderr) == (0, "")
     with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
-        obc.command("set_mode", mode="lost_in_space")
-        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=60.0)
+        obc.command("set_mode", mode="standby")  # as after boot
     done = subprocess.run(
         [program, emulator.ready["serial"]], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stderr) == (0, "")
     counts, attitude = done.stdout.splitlines()
-    assert counts == "acknowledges 1, refusals 0, faults 0"
+    assert counts == "acknowledges 2, refusals 0, faults 0"
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
+        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=60.0)
     seen = [float(word) for word in attitude.removeprefix("valid 1, q ").split()]
     assert seen == pytest.approx([truth[name] for name in ("q_x", "q_y", "q_z", "q_w")], abs=1e-4)
 

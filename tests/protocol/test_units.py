@@ -277,7 +277,7 @@ def test_units_of_measure_are_converted_within_a_kind():
 def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):
     (tmp_path / "unit.toml").write_text(HEAD + 'plugin = "unit.py"\n', encoding="utf-8")
     (tmp_path / "unit.py").write_text("1 / 0\n", encoding="utf-8")
-    with pytest.raises(IcdError, match=r"unit\.py: the plugin fails: ZeroDivisionError"):
+    with pytest.raises(IcdError, match=r"the plugin fails in unit\.py: ZeroDivisionError"):
         load_unit(tmp_path)
 
 
