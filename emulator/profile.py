@@ -109,7 +109,7 @@ class DeviceConfig(Strict):
     firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
     """Reported in `identification` (128)."""
     boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
-    """Minimum time in boot mode."""
+    """Time in boot mode after a start or reset, in simulation time."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
@@ -164,7 +164,7 @@ class ImagesConfig(Strict):
     """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
     folder: str = ""
-    """Folder of PNG, TIFF or JPEG images, used in the order of their names; relative to the profile."""
+    """Folder of PNG, TIFF, JPEG or BMP images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
@@ -218,7 +218,7 @@ class SerialConfig(Strict):
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
-    """Whether transmission is limited to the bit rate."""
+    """Whether a message arrives, whole, only at the time at which its last byte would at the bit rate."""
     symlink: str = ""
     """Path of a symbolic link to the pty, created at the start and removed at the end."""
 

@@ -21,10 +21,11 @@ from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
 from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.device.device import Background, outcome
-from starhil.emulator.emulation import Emulation, camera_constants
+from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile
 from starhil.emulator.tape import (
     EVENTS_FILE,
@@ -421,7 +422,7 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             faults = Faults(emulation.device, emulation.links)
             _enter_scenario(folder, emulation, faults)
             warm = await emulation.imager.start()
-            play = _Playing(emulation, player, faults, camera_constants(warm))
+            play = _Playing(emulation, player, faults, warm)
             expected = await play.entries(folder, report, ends=ends)
             to_the_end = not report.differences
             _compare_sent(expected, player.sent, report, to_the_end=to_the_end)
@@ -442,11 +443,11 @@ def _enter_scenario(folder: Path, emulation: Emulation, faults: Faults) -> None:
 class _Playing:
     """Plays entries one by one."""
 
-    def __init__(self, emulation: Emulation, player: Player, faults: Faults, camera: dict[str, Any]) -> None:
+    def __init__(self, emulation: Emulation, player: Player, faults: Faults, warm: PipelineReady) -> None:
         self._emulation = emulation
         self._player = player
         self._faults = faults
-        self._camera = camera
+        self._warm = warm
 
     async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> dict[str, list[Any]]:
         """Play a tape to its end, or to the entry at which the device deviates; return what was sent until there, by link."""
@@ -517,7 +518,7 @@ class _Playing:
                     raise _DeviationError(_deviation(entry, "nothing is being written"))
                 player.writes.popleft()()
             case "ready":
-                device.pipeline_ready(self._camera)
+                self._emulation.pipeline_ready(self._warm)
             case "clear_faults":
                 self._faults.clear()
 

@@ -90,6 +90,10 @@ class LatchedClock:
         """Return the time of the last entry, nanoseconds."""
         return self._now_ns
 
+    def start(self) -> None:
+        """Start the running clock."""
+        self.source.start()
+
     def latch(self) -> None:
         """Set this clock to the current time."""
         self._now_ns = self.source.now_ns()

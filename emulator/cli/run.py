@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.options import DIALECTS, UnitChoice, one_of
-from starhil.emulator.cli.output import output_help, prepare_output
+from starhil.emulator.cli.output import output_help, prepare_output, report_slow_start
 
 
 def command(
@@ -205,7 +205,9 @@ def command(
             await emulator.start()
             line = asyncio.create_task(emulator.ready())
             stop = asyncio.create_task(emulator.ended.wait())
+            progress = asyncio.create_task(report_slow_start())
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
+            progress.cancel()
             if line.done():
                 gc.collect()
                 gc.freeze()  # long-lived objects: garbage collection would pause the links

@@ -194,7 +194,9 @@ class MatchedStar:
     magnitude, snr
         Measured magnitude and signal-to-noise ratio.
     vector
-        Direction in the sensor frame, by the camera of the profile.
+        Measured direction in the sensor frame, by the camera of the profile.
+    icrs
+        Modelled direction: that of the star in the catalogue, in ICRS, without aberration.
     """
 
     hip: int
@@ -203,6 +205,7 @@ class MatchedStar:
     magnitude: float
     snr: float
     vector: Triple
+    icrs: Triple
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -42,7 +42,7 @@ ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 def star(hip, x, y, magnitude, snr):
     """An identified star where the default camera sees it."""
     (vector,) = DEFAULT_CAMERA.back_project([[x, y]]).tolist()
-    return MatchedStar(hip, x, y, magnitude, snr, tuple(vector))
+    return MatchedStar(hip, x, y, magnitude, snr, tuple(vector), (0.0, 0.0, 0.0))
 
 
 STARS = (
@@ -96,7 +96,9 @@ class FakePipeline:
             detected=40,
             refused=3,
             matched=35,
-            stars=STARS,
+            stars=tuple(
+                replace(star, icrs=tuple((attitude.matrix.T @ star.vector).tolist())) for star in STARS
+            ),
             probability_false=1e-12,
             rms_px=0.1,
             background_dn=8.2,

@@ -16,6 +16,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
+from starid.catalog import load_catalog
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 BETELGEUSE = 27989
@@ -89,6 +90,20 @@ def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline
             request = replace(REQUEST, index=index, predicted_xyzw=predicted, faults=cover)
             result = pipeline.handle(request)
             assert (result.valid, result.reason, result.matched) == (False, "too_few_stars", 0), cover
+
+
+def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measured_one(pipeline):
+    catalog = load_catalog(epoch=Profile().catalog.epoch)
+    wanted = {int(hip): vector for hip, vector in zip(catalog.hip, catalog.vectors, strict=True)}
+    moved = replace(REQUEST, index=30, observer_velocity=(20_000.0, -20_000.0, 5_000.0))
+    for request in (replace(REQUEST, index=31), moved):
+        result = pipeline.handle(request)
+        measured = np.array([star.vector for star in result.stars])
+        measured = measured @ Attitude(np.array(result.quaternion_xyzw)).matrix
+        modelled = np.array([star.icrs for star in result.stars])
+        assert len(modelled) > 10
+        assert modelled == pytest.approx(np.array([wanted[star.hip] for star in result.stars]), abs=1e-12)
+        assert np.abs(measured - modelled).max() > 1e-6
 
 
 def test_an_image_that_is_saturated_all_over_cannot_be_searched(pipeline):
