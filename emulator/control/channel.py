@@ -256,6 +256,7 @@ class ControlServer:
                 "accepted": feed.accepted,
                 "refused": feed.refused,
                 "last_fault": feed.last_fault,
+                "speed": feed.speed.ratio,
                 "address": emulation.leader.ready_fields.get("truth", ""),
             }
         return answer
