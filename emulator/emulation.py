@@ -508,7 +508,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False) -> PipelineSet
         sky=dict(profile.sky),
         identifier=dict(profile.identifier),
         catalog_path=str(profile.folder / Path(path).expanduser()) if path else "",
-        epoch=profile.catalog.epoch,
+        epoch=profile.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped" and not repeatable,

@@ -113,11 +113,12 @@ def command(
         typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
     ] = None,
     log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
-) -> None:
+) -> int:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
     When the emulator accepts commands, it prints a line on stdout that gives the links:
-    `ready serial=… dialect=… can=… seed=…`.
+    `ready serial=… dialect=… can=… seed=…`. The exit status is 1 if a log, a recording or the state could not be
+    written, for example because the disk is full; the run goes on without it.
     """
     from starhil.emulator.pipeline.worker_process import take_worker
 
@@ -190,7 +191,7 @@ def command(
         if path is not None:
             prepare_output(path, option)
 
-    async def run() -> None:
+    async def run() -> int:
         import signal
 
         emulator = Run(profiles[0], options, worker, profiles[1:])
@@ -216,8 +217,9 @@ def command(
                 line.cancel()
         finally:
             await emulator.close()
+        return int(emulator.failed)
 
-    asyncio.run(run())
+    return asyncio.run(run())
 
 
 def _absolute_folder(unit: str) -> str:
