@@ -40,6 +40,9 @@ log = logging.getLogger("starhil.truth")
 HISTORY: Final = 512
 """Number of messages kept for exposures whose midpoint is in the past."""
 
+NEAR: Final = 0.05
+"""Error of a measured speed that the tracking of drift follows anyway."""
+
 RESTART_S: Final = 1.0
 """Jump back of the sender's time that starts a new timeline, seconds."""
 
@@ -153,11 +156,11 @@ class LiveTruth:
         self._times.clear()
         self._states.clear()
         if self.speed.differs:
-            wall = _two_digits(self.speed.ratio * self._clock_speed)
+            wall = rounded_speed(self.speed.ratio * self._clock_speed)
             scaled = f"--clock scaled:{wall:g}, or " if wall <= MAX_SCALE else ""
             log.warning(
                 "truth feed: the sender runs at %g × the clock; use %slock-step with --clock stepped",
-                _two_digits(self.speed.ratio),
+                rounded_speed(self.speed.ratio),
                 scaled,
             )
 
@@ -222,9 +225,10 @@ class LiveTruth:
         return _between(self._states[low], self._states[upper], (t_s - self._times[low]) / span_s, span_s)
 
 
-def _two_digits(value: float) -> float:
-    """Round to two significant digits."""
-    return float(f"{value:.2g}")
+def rounded_speed(speed: float) -> float:
+    """Return a whole speed, or a whole fraction, if one is near; otherwise, round to two significant digits."""
+    whole = max(round(speed), 1) / max(round(1.0 / speed), 1)
+    return whole if abs(speed / whole - 1.0) < NEAR else float(f"{speed:.2g}")
 
 
 def _moved_on(last: TruthState, seconds: float) -> TruthState:
