@@ -20,6 +20,7 @@ from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
+ROUNDS = 10
 WITHIN_S = 60.0
 
 
@@ -46,12 +47,14 @@ async def talk(emulation, frames):
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
+    rounds = 0
     async with asyncio.timeout(WITHIN_S):
-        while emulation.device.cycle.published < frames:
+        while emulation.device.cycle.published < frames or rounds < ROUNDS:
             if emulation.stepper is not None:
                 await emulation.stepper.step(0.05)
             for name in ("precise_attitude", "identification", "device_status"):
                 await client.telemetry(name)
+            rounds += 1
             await asyncio.sleep(0.01)
     await client.close()
 
