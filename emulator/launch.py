@@ -266,7 +266,7 @@ class Run:
             A pipeline cannot start; one line.
         """
         with self._rejecting():
-            lines = [await head.emulation.ready() for head in self.heads]
+            lines = await asyncio.gather(*(head.emulation.ready() for head in self.heads))
         line = lines[0]
         for head, further in zip(self.heads[1:], (each.split()[1:] for each in lines[1:]), strict=True):
             line += "".join(
