@@ -92,7 +92,7 @@ class FieldSweep:
                         break
         if first is None:
             raise StaridError("image: no view of it is available")
-        failed = dataclasses.replace(first.solution, elapsed=time.perf_counter() - begin)
+        failed = first.solution.timed(begin)
         return dataclasses.replace(first, solution=failed)
 
 

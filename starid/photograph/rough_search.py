@@ -141,7 +141,7 @@ class RoughSearch:
                 )
             if solution.valid or solution.reason is Reason.TOO_FEW_STARS:
                 break
-        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+        return solution.timed(begin)
 
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
         """Yield all attempts, cheap ones first."""
