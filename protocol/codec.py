@@ -120,6 +120,16 @@ class Field:
         return self.slot.size
 
     @property
+    def bit_count(self) -> int:
+        """Number of bits of the raw value."""
+        return self.width or 8 * self.size
+
+    def place(self, bit: int) -> tuple[int, int]:
+        """Return the byte in the row that holds a bit of the raw value, and the bit in that byte; 0 is the lowest."""
+        byte, position = divmod(self.shift + bit, 8)
+        return self.offset + (byte if self.slot.order == "little" else self.size - 1 - byte), position
+
+    @property
     def scaled(self) -> bool:
         """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0
@@ -352,7 +362,7 @@ class Row:
     klass: str = ""
     """Name of the row's class, if the unit has classes."""
     action: str | None = None
-    """Name of the action that a telecommand performs."""
+    """Name of the action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: Mapping[str, bool | int | float | str] = dataclass_field(default_factory=dict)
     """Fixed arguments of the action."""
     answers: tuple[str, ...] = ("reply",)

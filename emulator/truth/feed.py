@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Final, Literal
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import until_cancelled
 from starhil.emulator.json_lines import read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.lock_step import LockStep, Step
@@ -87,7 +88,7 @@ class LiveFeed:
                 address = transport.get_extra_info("sockname")
             else:
                 self._server = await asyncio.start_server(
-                    self._serve_connection, host, port, limit=self.truth.format.max_size
+                    until_cancelled(self._serve_connection), host, port, limit=self.truth.format.max_size
                 )
                 address = self._server.sockets[0].getsockname()
         except (OSError, ValueError) as error:  # ValueError: not a valid host name
@@ -122,7 +123,10 @@ class LiveFeed:
             except (OSError, ValueError) as error:
                 if not reported:  # once, not at every attempt
                     log.warning(
-                        "truth feed tcp:%s:%d: no connection (%s); still trying", host, port, reason(error)
+                        "truth feed tcp:%s:%d: no connection (%s); still trying; the simulator must listen there",
+                        host,
+                        port,
+                        reason(error),
                     )
                 reported = True
             else:

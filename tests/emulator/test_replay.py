@@ -12,14 +12,16 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.replay import replay
-from starhil.emulator.tape import EVENTS_FILE, RUN_FILE
+from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
+ROUNDS = 10
 WITHIN_S = 60.0
 
 
@@ -46,12 +48,14 @@ async def talk(emulation, frames):
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
+    rounds = 0
     async with asyncio.timeout(WITHIN_S):
-        while emulation.device.cycle.published < frames:
+        while emulation.device.cycle.published < frames or rounds < ROUNDS:
             if emulation.stepper is not None:
                 await emulation.stepper.step(0.05)
             for name in ("precise_attitude", "identification", "device_status"):
                 await client.telemetry(name)
+            rounds += 1
             await asyncio.sleep(0.01)
     await client.close()
 
@@ -149,7 +153,10 @@ def test_a_changed_device_is_found(record):
     assert difference.startswith("serial: differs")
 
 
-def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_is_played_to_there(record):
+@pytest.mark.parametrize("rest", [0, 8])
+def test_a_truncated_recording_is_played_to_its_end_and_called_truncated(record, rest):
+    """Cut after an entry that is followed by output, or within the next line."""
+
     async def scenario(emulation, _line):
         await talk(emulation, 3)
 
@@ -157,13 +164,43 @@ def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_is_played_to_there
     events = folder / EVENTS_FILE
     text = events.read_text()
     cut = text.index("\n", len(text) // 2)
-    while '"do": "out"' not in text[:cut].rpartition("\n")[2]:
+    while '"do": "in"' not in text[:cut].rpartition("\n")[2]:
         cut = text.index("\n", cut + 1)
-    events.write_text(text[: cut + 1] + text[cut + 1 : cut + 9])
-    (folder / "truth.csv").unlink()
+    events.write_text(text[: cut + 1 + rest])
     report = report_of(folder)
     assert 0 < report.entries < text.count("\n")
-    assert report.differences == []
+    (difference,) = report.differences
+    assert difference.startswith(f"{events}: truncated at ")
+
+
+def test_a_missing_truth_log_is_a_difference(record):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    (folder / "truth.csv").unlink()
+    assert report_of(folder).differences == [f"{folder / 'truth.csv'}: missing"]
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("device.firmware_minor=0", "identical"),
+        ("device.firmware_minor=9", "serial: differs from byte"),
+        ("truth={kind='fixed', attitude={ra_deg=10.0, dec_deg=0.0}}", "truth log: row 1 differs"),
+        ("parameters.update_rate=0.5", "the device behaves differently"),
+    ],
+)
+def test_another_profile_is_compared_with_the_recording(record, tmp_path, override, said):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    mine = tmp_path / "mine.toml"
+    mine.write_text('[parameters]\nstart_mode = "lost_in_space"\nupdate_rate = 5.0\n')
+    status, out, err = run_command_line("replay", str(folder), "--profile", str(mine), "--set", override)
+    assert (status, err) == (0 if said == "identical" else 1, "")
+    assert said in out
 
 
 @pytest.mark.parametrize("content", [None, "{}", '{"profile": {"x": 1}, "folder": "."}'])
@@ -189,3 +226,116 @@ def test_a_recording_is_of_one_head(run, tmp_path):
             others=[{"links": {"can": {"address": 5}}}],
         )
     assert not (tmp_path / "recorded").exists()
+
+
+DAMAGED_LINES = {
+    "not JSON": "}",
+    "not an object": "7",
+    "empty": "",
+    "a list": "[]",
+    "nested too deeply": "[" * 100_000,
+    "no time": '{"do": "event"}',
+    "a time in words": '{"ns": "soon", "do": "event"}',
+    "a time before the start": '{"ns": -1, "do": "event"}',
+    "a time without end": '{"ns": 1e400, "do": "event"}',
+    "a fraction of a nanosecond": '{"ns": 0.5, "do": "event"}',
+    "nothing to do": '{"ns": 0}',
+    "an unknown kind": '{"ns": 0, "do": "dance"}',
+    "a kind that is no text": '{"ns": 0, "do": {}}',
+    "input without link": '{"ns": 0, "do": "in", "data": "00"}',
+    "input of an unknown link": '{"ns": 0, "do": "in", "link": "radio", "data": "00"}',
+    "input without data": '{"ns": 0, "do": "in", "link": "serial"}',
+    "half a byte": '{"ns": 0, "do": "in", "link": "serial", "data": "0"}',
+    "no hexadecimal": '{"ns": 0, "do": "out", "link": "serial", "data": "xy"}',
+    "a number as bytes": '{"ns": 0, "do": "out", "link": "serial", "data": 5}',
+    "a CAN frame on a serial line": '{"ns": 0, "do": "in", "link": "serial", "data": [1, "00", true, false]}',
+    "bytes on a CAN bus": '{"ns": 0, "do": "out", "link": "can", "data": "00"}',
+    "part of a CAN frame": '{"ns": 0, "do": "out", "link": "can", "data": [1, "00"]}',
+    "a CAN frame that cannot exist": '{"ns": 0, "do": "out", "link": "can", "data": [1, "00112233445566778899", true, false]}',
+    "a feed without data": '{"ns": 0, "do": "feed"}',
+    "a feed that is not bytes": '{"ns": 0, "do": "feed", "data": "\u2192"}',
+    "no truth": '{"ns": 0, "do": "truth"}',
+    "an unknown truth": '{"ns": 0, "do": "truth", "config": {"kind": "x"}, "start_s": 0}',
+    "a truth that starts never": '{"ns": 0, "do": "truth", "config": {"kind": "fixed"}, "start_s": NaN}',
+    "no fault": '{"ns": 0, "do": "fault"}',
+    "an unknown fault": '{"ns": 0, "do": "fault", "request": {"weather": 1}}',
+    "a fault of a link that is off": '{"ns": 0, "do": "fault", "request": {"can": {"drop": 1.0}}}',
+    "no UTF-8": b"\xff",
+}
+
+
+IMPOSSIBLE_LINES = {
+    "input of a link that is off": '{"ns": 0, "do": "in", "link": "can", "data": [1, "00", true, false]}',
+    "no feed": '{"ns": 0, "do": "feed", "data": "{}"}',
+    "a reply to nothing": '{"ns": 0, "do": "reply"}',
+    "the end of no write": '{"ns": 0, "do": "stored"}',
+}
+"""Entries that cannot happen to the device."""
+
+
+@pytest.fixture
+def recorded(record):
+    """A short recording."""
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 2)
+
+    return record(scenario)
+
+
+def with_line(recorded, line):
+    """Insert a line into the tape; return its place."""
+    events = recorded / EVENTS_FILE
+    lines = events.read_bytes().splitlines(keepends=True)
+    lines.insert(3, (line if isinstance(line, bytes) else line.encode()) + b"\n")
+    events.write_bytes(b"".join(lines))
+    return f"{events}: line 4: "
+
+
+@pytest.mark.parametrize("line", IMPOSSIBLE_LINES.values(), ids=IMPOSSIBLE_LINES)
+def test_a_line_that_cannot_be_played_is_a_difference(recorded, line):
+    where = with_line(recorded, line)
+    assert report_of(recorded).differences[0].startswith(where)
+
+
+@pytest.mark.parametrize("line", DAMAGED_LINES.values(), ids=DAMAGED_LINES)
+def test_a_damaged_line_is_named(recorded, line):
+    where = with_line(recorded, line)
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    assert where in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+DAMAGED_FILES = {
+    "run: nested too deeply": (RUN_FILE, b"[" * 100_000),
+    "run: no UTF-8": (RUN_FILE, b"\xff"),
+    "run: not an object": (RUN_FILE, b"[]"),
+    "run: no folder": (RUN_FILE, b'{"profile": {}}'),
+    "run: a number as folder": (RUN_FILE, b'{"profile": {}, "folder": 5}'),
+    "scenario: not JSON": (SCENARIO_FILE, b"{"),
+    "scenario: no UTF-8": (SCENARIO_FILE, b"\xff"),
+    "scenario: nested too deeply": (SCENARIO_FILE, b"[" * 100_000),
+    "scenario: another table": (SCENARIO_FILE, b'{"at": []}'),
+    "truth log: no UTF-8": (TRUTH_FILE, b"frame\n\xff\n"),
+    "truth log: an endless cell": (TRUTH_FILE, b"frame\n" + b"1" * 200_000),
+}
+
+
+@pytest.mark.parametrize(("name", "content"), DAMAGED_FILES.values(), ids=DAMAGED_FILES)
+def test_a_damaged_file_is_named(recorded, name, content):
+    (recorded / name).write_bytes(content)
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    assert f"{recorded / name}: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [RUN_FILE, EVENTS_FILE, SCENARIO_FILE, TRUTH_FILE])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_not_a_file_is_named_without_waiting(recorded, name, make):
+    (recorded / name).unlink(missing_ok=True)
+    make(recorded / name)
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    assert f"{recorded / name}: " in str(caught.value)
