@@ -252,6 +252,14 @@ class _Builder:
         custom = link.serial is not None and "custom" in (link.serial.framing.kind, link.serial.check.kind)
         if link.serial is None or (custom and definition.plugin.skipped is not None):
             return
+        if isinstance(link.serial.framing, CubeSpaceFraming):
+            for name in link.serial.framing.unanswered:
+                if name not in definition.telecommands:
+                    raise MissingNameError(
+                        f"{self._tables['link'][0]}: link.serial.framing.unanswered: no telecommand named {name!r}"
+                        f"{did_you_mean(name, definition.telecommands)}",
+                        name,
+                    )
         try:
             build_serial_stack(definition)
         except IcdError as error:
@@ -325,7 +333,12 @@ class _Builder:
         one, two, three = table.axes
         try:
             return Conventions(
-                table.quaternion, table.scalar_sign, (one, two, three), table.epoch, table.byte_order
+                table.quaternion,
+                table.scalar_sign,
+                (one, two, three),
+                table.epoch,
+                table.byte_order,
+                table.telecommand_crc,
             )
         except IcdError as error:
             raise IcdError(f"{file}: {error}") from None
@@ -547,10 +560,8 @@ class _Builder:
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
             raise IcdError(f"{where}: last_id {last} is below ID {model.id}")
-        if kind == "telemetry" and (
-            model.action is not None or model.arguments or model.readback is not None
-        ):
-            raise IcdError(f"{where}: only telecommands have an action or a readback")
+        if kind == "telemetry" and model.readback is not None:
+            raise IcdError(f"{where}: only telecommands have a readback")
         if model.readback is not None and not model.name.startswith(SETS):
             raise IcdError(f"{where}: the name of a telecommand with a readback must begin with {SETS}")
         klass = self._class_of(kind, model, where)

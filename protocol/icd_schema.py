@@ -60,6 +60,9 @@ class ConventionsModel(_Model):
     `2000-01-01`."""
     byte_order: Order = "little"
     """Default byte order of fields."""
+    telecommand_crc: bool = False
+    """Whether the CRC-8 of its data may follow the data of a telecommand: reflected polynomial 12h, initial value
+    0, but FFh without data (CubeSpace). If it is wrong, the telecommand is refused with `crc`."""
 
 
 class ClassModel(_Model):
@@ -203,7 +206,7 @@ class RowModel(_Model):
     """ID of a telemetry row that reports the last accepted values of this telecommand. If the
     telecommand is `set_NAME`, the telemetry row is `NAME`."""
     action: str | None = None
-    """Action that a telecommand performs."""
+    """Action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     answer: list[str] | None = None

@@ -19,7 +19,7 @@ from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
 from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
+from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack, serial_answers
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
@@ -66,7 +66,7 @@ def _unknown_link(icd: InterfaceDefinition) -> bool:
 def _on_serial(
     icd: InterfaceDefinition, stack: SerialStack, row: Row, values: Mapping[str, Value]
 ) -> Exchange:
-    request, replies = _messages(icd, row, values)
+    request, replies = _messages(icd, row, values, serial_answers(icd, row))
     if isinstance(stack, ComposedStack):
         _check_framing(stack, row, request)
     link = "serial, dialect b" if isinstance(stack, CubeSpaceStack) else "serial"
@@ -75,7 +75,7 @@ def _on_serial(
 
 
 def _on_can(icd: InterfaceDefinition, row: Row, values: Mapping[str, Value]) -> Exchange:
-    request, replies = _messages(icd, row, values)
+    request, replies = _messages(icd, row, values, row.answers)
     sent = encode_request_frames(request, HOST_ADDRESS, DEVICE_ADDRESS)
     received = [
         frame
@@ -89,10 +89,12 @@ def _frames(frames: Iterable[CanFrame]) -> tuple[str, ...]:
     return tuple(f"{frame.id:08X}#{_hex(frame.data)}" for frame in frames)
 
 
-def _messages(icd: InterfaceDefinition, row: Row, values: Mapping[str, Value]) -> tuple[Request, list[Reply]]:
+def _messages(
+    icd: InterfaceDefinition, row: Row, values: Mapping[str, Value], answers: Iterable[str]
+) -> tuple[Request, list[Reply]]:
     """Return the request for a row and its answers."""
     request = icd.request(row, row.encode(values) if row.kind == "telecommand" else b"")
-    return request, [_reply(icd, row, answer, request, values) for answer in row.answers]
+    return request, [_reply(icd, row, answer, request, values) for answer in answers]
 
 
 def examine(

@@ -21,7 +21,6 @@ from starhil.protocol.device_model import HEALTH, PARAMETER, generic, number_in
 from starhil.protocol.image_transfer import frame_checksum
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
-from starid.attitude import Attitude
 
 Getter: TypeAlias = Callable[[Snapshot], Value | None]
 
@@ -166,19 +165,11 @@ def _of_directions(letter: str, axis: int) -> None:
         f"vector_{letter}",
         lambda shot, star: float(to_reported_frame(shot.device, np.array(star.vector))[axis]),
     )
-    _of_star(f"icrs_{letter}", lambda shot, star: float(_icrs(shot, star)[axis]))
+    _of_star(f"icrs_{letter}", lambda _shot, star: star.icrs[axis])
 
 
 for _axis, _letter in enumerate("xyz"):
     _of_directions(_letter, _axis)
-
-
-def _icrs(shot: Snapshot, star: MatchedStar) -> np.ndarray:
-    if shot.frame is None:
-        return np.zeros(3)
-    attitude = Attitude(np.array(shot.frame.result.quaternion_xyzw))
-    vector: np.ndarray = attitude.matrix.T @ np.array(star.vector)
-    return vector
 
 
 # --- time ---
@@ -277,6 +268,14 @@ QUANTITIES["file.ready"] = lambda shot: shot.device.files.ready
 QUANTITIES["file.parameter_error"] = lambda shot: shot.device.files.parameter_error
 QUANTITIES["file.checksum"] = lambda shot: shot.device.files.checksum
 QUANTITIES["file.length"] = lambda shot: len(shot.device.files.data)
+QUANTITIES["file.updating"] = lambda shot: shot.device.files.updating
+for _name in ("type", "counter", "size", "time"):
+    QUANTITIES[f"file.{_name}"] = lambda shot, name=_name: int(getattr(shot.device.files.info, name))
+QUANTITIES["file.crc"] = lambda shot: shot.device.files.info.checksum
+QUANTITIES["file.packet_number"] = lambda shot: shot.device.files.packet[0]
+QUANTITIES["file.packet"] = lambda shot: shot.device.files.packet[1]
+QUANTITIES["card.formatting"] = lambda shot: shot.device.files.erasing and shot.device.files.formatting
+QUANTITIES["card.erasing"] = lambda shot: shot.device.files.erasing and not shot.device.files.formatting
 QUANTITIES["file.hole_map[n]"] = lambda shot, number: shot.device.files.arrived.part(number)
 
 
