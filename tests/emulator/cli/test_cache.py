@@ -92,3 +92,12 @@ def test_a_limit_that_is_not_a_number_is_reported_and_the_default_used(
         monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", text)
         assert cache.size_limit() == 500_000_000
     assert "must be a number of megabytes" in caplog.text
+
+
+def test_a_loop_of_links_does_not_stop_the_cache(folder):
+    folder.mkdir()
+    (folder / f"{name(1)}.npz").symlink_to(f"{name(1)}.npz")
+    cache.cached_tables(name(2), lambda: {"a": MEGABYTE})
+    result = CliRunner().invoke(build_app(), ["cache", "clear"])
+    assert result.exit_code == 0, result.output
+    assert not (folder / f"{name(2)}.npz").exists()
