@@ -283,6 +283,8 @@ class Run:
         closers += [head.emulation.close for head in reversed(self.heads)]
         if self.control is not None:
             closers.insert(0, self.control.close)
+        if self._recorder is not None and not self._rejected:
+            closers.append(self._recorder.end)
         closers += [file.discard if self._rejected else file.close for file in self._files]
         if self._rejected and self._recorder is not None and self._recorder.file is not None:
             closers.append(self._recorder.discard)
