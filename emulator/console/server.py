@@ -10,10 +10,11 @@ import logging
 import secrets
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Final, cast
+from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
+from aiohttp.http import HttpProcessingError
 
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
@@ -94,7 +95,12 @@ class ConsoleServer:
         app.router.add_post("/runs", self._report)
         app.router.add_static("/static", STATIC)
         self._runner = web.AppRunner(
-            app, access_log=None, handle_signals=False, shutdown_timeout=0.5, keepalive_timeout=REQUEST_S
+            app,
+            access_log=None,
+            logger=_ServerLog(log),
+            handle_signals=False,
+            shutdown_timeout=0.5,
+            keepalive_timeout=REQUEST_S,
         )
         await self._runner.setup()
         server, limit = cast("web.Server", self._runner.server), ConnectionLimit("console", BUSY)
@@ -197,6 +203,15 @@ class ConsoleServer:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         return socket
+
+
+class _ServerLog(logging.LoggerAdapter[logging.Logger]):
+    """Logs a request that is not HTTP at level debug: its peer is answered with 400, and could fill the log."""
+
+    def log(self, level: int, msg: object, *args: object, **options: Any) -> None:
+        """Log an event of the HTTP server."""
+        from_peer = isinstance(options.get("exc_info"), HttpProcessingError)
+        super().log(logging.DEBUG if from_peer else level, msg, *args, **options)
 
 
 class _Gate(asyncio.Protocol):

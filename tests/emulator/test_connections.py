@@ -182,3 +182,33 @@ def test_an_error_of_the_event_loop_is_logged_once(caplog):
         "event loop: socket.accept() out of system resource: OSError: [Errno 24] Too many open files",
         "event loop: another",
     ]
+
+
+@pytest.mark.parametrize(
+    "request_", [b"GET / HTTP/9.9\r\n\r\n", b"GET / HTTP/1.1\r\nA B: c\r\n\r\n", b"GET /" + bytes(9000)]
+)
+def test_a_request_that_is_not_http_is_answered_and_not_logged(run, caplog, request_):
+    async def scenario(emulation, _line):
+        reader, writer = await asyncio.open_connection("127.0.0.1", view_port(emulation))
+        writer.write(request_)
+        assert (await asyncio.wait_for(reader.read(), WITHIN_S)).startswith(b"HTTP/1.0 400 ")
+        writer.close()
+
+    run(scenario, options=OPTIONS)
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_an_internal_error_of_the_console_is_logged(run, caplog, monkeypatch):
+    async def fail(_request):
+        raise KeyError("stars")
+
+    monkeypatch.setattr(server, "_page", fail)
+
+    async def scenario(emulation, _line):
+        async with aiohttp.request("GET", emulation.ready_fields["view"]) as page:
+            assert page.status == 500
+
+    run(scenario, options=OPTIONS)
+    assert [record.levelno for record in caplog.records if record.levelno >= logging.WARNING] == [
+        logging.ERROR
+    ]
