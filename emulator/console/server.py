@@ -44,6 +44,9 @@ REQUEST_S: Final = 10.0
 """Time within which a peer must send a request after it has connected or received the last response, and the
 body of a request after its headers, seconds."""
 
+LINGER_S: Final = 1.0
+"""Time for which the rest of a rejected request is read, so that its peer receives the answer, seconds."""
+
 BUSY: Final = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
     b"503: too many connections; close other pages of the console\n"
@@ -101,6 +104,7 @@ class ConsoleServer:
             handle_signals=False,
             shutdown_timeout=0.5,
             keepalive_timeout=REQUEST_S,
+            lingering_time=LINGER_S,
         )
         await self._runner.setup()
         server, limit = cast("web.Server", self._runner.server), ConnectionLimit("console", BUSY)
