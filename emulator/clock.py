@@ -1,7 +1,7 @@
 """Simulation time, and the Unix clock of the device, which is derived from it.
 
-Simulation time is counted in nanoseconds since the start of the run. The model uses no other time; only
-`RealClock` and `ScaledClock` read the wall clock.
+Simulation time is counted in nanoseconds since the pipelines of all heads were ready: no time passes while kernels
+are compiled. The model uses no other time; only `RealClock` and `ScaledClock` read the wall clock.
 """
 
 from __future__ import annotations
@@ -33,15 +33,18 @@ class Clock(Protocol):
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
 
+    def start(self) -> None:
+        """Let time pass; before this, it is zero."""
+
 
 class ScaledClock:
-    """A clock that runs `speed` times as fast as wall time."""
+    """A clock that runs `speed` times as fast as wall time, once it is started."""
 
     def __init__(self, speed: float) -> None:
         if not 0.0 < speed <= MAX_SCALE:
             raise EmulatorError(f"clock: scale {speed:g} is outside 0 … {MAX_SCALE:g}; try scaled:10")
         self.speed = speed
-        self._origin_ns = time.monotonic_ns()
+        self._origin_ns: int | None = None
 
     @property
     def name(self) -> str:
@@ -50,7 +53,13 @@ class ScaledClock:
 
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
+        if self._origin_ns is None:
+            return 0
         return int((time.monotonic_ns() - self._origin_ns) * self.speed)
+
+    def start(self) -> None:
+        """Let time pass; before this, it is zero."""
+        self._origin_ns = time.monotonic_ns()
 
 
 class RealClock(ScaledClock):
@@ -77,6 +86,9 @@ class SteppedClock:
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
         return self._now_ns
+
+    def start(self) -> None:
+        """Do nothing: time passes on request."""
 
     def set_ns(self, now_ns: int) -> None:
         """Advance to a time, nanoseconds.

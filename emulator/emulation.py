@@ -9,7 +9,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Final
 from urllib.parse import quote
 
 from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock, make_clock
@@ -50,9 +49,6 @@ from starid.attitude import Attitude
 
 log = logging.getLogger("starhil.run")
 
-PATIENCE_S: Final = 8.0
-"""Time after which the log explains a slow start, seconds."""
-
 
 class Emulation:
     """A device with its pipeline, links, truth and clock.
@@ -80,6 +76,8 @@ class Emulation:
         The heads that share clock and truth, the leader first.
     body_truth
         Truth of the body on which the heads are mounted.
+    time_passes
+        Set when the pipeline of every head is ready, which starts the clock.
     """
 
     def __init__(
@@ -122,6 +120,7 @@ class Emulation:
         self._warm_up_task: asyncio.Task[None] | None = None
         self._revival: PipelineRevival | None = None
         self._awake = asyncio.Event()
+        self.time_passes: asyncio.Event = asyncio.Event() if leader is None else leader.time_passes
 
     @property
     def requests(self) -> Requests:
@@ -160,7 +159,7 @@ class Emulation:
         return ThreadImager(setup)
 
     async def open(self) -> None:
-        """Open truth and links and switch the device on; time is stopped until `begin`.
+        """Open truth and links and switch the device on; time is stopped until every head is ready.
 
         Raises
         ------
@@ -187,22 +186,19 @@ class Emulation:
             raise
 
     def begin(self) -> None:
-        """Start time and the pipeline; `ready` waits for the pipeline."""
+        """Start the pipeline; `ready` waits for it."""
         device = self.device
         if isinstance(self.clock, SteppedClock):
             if self.leader is self:
                 stepped = [(head.device.scheduler, head.imager) for head in self.heads]
                 transports = [link.transport for head in self.heads for link in head.links]
-                self.stepper = StepPump(stepped, self.clock, transports, self.tape)
+                self.stepper = StepPump(stepped, self.clock, self.time_passes, transports, self.tape)
         else:
             passing = self.clock.source if isinstance(self.clock, LatchedClock) else self.clock
             self._pump = ClockPump(device.scheduler, passing, self.tape)
-            self._pump.start()
         if self.tape is not None:
             self.tape.begin()
-        self._revival = PipelineRevival(
-            self.imager, device, lambda warm: device.pipeline_ready(camera_constants(warm))
-        )
+        self._revival = PipelineRevival(self.imager, device, self.pipeline_ready)
         self._warm_up_task = asyncio.create_task(self._warm_up())
 
     @property
@@ -299,8 +295,10 @@ class Emulation:
             self.tape.enter(kind, **values)
 
     def _message_received(self, data: bytes) -> None:
-        """Record a message of the feed."""
+        """Record a message of the feed; until time passes, each message replaces the earlier ones."""
         self._record_entry("feed", data=data.decode("latin-1"))
+        if not self.time_passes.is_set() and self.feed is not None and self.feed.truth.timeline == "anchor":
+            self.feed.truth.begin_timeline()
 
     def _now_s(self) -> float:
         """Return the simulation time, seconds."""
@@ -318,11 +316,9 @@ class Emulation:
         return config.lockstep
 
     async def _step_in_lock(self, seconds: float) -> None:
-        """Advance the clock for a simulator, after waiting until every head is ready."""
+        """Advance the clock for a simulator."""
         if self.tape is not None and self.tape.plays:
             return  # the events of the step are on the tape
-        for head in self.heads:
-            await head._awake.wait()  # noqa: SLF001 (of this class)
         if self.stepper is not None:
             await self.stepper.step(seconds)
 
@@ -424,13 +420,13 @@ class Emulation:
         """Wait for the pipeline; after that, the device leaves the boot mode at the end of its boot time."""
         device = self.device
         try:
-            self.warm = await self.imager.start()
-            log.info("pipeline ready: %d stars, %.2f s", self.warm.stars, self.warm.seconds)
+            warm = await self.imager.start()
+            log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
             self._record_entry("ready")
             device.on_mode.append(
                 lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
             )
-            device.pipeline_ready(camera_constants(self.warm))
+            self.pipeline_ready(warm)
         except EmulatorError as error:
             device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: {error}") from None
@@ -439,6 +435,18 @@ class Emulation:
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
+
+    def pipeline_ready(self, warm: PipelineReady) -> None:
+        """Pass the camera of a ready pipeline to the device; time starts when every head has one."""
+        self.warm = warm
+        self.device.pipeline_ready(camera_constants(warm))
+        if self.time_passes.is_set() or any(head.warm is None for head in self.heads):
+            return
+        self.time_passes.set()
+        self.clock.start()
+        for head in self.heads:
+            if head._pump is not None:  # noqa: SLF001 (of this class)
+                head._pump.start()  # noqa: SLF001
 
     async def ready(self) -> str:
         """Wait until the device accepts commands; return the ready line.
@@ -449,12 +457,10 @@ class Emulation:
             The pipeline cannot start, for example because there is no catalogue; one line.
         """
         awake = asyncio.create_task(self._awake.wait())
-        patience = asyncio.get_running_loop().call_later(PATIENCE_S, _warn_of_first_compilation)
         warm_up = self._warm_up_task
         if warm_up is None:
             raise EmulatorError("emulation: not started")
         await asyncio.wait({awake, warm_up}, return_when=asyncio.FIRST_COMPLETED)
-        patience.cancel()
         if warm_up.done() and (error := warm_up.exception()) is not None:
             awake.cancel()
             raise error
@@ -504,7 +510,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False) -> PipelineSet
         sky=dict(profile.sky),
         identifier=dict(profile.identifier),
         catalog_path=str(profile.folder / Path(path).expanduser()) if path else "",
-        epoch=profile.catalog.epoch,
+        epoch=profile.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,
         build_in_background=profile.run.clock != "stepped" and not repeatable,
@@ -527,10 +533,6 @@ def camera_constants(warm: PipelineReady) -> dict[str, Value]:
         "p1": p1,
         "p2": p2,
     }
-
-
-def _warn_of_first_compilation() -> None:
-    log.warning("the first start compiles kernels for about a minute; the links already answer")
 
 
 def _log_frame(measurement: Measurement) -> None:

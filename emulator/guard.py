@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import inspect
 import logging
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack
-from typing import Final, ParamSpec
+from typing import Any, Final, ParamSpec
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.errors import ProtocolError
@@ -41,6 +43,21 @@ def call_guarded(
         callback(*args, **kwargs)
     except Exception as error:  # noqa: BLE001 (whatever it is, the caller has more to do)
         log_internal_error(what, error)
+
+
+def until_cancelled(
+    serve: Callable[Arguments, Awaitable[None]],
+) -> Callable[Arguments, Coroutine[Any, Any, None]]:
+    """Return a handler of connections for a server of asyncio that ends when it is cancelled, as at the end of a run.
+
+    asyncio would log the cancellation with a traceback.
+    """
+
+    async def serve_until_cancelled(*args: Arguments.args, **kwargs: Arguments.kwargs) -> None:
+        with contextlib.suppress(asyncio.CancelledError):
+            await serve(*args, **kwargs)
+
+    return serve_until_cancelled
 
 
 async def close_all(closers: Sequence[Callable[[], object]]) -> None:

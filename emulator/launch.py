@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starhil.emulator.clock import make_clock
 from starhil.emulator.console.obc import MakeClient, ObcClient
@@ -15,6 +17,7 @@ from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
+from starhil.emulator.output_file import OutputFile
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.tape import TRUTH_FILE, Recorder
@@ -22,6 +25,9 @@ from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.errors import ProtocolError
+
+if TYPE_CHECKING:
+    from starhil.emulator.console.recorder import McapRecorder
 
 
 @dataclass(frozen=True)
@@ -96,14 +102,15 @@ class Head:
             raise EmulatorError("run: not started")
         return self._faults
 
-    def open_logs(self, options: RunOptions) -> None:
+    def open_logs(self, options: RunOptions, recorder: Recorder | None) -> None:
         """Open the truth log and the recording's truth log."""
         wall_times = self.emulation.clock.speed > 0.0
         if options.truth_log is not None:
             path = path_of_head(options.truth_log, self.number)
             self._truth_logs.append(TruthLog(path, overwrite=options.overwrite, wall_times=wall_times))
-        if options.record is not None:
-            self._truth_logs.append(TruthLog(options.record / TRUTH_FILE, wall_times=wall_times))
+        if recorder is not None:
+            path = recorder.folder / TRUTH_FILE
+            self._truth_logs.append(TruthLog(path, wall_times=wall_times, output=recorder.output))
 
     async def open(self) -> None:
         """Open the links and switch the device on."""
@@ -118,10 +125,10 @@ class Head:
         set_truth = emulation.set_truth if self.number == 1 else _leave_truth
         scenario.enter(emulation.device.scheduler, self.faults, set_truth, emulation.profile.folder)
 
-    def close_logs(self) -> None:
-        """Close the truth logs."""
-        for log in self._truth_logs:
-            log.close()
+    @property
+    def files(self) -> list[OutputFile]:
+        """The truth logs."""
+        return [log.file for log in self._truth_logs]
 
 
 class Run:
@@ -162,9 +169,6 @@ class Run:
         if self.options.record is not None:
             if others:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
-            from starhil.emulator.replay import prepare_recording
-
-            prepare_recording(self.options.record, profile, self.options.scenario)
             self._recorder = Recorder(self.options.record, make_clock(profile.run.clock))
         self.emulation = Emulation(profile, worker, tape=self._recorder, previews=self.options.watched)
         self.heads = [Head(1, self.emulation)]
@@ -175,11 +179,29 @@ class Run:
         self.control: ControlServer | None = None
         self._closers: list[Callable[[], object]] = []
         """Closers of console and MCAP file, in the order of opening."""
+        self._recorders: list[McapRecorder] = []
+        self._rejected = False
+        """Whether the start has failed, so that no files are left behind."""
 
     @property
     def faults(self) -> Faults:
         """The faults of the first head."""
         return self.heads[0].faults
+
+    @property
+    def _files(self) -> list[OutputFile]:
+        """The files that the run writes."""
+        tapes = [] if self._recorder is None or self._recorder.file is None else [self._recorder.file]
+        logs = [file for head in self.heads for file in head.files]
+        return [*tapes, *(recorder.file for recorder in self._recorders), *logs]
+
+    @property
+    def failed(self) -> bool:
+        """Whether something could not be written."""
+        outputs = [file.output for file in self._files] + [
+            head.emulation.device.stored for head in self.heads
+        ]
+        return any(output.failed for output in outputs)
 
     async def start(self) -> None:
         """Open files, links and control channel, switch the devices on and start time.
@@ -189,10 +211,27 @@ class Run:
         EmulatorError, ProtocolError
             A file, port or bus is not available; one line.
         """
+        with self._rejecting():
+            await self._start()
+
+    @contextmanager
+    def _rejecting(self) -> Iterator[None]:
+        try:
+            yield
+        except (EmulatorError, ProtocolError):
+            self._rejected = True
+            raise
+
+    async def _start(self) -> None:
         options = self.options
+        if self._recorder is not None:
+            from starhil.emulator.replay import prepare_recording
+
+            prepare_recording(self._recorder.folder, self.emulation.profile, options.scenario)
+            self._recorder.open()
         scenario = load_scenario(options.scenario) if options.scenario else None
         for head in self.heads:
-            head.open_logs(options)
+            head.open_logs(options, self._recorder)
         opened: list[Head] = []
         try:
             for head in self.heads:
@@ -226,9 +265,10 @@ class Run:
         EmulatorError
             A pipeline cannot start; one line.
         """
-        line = await self.emulation.ready()
-        for head in self.heads[1:]:
-            further = (await head.emulation.ready()).split()[1:]
+        with self._rejecting():
+            lines = [await head.emulation.ready() for head in self.heads]
+        line = lines[0]
+        for head, further in zip(self.heads[1:], (each.split()[1:] for each in lines[1:]), strict=True):
             line += "".join(
                 f" {key}.{head.number}={value}"
                 for key, _, value in (field.partition("=") for field in further)
@@ -243,9 +283,9 @@ class Run:
         closers += [head.emulation.close for head in reversed(self.heads)]
         if self.control is not None:
             closers.insert(0, self.control.close)
-        closers += [head.close_logs for head in self.heads]
-        if self._recorder is not None:
-            closers.append(self._recorder.close)
+        closers += [file.discard if self._rejected else file.close for file in self._files]
+        if self._rejected and self._recorder is not None and self._recorder.file is not None:
+            closers.append(self._recorder.discard)
         await close_all(closers)
 
     async def _open_console(self, control: ControlServer) -> None:
@@ -270,6 +310,7 @@ class Run:
             own_path = path_of_head(path, head.number)
             recorder = McapRecorder(head.emulation, client, own_path, overwrite=self.options.overwrite)
             self._closers.append(recorder.close)
+            self._recorders.append(recorder)
             recorder.start()
 
     async def _open_server(self, control: ControlServer, clients: Sequence[ObcClient]) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import permutations
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
 
@@ -16,7 +17,7 @@ from pydantic import Field, PrivateAttr, ValidationError, field_validator, model
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import (
-    LATEST_UNIX_S,
+    Date,
     FixedConfig,
     OrbitConfig,
     Strict,
@@ -33,6 +34,9 @@ FrameSeconds = Annotated[float, Field(ge=0.0, le=10.0)]
 """Duration of one stage of a frame, seconds."""
 
 Milliamperes = Annotated[float, Field(ge=0.0, le=10_000.0)]
+_J2000_UNIX_S: Final = 946_728_000.0
+_JULIAN_YEAR_S: Final = 365.25 * 86_400.0
+
 ParticleRate = Annotated[float, Field(ge=0.0, le=1e6)]
 FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
 PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -55,8 +59,8 @@ class RunConfig(Strict):
     state_dir: str = ""
     """Folder for state that survives a restart: saved parameters, boot count, CANopen settings. Empty: no
     state is kept."""
-    start_unix_s: Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S)] = 1_767_225_600.0
-    """Device clock at the start of the run, until it is set; default: 2026-01-01."""
+    start_unix_s: Date = 1_767_225_600.0
+    """Device clock at the start of the run, until it is set: a date, or Unix time; default: 2026-01-01."""
 
 
 class CatalogConfig(Strict):
@@ -64,8 +68,8 @@ class CatalogConfig(Strict):
 
     path: str = ""
     """Hipparcos file; empty: the installed catalogue."""
-    epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] = 2026.0
-    """Julian year of the star positions."""
+    epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] | None = None
+    """Julian year of the star positions; default: that of the date at the start of the run, to a tenth."""
 
 
 class CameraConfig(Strict):
@@ -106,7 +110,7 @@ class DeviceConfig(Strict):
     firmware_minor: Annotated[int, Field(ge=0, le=255)] = 0
     """Reported in `identification` (128)."""
     boot_s: Annotated[float, Field(ge=0.0, le=600.0)] = 0.5
-    """Minimum time in boot mode."""
+    """Time in boot mode after a start or reset, in simulation time."""
     rate_window: Annotated[int, Field(ge=2, le=20)] = 2
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
@@ -161,7 +165,7 @@ class ImagesConfig(Strict):
     """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
     folder: str = ""
-    """Folder of PNG, TIFF or JPEG images, used in the order of their names; relative to the profile."""
+    """Folder of PNG, TIFF, JPEG or BMP images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
@@ -215,7 +219,7 @@ class SerialConfig(Strict):
     baud: Annotated[int, Field(ge=1200, le=4_000_000)] = 115_200
     """Bit rate."""
     pace: bool = True
-    """Whether transmission is limited to the bit rate."""
+    """Whether a message arrives, whole, only at the time at which its last byte would at the bit rate."""
     symlink: str = ""
     """Path of a symbolic link to the pty, created at the start and removed at the end."""
 
@@ -310,6 +314,13 @@ class Profile(Strict):
         return float(self.sky.get("date", self.run.start_unix_s))
 
     @property
+    def epoch(self) -> float:
+        """Julian year of the star positions."""
+        if self.catalog.epoch is not None:
+            return self.catalog.epoch
+        return round(2000.0 + (self.start_unix_s - _J2000_UNIX_S) / _JULIAN_YEAR_S, 1)
+
+    @property
     def source(self) -> str:
         """File of the profile, or its name if there is none, for messages."""
         return self.name if self._source is None else str(self._source)
@@ -330,8 +341,9 @@ class Profile(Strict):
 ALTERNATIVES: Final = (
     (frozenset({"fov_deg"}), frozenset({"focal_px", "centre_px"})),
     (frozenset({"ra_deg", "dec_deg", "roll_deg"}), frozenset({"quaternion_xyzw"})),
+    (frozenset({"quaternion_xyzw"}), frozenset({"matrix"}), frozenset({"euler_deg", "sequence"})),
 )
-"""Pairs of key sets that exclude each other in a table."""
+"""Sets of keys that exclude each other in a table: field of view, attitude, mount."""
 
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
 """Device parameters that describe the camera; by default, the device is calibrated exactly."""
@@ -440,8 +452,8 @@ def _replaced_by(given: Iterable[str]) -> set[str]:
     """Return the keys of a table that are excluded by the given ones."""
     return {
         key
-        for one, other in ALTERNATIVES
-        for keys, by in ((one, other), (other, one))
+        for forms in ALTERNATIVES
+        for keys, by in permutations(forms, 2)
         if not by.isdisjoint(given)
         for key in keys
     }
@@ -451,7 +463,7 @@ def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     """Merge `over` into `base`, table by table.
 
     A table with another `kind` replaces the whole table, and keys in `over` remove their alternatives from
-    `base` (field of view or focal lengths, angles or quaternion).
+    `base` (field of view or focal lengths, angles or quaternion, the forms of a mount).
     """
     if "kind" in over and over["kind"] != base.get("kind"):
         return dict(over)

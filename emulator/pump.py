@@ -90,13 +90,15 @@ class ClockPump:
 
 
 class StepPump:
-    """Runs events on request; before each, it waits for the pipelines and for the links to send.
+    """Runs events on request, once time passes; before each, it waits for the pipelines and for the links to send.
 
     Parameters
     ----------
     devices
         Scheduler and pipeline of each device on the clock. Simultaneous events run in the
         order of the devices.
+    time_passes
+        Set when every pipeline is ready; steps wait for it.
     transports
         Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not wait for its
         transport until it reads again.
@@ -108,12 +110,14 @@ class StepPump:
         self,
         devices: Sequence[tuple[Scheduler, Imager]],
         clock: SteppedClock,
+        time_passes: asyncio.Event,
         transports: Sequence[Transport[Any]] = (),
         tape: Tape | None = None,
     ) -> None:
         self._tape = tape
         self._schedulers = [scheduler for scheduler, _ in devices]
         self._clock = clock
+        self._time_passes = time_passes
         self._imagers = [imager for _, imager in devices]
         self._transports = transports
         self._stalled: dict[Transport[Any], int] = {}
@@ -130,6 +134,7 @@ class StepPump:
         """
         if not 0.0 < seconds <= MAX_STEP_S:
             raise EmulatorError(f"step: must be seconds in (0, {MAX_STEP_S:g}], not {seconds}")
+        await self._time_passes.wait()
         async with self._lock:
             end_ns = self._clock.now_ns() + round(seconds * NANOSECONDS)
             await self._settle()

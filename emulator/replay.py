@@ -10,18 +10,22 @@ import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import cached_property
+from io import TextIOWrapper
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import BaseModel, Field, RootModel, ValidationError, model_validator
 
 from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
 from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.device.device import Background, outcome
-from starhil.emulator.emulation import Emulation, camera_constants
+from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile
 from starhil.emulator.tape import (
     EVENTS_FILE,
@@ -33,17 +37,91 @@ from starhil.emulator.tape import (
     as_json,
     from_json,
 )
-from starhil.emulator.truth.config import FileConfig, TruthConfig
+from starhil.emulator.truth.config import FileConfig, Strict, TruthConfig
 from starhil.emulator.truth_log import WALL_TIMES, TruthLog
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import Receive, ReportError, Transport
 from starhil.protocol.transports.paced import SerialTransport
+from starid.errors import StaridError
+from starid.files import open_regular, read_text
 
 Item = TypeVar("Item", bytes, CanFrame)
+Model = TypeVar("Model", bound=BaseModel)
 
-_TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 TRUTH_SOURCE_FILE: Final = "truth_source.csv"
+
+
+class _RunFile(BaseModel):
+    """The part of `run.json` that a replay uses."""
+
+    folder: str
+    profile: Profile
+
+
+class _Timed(Strict):
+    """An entry of the tape."""
+
+    ns: Annotated[int, Field(ge=0, lt=1 << 63)]
+
+
+class _Plain(_Timed):
+    """An entry that consists of its time."""
+
+    do: Literal["event", "reply", "stored", "ready", "clear_faults"]
+
+
+class _Item(_Timed):
+    """An item on a link."""
+
+    do: Literal["in", "out"]
+    link: Literal["serial", "can", "canopen"]
+    data: str | tuple[int, str, bool, bool]
+
+    @cached_property
+    def item(self) -> bytes | CanFrame:
+        """Serial bytes or a CAN frame."""
+        return from_json(self.data)
+
+    @model_validator(mode="after")
+    def _check_item(self) -> Self:
+        try:
+            is_serial = isinstance(self.item, bytes)
+        except ProtocolError as error:
+            raise ValueError(str(error)) from None
+        if is_serial != (self.link == "serial"):
+            raise ValueError(f"data: not that of the link {self.link}")
+        return self
+
+
+class _Feed(_Timed):
+    """A message of a simulator."""
+
+    do: Literal["feed"]
+    data: Annotated[str, Field(pattern=r"^[\x00-\xff]*$")]
+
+
+class _Truth(_Timed):
+    """A new truth."""
+
+    do: Literal["truth"]
+    config: TruthConfig
+    start_s: Annotated[float, Field(ge=-1e9, le=1e9)]
+
+
+class _Fault(_Timed):
+    """New faults."""
+
+    do: Literal["fault"]
+    request: FaultRequest
+
+
+Entry = _Plain | _Item | _Feed | _Truth | _Fault
+
+
+class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
+    """A line of the tape."""
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
@@ -58,24 +136,34 @@ def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise EmulatorError(f"--record {folder}: not empty; choose another folder")
-        values = profile.model_dump(mode="json")
-        if isinstance(profile.truth, FileConfig):
-            shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
-            values["truth"]["path"] = TRUTH_SOURCE_FILE
-        state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
-        if state is not None and state.is_dir():
-            shutil.copytree(state, folder / STATE_FOLDER)
-        if scenario:
-            text = load_scenario(scenario).model_dump_json()
-            (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
-        run = {
-            "starhil": importlib.metadata.version("starhil"),
-            "folder": str(profile.folder.resolve()),
-            "profile": values,
-        }
-        (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+    try:
+        _copy_inputs(folder, profile, scenario)
+    except (EmulatorError, OSError) as error:
+        shutil.rmtree(folder, ignore_errors=True)  # everything in it is from here
+        if isinstance(error, EmulatorError):
+            raise
+        raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+
+
+def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
+    values = profile.model_dump(mode="json")
+    if isinstance(profile.truth, FileConfig):
+        shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
+        values["truth"]["path"] = TRUTH_SOURCE_FILE
+    state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
+    if state is not None and state.is_dir():
+        shutil.copytree(state, folder / STATE_FOLDER)
+    if scenario:
+        text = load_scenario(scenario).model_dump_json()
+        (folder / SCENARIO_FILE).write_text(text, encoding="utf-8")
+    run = {
+        "starhil": importlib.metadata.version("starhil"),
+        "folder": str(profile.folder.resolve()),
+        "profile": values,
+    }
+    (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
 
 class Player:
@@ -208,7 +296,7 @@ class PlayedImager:
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
-            raise EmulatorError("replay: the device has requested fewer frames than in the recorded run")
+            raise EmulatorError("the device has requested fewer frames than in the recorded run")
         self.pending -= 1
         self._arrived.popleft()()
 
@@ -242,22 +330,35 @@ def read_run(folder: Path) -> Profile:
     """
     path = folder / RUN_FILE
     try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-        profile = Profile.model_validate_json(json.dumps(run["profile"]))
+        text = _read(path)
+    except EmulatorError as error:
+        raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
+    run = _validated(_RunFile, text, path)
+    is_copied = isinstance(run.profile.truth, FileConfig)
+    run.profile._source = (folder if is_copied else Path(run.folder)) / RUN_FILE  # noqa: SLF001 (private: not a key of the file)
+    return run.profile
+
+
+def _read(path: Path) -> str:
+    """Read a file of a recording; an error names it."""
+    try:
+        return read_text(path)
     except OSError as error:
-        raise EmulatorError(
-            f"replay {folder}: {RUN_FILE}: {error.strerror}; give a folder made by starhil run --record"
-        ) from None
-    except (ValueError, KeyError, TypeError) as error:
-        why = explain(error, Profile) if isinstance(error, ValidationError) else "not a recording"
-        raise EmulatorError(f"replay {path}: {why}") from None
-    is_copied = isinstance(profile.truth, FileConfig)
-    profile._source = (folder if is_copied else Path(run["folder"])) / RUN_FILE  # noqa: SLF001 (private: not a key of the file)
-    return profile
+        raise EmulatorError(f"replay {path}: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise EmulatorError(f"replay {path}: damaged ({error.reason})") from None
 
 
-def read_events(folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield the lines of a tape.
+def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
+    """Validate JSON of a recording; an error says where it is."""
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        raise EmulatorError(f"replay {where}: {explain(error, model)}") from None
+
+
+def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
+    """Yield the entries of a tape, each with file and line.
 
     Raises
     ------
@@ -266,14 +367,12 @@ def read_events(folder: Path) -> Iterator[dict[str, Any]]:
     """
     path = folder / EVENTS_FILE
     try:
-        with path.open(encoding="utf-8") as file:
+        with open_regular(path) as file:
             for number, line in enumerate(file, start=1):
-                if not line.endswith("\n"):
+                if not line.endswith(b"\n"):
                     return  # the run was killed while it wrote
-                try:
-                    yield json.loads(line)
-                except ValueError:
-                    raise EmulatorError(f"replay {path}: line {number} is damaged") from None
+                where = f"{path}: line {number}"
+                yield where, _validated(_Line, line, where).root
     except OSError as error:
         raise EmulatorError(f"replay {path}: {error.strerror}") from None
 
@@ -309,14 +408,17 @@ async def replay(folder: Path) -> ReplayReport:
             faults = Faults(emulation.device, emulation.links)
             _enter_scenario(folder, emulation, faults)
             warm = await emulation.imager.start()
-            play = _Playing(emulation, player, faults, camera_constants(warm))
+            play = _Playing(emulation, player, faults, warm)
             expected: dict[str, list[Any]] = {}
-            for event in read_events(folder):
-                if event["do"] == "out":
-                    expected.setdefault(event["link"], []).append(event["data"])
+            for where, entry in read_events(folder):
+                if isinstance(entry, _Item) and entry.do == "out":
+                    expected.setdefault(entry.link, []).append(as_json(entry.item))
                     continue
-                player.stepped.set_ns(max(event["ns"], player.stepped.now_ns()))
-                await play.entry(event)
+                player.stepped.set_ns(max(entry.ns, player.stepped.now_ns()))
+                try:
+                    await play.entry(entry)
+                except (EmulatorError, ProtocolError, StaridError) as error:
+                    raise EmulatorError(f"replay {where}: {error}") from None
                 report.entries += 1
             _compare_sent(expected, player.sent, report)
         finally:
@@ -329,58 +431,68 @@ async def replay(folder: Path) -> ReplayReport:
 def _enter_scenario(folder: Path, emulation: Emulation, faults: Faults) -> None:
     path = folder / SCENARIO_FILE
     if path.exists():
-        scenario = Scenario.model_validate_json(path.read_text(encoding="utf-8"))
+        scenario = _validated(Scenario, _read(path), path)
         scenario.enter(emulation.device.scheduler, faults, emulation.set_truth, emulation.profile.folder)
 
 
 class _Playing:
     """Plays entries one by one."""
 
-    def __init__(self, emulation: Emulation, player: Player, faults: Faults, camera: dict[str, Any]) -> None:
+    def __init__(self, emulation: Emulation, player: Player, faults: Faults, warm: PipelineReady) -> None:
         self._emulation = emulation
         self._player = player
         self._faults = faults
-        self._camera = camera
+        self._warm = warm
 
-    async def entry(self, event: dict[str, Any]) -> None:
-        """Play one entry at the current time."""
-        device, player, kind = self._emulation.device, self._player, event["do"]
-        if kind == "event":
-            due = device.scheduler.pop_due(player.clock.now_ns())
-            if due is None:
-                raise EmulatorError(_deviation(event, "no event is due"))
-            due.action(due.due_ns)
-        elif kind == "reply" and player.pipeline is not None:
-            await player.pipeline.deliver()
-        elif kind == "in":
-            player.receivers[event["link"]](from_json(event["data"]))
-        elif kind == "stored":
-            if not player.writes:
-                raise EmulatorError(_deviation(event, "nothing is being written"))
-            player.writes.popleft()()
-        elif kind == "ready":
-            device.pipeline_ready(self._camera)
-        else:
-            await self._command(event)
+    async def entry(self, entry: Entry) -> None:
+        """Play one entry at the current time.
 
-    async def _command(self, event: dict[str, Any]) -> None:
-        """Play a feed message or a command on the control channel."""
-        emulation, kind = self._emulation, event["do"]
-        if kind == "feed" and emulation.feed is not None:
-            await emulation.feed.process(event["data"].encode("latin-1"))
-        elif kind == "truth":
-            config = _TRUTH.validate_json(json.dumps(event["config"]))
-            await emulation.play_truth(config, event["start_s"])
-        elif kind == "fault":
-            self._faults.inject(FaultRequest.model_validate_json(json.dumps(event["request"])))
-        elif kind == "clear_faults":
-            self._faults.clear()
-        else:
-            raise EmulatorError(_deviation(event, f"{kind!r} cannot be played"))
+        Raises
+        ------
+        EmulatorError
+            The device behaves differently, so that the entry cannot be played.
+        """
+        emulation = self._emulation
+        match entry:
+            case _Plain():
+                await self._plain(entry)
+            case _Item():
+                receive = self._player.receivers.get(entry.link)
+                if receive is None:
+                    raise EmulatorError(_deviation(entry, f"the link {entry.link} is off"))
+                receive(entry.item)
+            case _Feed():
+                if emulation.feed is None:
+                    raise EmulatorError(_deviation(entry, "there is no live feed"))
+                await emulation.feed.process(entry.data.encode("latin-1"))
+            case _Truth():
+                await emulation.play_truth(entry.config, entry.start_s)
+            case _Fault():
+                self._faults.inject(entry.request)
+
+    async def _plain(self, entry: _Plain) -> None:
+        """Play an entry that consists of its time."""
+        device, player = self._emulation.device, self._player
+        match entry.do:
+            case "event":
+                due = device.scheduler.pop_due(player.clock.now_ns())
+                if due is None:
+                    raise EmulatorError(_deviation(entry, "no event is due"))
+                call_guarded("event", due.action, due.due_ns)
+            case "reply" if player.pipeline is not None:
+                await player.pipeline.deliver()
+            case "stored":
+                if not player.writes:
+                    raise EmulatorError(_deviation(entry, "nothing is being written"))
+                player.writes.popleft()()
+            case "ready":
+                self._emulation.pipeline_ready(self._warm)
+            case "clear_faults":
+                self._faults.clear()
 
 
-def _deviation(event: dict[str, Any], why: str) -> str:
-    return f"replay: at {event['ns'] / NANOSECONDS:.6f} s the device behaves differently: {why}"
+def _deviation(entry: Entry, why: str) -> str:
+    return f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently: {why}"
 
 
 def _compare_sent(expected: dict[str, list[Any]], sent: dict[str, list[Any]], report: ReplayReport) -> None:
@@ -417,5 +529,10 @@ def _compare_truth(recorded: Path, now: Path, report: ReplayReport) -> None:
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    with path.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    try:
+        with TextIOWrapper(open_regular(path), encoding="utf-8", newline="") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise EmulatorError(f"replay {path}: {error.strerror}") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise EmulatorError(f"replay {path}: damaged ({error})") from None

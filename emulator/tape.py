@@ -11,6 +11,7 @@ line, in order), `truth.csv` (truth log), and other files that the run needs: `s
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
@@ -18,6 +19,7 @@ from typing import Any, Final, Protocol, TypeVar
 from starhil.emulator.clock import Clock
 from starhil.emulator.device.device import Background
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.output_file import Output, OutputFile
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.transports.base import Receive, ReportError, Transport
@@ -88,6 +90,10 @@ class LatchedClock:
         """Return the time of the last entry, nanoseconds."""
         return self._now_ns
 
+    def start(self) -> None:
+        """Start the running clock."""
+        self.source.start()
+
     def latch(self) -> None:
         """Set this clock to the current time."""
         self._now_ns = self.source.now_ns()
@@ -114,9 +120,16 @@ class Recorder:
     Parameters
     ----------
     folder
-        Folder of the recording, which must exist.
+        Folder of the recording.
     clock
         Clock of the run.
+
+    Attributes
+    ----------
+    file
+        The tape; None before it is opened.
+    output
+        All files of the recording.
     """
 
     plays: Final = False
@@ -124,10 +137,16 @@ class Recorder:
     def __init__(self, folder: Path, clock: Clock) -> None:
         self._latched = LatchedClock(clock) if clock.speed > 0.0 else None
         self.clock: Clock = self._latched or clock
-        self._file = (folder / EVENTS_FILE).open("w", encoding="utf-8", buffering=1)
+        self.folder = folder
+        self.file: OutputFile | None = None
+        self.output = Output(f"recording {folder}")
         self._held: list[Callable[[], None]] | None = []
         """Entries that arrived while the links were being opened, which takes no time on the tape; None
         afterwards."""
+
+    def open(self) -> None:
+        """Create the tape in the folder, which must exist."""
+        self.file = OutputFile("recording", self.folder / EVENTS_FILE, output=self.output)
 
     def begin(self) -> None:
         """Process the entries that arrived while the links were being opened."""
@@ -154,8 +173,9 @@ class Recorder:
 
     def write(self, kind: str, **values: Any) -> None:
         """Write a line with the time of the clock."""
-        if not self._file.closed:
-            self._file.write(json.dumps({"ns": self.clock.now_ns(), "do": kind, **values}) + "\n")
+        if self.file is not None:
+            entry = {"ns": self.clock.now_ns(), "do": kind, **values}
+            self.file.append(lambda: json.dumps(entry).encode() + b"\n")
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
         """Return the transport of the serial line, whose items are recorded."""
@@ -186,9 +206,9 @@ class Recorder:
 
         return background
 
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
+    def discard(self) -> None:
+        """Remove the folder, whose content this run has made, because the run was rejected."""
+        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 class _RecordedTransport(Transport[Item]):

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import csv
-import errno
-import fcntl
 import io
-import logging
-import os
-import stat
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -17,10 +12,8 @@ import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.cycle import Measurement, as_quaternion
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.output_file import Output, OutputFile
 from starid.attitude import Attitude
-
-log = logging.getLogger("starhil.truth")
 
 COLUMNS: Final = (
     "frame", "time_of_exposure_s", "run_time_s", "mode", "valid", "reason",
@@ -85,9 +78,6 @@ def compare(measurement: Measurement) -> dict[str, Any]:
 class TruthLog:
     """A CSV file with one row per exposure; rows are written complete and unbuffered.
 
-    Only one emulator at a time can write to a file. If writing fails, for example because the disk is full, a
-    warning is logged, the file ends with the last complete row and the run continues.
-
     Parameters
     ----------
     path
@@ -96,6 +86,8 @@ class TruthLog:
         Whether to replace an existing file.
     wall_times
         Whether to fill the columns in `WALL_TIMES`.
+    output
+        The recording of which the file is a part; by default it is none.
 
     Raises
     ------
@@ -103,91 +95,26 @@ class TruthLog:
         The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False, wall_times: bool = True) -> None:
-        self._path = path
+    def __init__(
+        self, path: Path, *, overwrite: bool = False, wall_times: bool = True, output: Output | None = None
+    ) -> None:
         self._empty_columns = () if wall_times else WALL_TIMES
-        self._size = 0
-        self._file: io.FileIO | None = None
-        try:
-            self._file = _open(path, overwrite=overwrite)
-            self._write_row(COLUMNS)
-        except OSError as error:
-            self.close()
-            raise EmulatorError(
-                f"truth log {path}: cannot be written ({error.strerror}); choose another file"
-            ) from None
+        self.file = OutputFile("truth log", path, header=_as_csv(COLUMNS), overwrite=overwrite, output=output)
+        self.close = self.file.close
 
     def write(self, measurement: Measurement) -> None:
         """Write the row of a measurement."""
-        if self._file is None:
-            return
-        try:
-            row = compare(measurement) | dict.fromkeys(self._empty_columns)
-            self._write_row([_format_cell(name, value) for name, value in row.items()])
-        except OSError as error:
-            log.warning(
-                "truth log %s: cannot be written (%s); it ends before frame %d; the run continues",
-                self._path,
-                error.strerror,
-                measurement.counter,
-            )
-            self.close()
+        self.file.append(lambda: self._row(measurement))
 
-    def _write_row(self, cells: Iterable[str]) -> None:
-        """Write a complete row, or nothing."""
-        if self._file is None:
-            return
-        text = io.StringIO()
-        csv.writer(text).writerow(cells)
-        row = memoryview(text.getvalue().encode())
-        size = len(row)
-        try:
-            while row:
-                written: int | None = self._file.write(row)
-                if written is None:  # a character device that would block
-                    raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN))
-                row = row[written:]
-        except OSError:
-            if stat.S_ISREG(os.fstat(self._file.fileno()).st_mode):
-                self._file.truncate(self._size)
-            raise
-        self._size += size
-
-    def close(self) -> None:
-        """Close the file."""
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+    def _row(self, measurement: Measurement) -> bytes:
+        row = compare(measurement) | dict.fromkeys(self._empty_columns)
+        return _as_csv(_format_cell(name, value) for name, value in row.items())
 
 
-def _open(path: Path, *, overwrite: bool) -> io.FileIO:
-    """Open and empty a file for one writer; a pipe is rejected, as its reader could block the emulator."""
-    flags = os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
-    file = os.fdopen(os.open(path, flags, 0o644), "wb", buffering=0)
-    try:
-        _lock_and_empty(path, file, overwrite=overwrite)
-    except (EmulatorError, OSError):
-        file.close()
-        raise
-    return file
-
-
-def _lock_and_empty(path: Path, file: io.FileIO, *, overwrite: bool) -> None:
-    """Lock a file for this process and empty it; a character device such as /dev/null is not locked."""
-    mode = os.fstat(file.fileno()).st_mode
-    if stat.S_ISCHR(mode):
-        return
-    if not stat.S_ISREG(mode):
-        raise EmulatorError(f"truth log {path}: not a regular file; choose another file")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise EmulatorError(f"truth log {path}: in use by another emulator; choose another file") from None
-    if os.fstat(file.fileno()).st_size and not overwrite:
-        raise EmulatorError(
-            f"truth log {path}: exists and is not empty; choose another file, or replace it with --overwrite"
-        )
-    file.truncate()
+def _as_csv(cells: Iterable[str]) -> bytes:
+    text = io.StringIO()
+    csv.writer(text).writerow(cells)
+    return text.getvalue().encode()
 
 
 def _format_cell(name: str, value: Any) -> str:

@@ -49,7 +49,8 @@ def explain(
             sorted(repr(tag) for each in models for tag in _tags_of(each))
         )
         return f"{'.'.join([*path, key])}: must be one of {expected}{given}"
-    shown = "" if isinstance(first["input"], (dict, list)) else f" (given: {first['input']!r})"
+    whole = isinstance(first["input"], (dict, list)) or first["type"] == "json_invalid"
+    shown = "" if whole else f" (given: {first['input']!r})"
     return f"{where}: {plain(first['msg'])}{shown}"
 
 

@@ -23,6 +23,8 @@ from starhil.protocol.unit_folders import DEFAULT_UNIT
 READY_WITHIN_S: Final = 300.0
 """The first start on a machine compiles for minutes; later ones take about 3 s."""
 STOP_WITHIN_S: Final = 15.0
+PROGRESS: Final = "starting:"
+"""Begin of the lines on stderr that report the progress of a slow start; they are shown."""
 SHOWN_LINES: Final = 5
 """Number of last lines of the emulator's stderr in an error message."""
 
@@ -200,7 +202,11 @@ class EmulatorProcess:
         self._lines.put(None)
 
     def _read_errors(self, stream: IO[str]) -> None:
-        self.errors.extend(line.rstrip() for line in stream)
+        for line in stream:
+            if line.startswith(PROGRESS):
+                print(line.rstrip(), file=sys.stderr, flush=True)
+            else:
+                self.errors.append(line.rstrip())
 
     def _last_errors(self) -> str:
         for reader in self._readers:

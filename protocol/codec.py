@@ -120,6 +120,16 @@ class Field:
         return self.slot.size
 
     @property
+    def bit_count(self) -> int:
+        """Number of bits of the raw value."""
+        return self.width or 8 * self.size
+
+    def place(self, bit: int) -> tuple[int, int]:
+        """Return the byte in the row that holds a bit of the raw value, and the bit in that byte; 0 is the lowest."""
+        byte, position = divmod(self.shift + bit, 8)
+        return self.offset + (byte if self.slot.order == "little" else self.size - 1 - byte), position
+
+    @property
     def scaled(self) -> bool:
         """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0

@@ -104,6 +104,17 @@ def cached_files() -> list[CachedFile]:
     return sorted(found, key=lambda each: each.used_s)
 
 
+def kernels_written_since(unix_s: float) -> int:
+    """Return how many kernels have been compiled into the cache since a Unix time in seconds."""
+    count = 0
+    for path in cache_dir().glob(f"{_KERNELS}/*/*.nbc"):
+        try:
+            count += path.stat().st_mtime >= unix_s
+        except FileNotFoundError:  # another process has removed it
+            continue
+    return count
+
+
 def size_limit() -> int:
     """Return the size limit of the cache in bytes: ``STARHIL_CACHE_LIMIT_MB``, else 500 MB.
 

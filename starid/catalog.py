@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,7 +28,8 @@ DEFAULT_EPOCH: Final = 2026.0
 _RAD_PER_MAS: Final = math.pi / (180.0 * 3600.0 * 1000.0)
 _EPOCH_RANGE: Final = (1800.0, 2200.0)
 _FORMAT: Final = 1
-_CANDIDATES: Final = 200_000
+_NARROWEST_STRIP: Final = 1e-4
+"""Narrowest strip in the search for close pairs: places within it remain exact."""
 _PER_STAR: Final = (
     *("hip", "vectors", "ra_rad", "dec_rad", "hp", "v", "b_v", "v_i"),
     *("parallax_mas", "pm_ra_mas_yr", "pm_dec_mas_yr"),
@@ -282,7 +282,7 @@ def companions(catalog: StarCatalog, limiting_magnitude: float, separation_rad: 
     """
     bright = np.flatnonzero(catalog.v <= limiting_magnitude)
     faint = np.flatnonzero(catalog.v > limiting_magnitude)
-    pairs = _close_pairs(catalog.vectors[bright], catalog.vectors[faint], separation_rad)
+    pairs = close_pairs(catalog.vectors[bright], catalog.vectors[faint], _chord(separation_rad))
     return faint[np.unique(pairs[:, 1])]
 
 
@@ -315,7 +315,7 @@ def merge_close_stars(
     if not separation_rad >= 0.0:
         raise StaridError(f"star catalogue: separation must be radians ≥ 0, not {separation_rad}")
     leader = np.arange(len(catalog))
-    pairs = _close_pairs(catalog.vectors, catalog.vectors, separation_rad)
+    pairs = close_pairs(catalog.vectors, catalog.vectors, _chord(separation_rad))
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     if len(pairs) == 0:
         return catalog
@@ -356,27 +356,31 @@ def _chord(angle_rad: float) -> float:
     return 2.0 * math.sin(0.5 * min(angle_rad, math.pi))
 
 
-def _close_pairs(ones: Array, others: Array, separation_rad: float) -> NDArray[np.intp]:
-    """Pairs (m, 2) of rows of two arrays of unit vectors that are at most an angle apart.
+def close_pairs(ones: Array, others: Array, distance: float) -> NDArray[np.intp]:
+    """Pairs (m, 2) of rows of two arrays of points that are at most a distance apart.
 
-    The second array is sorted by z, where partners lie within the chord. (A k-d tree takes 0.5 s to import.)
+    The second array is sorted into strips along the first axis. (A k-d tree takes 0.3 s to import.)
     """
-    chord = _chord(separation_rad)
-    order = np.argsort(others[:, 2], kind="stable")
-    ordered = others[order]
-    x, z = np.ascontiguousarray(ordered[:, 0]), np.ascontiguousarray(ordered[:, 2])
-    first = np.searchsorted(z, ones[:, 2] - chord, side="left")
-    count = np.searchsorted(z, ones[:, 2] + chord, side="right") - first
+    strip = max(distance, _NARROWEST_STRIP)
+    low = np.minimum(ones[:, 0].min(initial=0.0), others[:, 0].min(initial=0.0)) - 2.0 * strip
+    high = np.maximum(ones[:, 0].max(initial=0.0), others[:, 0].max(initial=0.0)) + 2.0 * strip
+    order, places = _in_strips(others, strip, low, high)
+    first_order, middle = (order, places) if ones is others else _in_strips(ones, strip, low, high)
     found = [np.empty((0, 2), dtype=np.intp)]
-    # chunks whose candidates take no more than a few megabytes
-    portion = np.cumsum(count) // _CANDIDATES
-    for start, end in itertools.pairwise([*np.flatnonzero(np.diff(portion, prepend=-1)).tolist(), len(ones)]):
-        one = np.repeat(np.arange(start, end), count[start:end])
-        before = np.cumsum(count[start:end]) - count[start:end]
-        other = np.arange(len(one)) + np.repeat(first[start:end] - before, count[start:end])
-        near = np.flatnonzero(np.abs(x[other] - ones[one, 0]) <= chord)
-        one, other = one[near], other[near]
-        gap = ordered[other] - ones[one]
-        close = np.einsum("ij,ij->i", gap, gap) <= chord * chord
-        found.append(np.column_stack([one[close], order[other[close]]]))
+    for neighbour in (-1, 0, 1):
+        centre = middle + neighbour * (high - low)
+        first = np.searchsorted(places, centre - strip)
+        count = np.searchsorted(places, centre + strip) - first
+        one = np.repeat(first_order, count)
+        other = order[np.arange(len(one)) + np.repeat(first - np.cumsum(count) + count, count)]
+        gap = others[other] - ones[one]
+        close = np.einsum("ij,ij->i", gap, gap) <= distance * distance
+        found.append(np.column_stack([one[close], other[close]]))
     return np.concatenate(found)
+
+
+def _in_strips(points: Array, strip: float, low: float, high: float) -> tuple[NDArray[np.intp], Array]:
+    """Order of points by strip of the last axis, then by the first axis; and their places in that order."""
+    places = np.floor(points[:, -1] / strip) * (high - low) + (points[:, 0] - low)
+    order = np.argsort(places, kind="stable")
+    return order, places[order]

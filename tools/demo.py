@@ -172,7 +172,7 @@ def main() -> int:
     command = emulator_command(
         profile="demo", serial="auto", can="auto", state_dir=out / "state", truth_log=truth_log
     )
-    console.print("Starting the emulator; the first start on a machine compiles for a few minutes.")
+    console.print("Starting the emulator; the first start on a machine compiles kernels.")
     begin = time.monotonic()
     try:
         with EmulatorProcess(command, ready_within_s=READY_WITHIN_S) as emulator:

@@ -33,9 +33,9 @@ from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 from starid.result_store import Results
 
 RATES_DEG_S: Final = (0.0, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 3.0, 4.0, 5.0)
-SUN_DEG: Final = (25.0, 30.0, 40.0, 50.0, 60.0, 90.0)
+SUN_DEG: Final = (0.0, 10.0, 20.0, 30.0, 35.0, 45.0, 60.0, 90.0)
 MOON_DEG: Final = (0.0, 5.0, 10.0, 15.0, 20.0, 25.0, 30.0)
-EARTH_DEG: Final = (-20.0, -10.0, 0.0, 10.0, 20.0, 25.0, 30.0)
+EARTH_DEG: Final = (-20.0, -10.0, 0.0, 10.0, 20.0, 25.0, 35.0)
 FALSE_STARS: Final = (0.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 PARTICLES_S: Final = (0.0, 100.0, 300.0, 1000.0, 3000.0)
 EARTH_RADIUS_DEG: Final = 64.0
@@ -167,7 +167,6 @@ class EcssDevice:
         self.exposure_s = float(parameters["exposure"]) / 1000.0
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])
-        self.sky = dict(setup.sky)
         timing, thermal = profile.timing, profile.thermal
         busy_s = self.exposure_s + timing.readout_s + timing.detect_s + timing.identify_tracking_s
         period_s = max(1.0 / float(parameters["update_rate"]), exposure_period_s(parameters))
@@ -261,11 +260,9 @@ def _near(body: str) -> Callable[[EcssDevice, Condition, int, np.random.Generato
         shot = _at_rest(device, condition, number, rng)
         away_deg = condition.value + (EARTH_RADIUS_DEG if body == "earth" else 0.0)
         ra_deg, dec_deg = direction_around(shot.attitude, (away_deg, away_deg), rng)
-        table = {"ra_deg": ra_deg, "dec_deg": dec_deg}
+        shot.sky = {body: {"ra_deg": ra_deg, "dec_deg": dec_deg}}
         if body == "earth":
-            table["radius_deg"] = EARTH_RADIUS_DEG
-        configured = device.sky.get(body)
-        shot.sky = {body: {**(configured if isinstance(configured, dict) else {}), **table}}
+            shot.sky[body]["radius_deg"] = EARTH_RADIUS_DEG
         return shot
 
     return near

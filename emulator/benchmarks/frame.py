@@ -13,7 +13,7 @@ import numpy as np
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.bodies import bodies_in_field
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
-from starhil.emulator.sky.light import baffle_passed
+from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import unix_time
 from starhil.emulator.truth.orbit import KeplerOrbit
@@ -175,7 +175,7 @@ def measure_bodies(
                 )
                 attitude = at_moon.rotated(_BESIDE_MOON_RAD * rng.uniform(-0.7, 0.7, 3))
             seen = bodies_in_field(objects, attitude, camera) or ("none",)
-            if seen != (case,) or baffle_passed(objects, attitude):
+            if seen != (case,) or through_baffle(objects, attitude):
                 continue
             pair = [times(skies[k], unix_s, attitude, index) for k in ((0, 1), (1, 0))[index % 2]]
             table.append(pair if index % 2 == 0 else pair[::-1])

@@ -1,22 +1,25 @@
-"""`starhil cache`: show and clear the cache of computed files."""
+"""`starhil cache`: show, fill and clear the cache of computed files."""
 
 from __future__ import annotations
 
+import asyncio
 import json
 import time
+from typing import Annotated
 
 import typer
 
 from starhil.emulator.cli.options import AsJson
+from starhil.emulator.cli.output import report_slow_start
 
 group = typer.Typer(
-    help="Show or clear the cache of star catalogues, indices, databases and machine code of kernels."
+    help="Show, fill or clear the cache of star catalogues, indices, databases and machine code of kernels."
 )
 
 
 @group.callback(invoke_without_command=True)
 def command(context: typer.Context) -> None:
-    """Show or clear the cache of star catalogues, indices and databases; without a command: info."""
+    """Show, fill or clear the cache of star catalogues, indices and databases; without a command: info."""
     if context.invoked_subcommand is None:
         info()
 
@@ -42,6 +45,46 @@ def info(as_json: AsJson = False) -> None:
         print(f"{each.size / BYTES_PER_MB:8.1f} MB  {used}  {each.name}")
     limit = size_limit() / BYTES_PER_MB
     print(f"{total / BYTES_PER_MB:8.1f} MB of {limit:g} MB in {len(files)} files in {cache_dir()}")
+
+
+@group.command("warm")
+def warm(
+    profile: Annotated[
+        str | None,
+        typer.Argument(
+            help="Device profile for which to fill the cache: a name or a TOML file.", show_default="cubestar"
+        ),
+    ] = None,
+) -> None:
+    """Compile the kernels and build the star index, as the first start of a profile does.
+
+    Progress is shown on stderr. Kernels are the same for all profiles; the star index depends on the camera.
+    """
+    from dataclasses import replace
+
+    from starhil.emulator.emulation import pipeline_setup
+    from starhil.emulator.pipeline.imager import ProcessImager
+    from starhil.emulator.pipeline.worker_process import WorkerProcess
+    from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starid.cache import cache_dir, kernels_written_since
+
+    begin_s = time.time()
+    setup = pipeline_setup(load_profile(profile or DEFAULT_PROFILE))
+    setup = replace(setup, previews=True, sky={"bodies": "ephemeris"})  # these have kernels of their own
+
+    async def start() -> None:
+        imager = ProcessImager(setup, WorkerProcess())
+        progress = asyncio.create_task(report_slow_start())
+        try:
+            await imager.start()
+        finally:
+            progress.cancel()
+            await imager.close()
+
+    asyncio.run(start())
+    print(
+        f"{kernels_written_since(begin_s)} kernels compiled in {time.time() - begin_s:.1f} s, in {cache_dir()}"
+    )
 
 
 @group.command("clear")

@@ -20,7 +20,8 @@ _UNITS = {"fx": "px", "fy": "px", "cx": "px", "cy": "px"}
 
 def command(
     images: Annotated[
-        list[Path], typer.Argument(help="PNG, TIFF or JPEG images from one camera, all of the same size.")
+        list[Path],
+        typer.Argument(help="PNG, TIFF, JPEG or BMP images from one camera, all of the same size."),
     ],
     output: Annotated[
         Path, typer.Option("--output", "-o", help=output_help("Camera profile (TOML) to write."))

@@ -28,7 +28,7 @@ _MODELS: dict[str, Model] = {"pinhole": "pinhole", "equidistant": "equidistant"}
 
 def command(
     image: Annotated[
-        Path, typer.Argument(help="PNG, TIFF or JPEG, 8 or 16 bits; grey, or colour with --fov.")
+        Path, typer.Argument(help="PNG, TIFF, JPEG or BMP, 8 or 16 bits; grey, or colour with --fov.")
     ],
     profile: Annotated[
         str | None, typer.Option(help="Device or camera profile with the camera: a name or a TOML file.")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import asyncio
 import codecs
 import io
 import sys
+import time
 from pathlib import Path
 from typing import Final, TextIO
 
@@ -38,6 +40,9 @@ _PLAIN: Final = {
 
 _HANDLER: Final = "starhil-plain"
 
+PROGRESS_S: Final = 5.0
+"""Time after which the progress of a slow start is reported, and between reports, seconds."""
+
 
 def output_help(what: str) -> str:
     """Return the help of an option that names an output file."""
@@ -68,6 +73,18 @@ def report_stream(output: Path | None) -> TextIO:
     from starid.files import is_stdout
 
     return sys.stderr if output is not None and is_stdout(output) else sys.stdout
+
+
+async def report_slow_start() -> None:
+    """Report the progress of a start on stderr every `PROGRESS_S`, until cancelled."""
+    from starid.cache import kernels_written_since
+
+    begin_s = time.time()
+    while True:
+        await asyncio.sleep(PROGRESS_S)
+        compiled = kernels_written_since(begin_s)
+        reason = f", {compiled} kernels compiled; later starts use them" if compiled else ""
+        print(f"starting: {time.time() - begin_s:.0f} s{reason}", file=sys.stderr, flush=True)
 
 
 def print_text(text: str) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.options import DIALECTS, UnitChoice, one_of
-from starhil.emulator.cli.output import output_help, prepare_output
+from starhil.emulator.cli.output import output_help, prepare_output, report_slow_start
 
 
 def command(
@@ -113,11 +113,12 @@ def command(
         typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
     ] = None,
     log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
-) -> None:
+) -> int:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 
     When the emulator accepts commands, it prints a line on stdout that gives the links:
-    `ready serial=… dialect=… can=… seed=…`.
+    `ready serial=… dialect=… can=… seed=…`. The exit status is 1 if a log, a recording or the state could not be
+    written, for example because the disk is full; the run goes on without it.
     """
     from starhil.emulator.pipeline.worker_process import take_worker
 
@@ -190,7 +191,7 @@ def command(
         if path is not None:
             prepare_output(path, option)
 
-    async def run() -> None:
+    async def run() -> int:
         import signal
 
         emulator = Run(profiles[0], options, worker, profiles[1:])
@@ -204,7 +205,9 @@ def command(
             await emulator.start()
             line = asyncio.create_task(emulator.ready())
             stop = asyncio.create_task(emulator.ended.wait())
+            progress = asyncio.create_task(report_slow_start())
             await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
+            progress.cancel()
             if line.done():
                 gc.collect()
                 gc.freeze()  # long-lived objects: garbage collection would pause the links
@@ -214,8 +217,9 @@ def command(
                 line.cancel()
         finally:
             await emulator.close()
+        return int(emulator.failed)
 
-    asyncio.run(run())
+    return asyncio.run(run())
 
 
 def _absolute_folder(unit: str) -> str:

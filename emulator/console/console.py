@@ -100,9 +100,9 @@ class Console:
         device = self._emulation.device
         device.on_frame.append(self._frame_published)
         device.on_mode.append(self._mode_changed)
-        catalog = self._emulation.profile.catalog
-        path = str(self._emulation.profile.folder / catalog.path) if catalog.path else None
-        self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, catalog.epoch))
+        profile = self._emulation.profile
+        path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
+        self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, profile.epoch))
         loops = (self._deliver_trace, self._report_status, self._poll_telemetry)
         self._tasks = [asyncio.create_task(self._guarded(loop)) for loop in loops]
 
@@ -280,7 +280,7 @@ class Console:
         mount = None if profile.truth.mount is None else profile.truth.mount.build()
         _table(request, "to")
         truth = await self._execute({"do": "truth"})
-        wanted = await asyncio.to_thread(pointing_request, request, truth, mount, path, profile.catalog.epoch)
+        wanted = await asyncio.to_thread(pointing_request, request, truth, mount, path, profile.epoch)
         return await self._execute(wanted)
 
     async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import asyncio
 import base64
 import functools
+import io
 import json
 import logging
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import IO, Any, Final
+from typing import Any, Final
 
 from mcap.writer import CompressionType, Writer
 
@@ -21,13 +22,16 @@ from starhil.emulator.console.obc import ObcClient, decode
 from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.emulation import Emulation
-from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import log_internal_error
+from starhil.emulator.output_file import OutputFile
 
 log = logging.getLogger("starhil.record")
 
 MAX_PENDING: Final = 64
 """Write-queue limit; further messages are dropped."""
+
+MCAP_TIMES_NS: Final = range(1 << 64)
+"""Times that an MCAP file can hold: Unix time, nanoseconds."""
 
 POLL_S: Final = 1.0
 """Period in which every telemetry row is read once, seconds."""
@@ -72,7 +76,7 @@ INFO: Final = 2
 
 
 class McapRecorder:
-    """Records a run; if the disk is full, the recording stops and the run continues.
+    """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows.
 
     Parameters
     ----------
@@ -96,25 +100,17 @@ class McapRecorder:
     ) -> None:
         self._emulation = emulation
         self._client = client
-        self._path = path
         self._history = History(1)
         self._room = threading.Semaphore(MAX_PENDING)
-        self._ended = False
-        """Whether the recording has stopped."""
+        self._start_ns = round(emulation.profile.run.start_unix_s * NANOSECONDS)
+        """Unix time of the start of the simulation, to which all log times refer."""
+        self._stamp_missing = False
         self.dropped = 0
         """Messages that were dropped because the disk was too slow."""
         self._task: asyncio.Task[None] | None = None
-        try:
-            if not overwrite and path.exists() and path.stat().st_size:
-                raise EmulatorError(
-                    f"recording {path}: exists and is not empty; choose another file, or replace it with --overwrite"
-                )
-            self._file: IO[bytes] = path.open("wb")
-        except OSError as error:
-            raise EmulatorError(
-                f"recording {path}: cannot be written ({error.strerror}); choose another file"
-            ) from None
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD)
+        self.file = OutputFile("recording", path, overwrite=overwrite)
+        self._stream = io.BufferedWriter(self.file.stream)
+        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="starhil")
         self._schemas = {
             name: self._writer.register_schema(
@@ -143,26 +139,25 @@ class McapRecorder:
             await asyncio.gather(self._task, return_exceptions=True)
         await asyncio.to_thread(self._disk.shutdown, wait=True)
         self._on_disk(self._writer.finish)
-        self._ended = True
-        self._file.close()
+        self._on_disk(self._stream.flush)
+        self.file.close()
         if self.dropped:
             log.warning(
-                "recording %s: %d messages dropped, as the disk was too slow", self._path, self.dropped
+                "recording %s: %d messages dropped, as the disk was too slow", self.file.path, self.dropped
             )
 
     # --- sources ---
 
     def _record_frame(self, measurement: Measurement) -> None:
-        at_ns = measurement.mid_unix_ns
-        stamp = _stamp(at_ns)
+        at_ns, stamp = measurement.mid_ns, self._stamp(measurement.mid_unix_ns)
         preview = measurement.result.preview
         if preview is not None:
             data = base64.b64encode(preview.jpeg).decode()
-            image = {"timestamp": stamp, "frame_id": "sensor", "data": data, "format": "jpeg"}
+            image = {**stamp, "frame_id": "sensor", "data": data, "format": "jpeg"}
             self._write("/image", "foxglove.CompressedImage", at_ns, image)
         quaternion = measurement.truth.attitude.quaternion_xyzw.tolist()
         truth = {
-            "timestamp": stamp,
+            **stamp,
             "parent_frame_id": "icrs",
             "child_frame_id": "sensor",
             "translation": {"x": 0.0, "y": 0.0, "z": 0.0},
@@ -172,19 +167,21 @@ class McapRecorder:
         }
         self._write("/truth", "foxglove.FrameTransform", at_ns, truth)
         row = dict(zip(COLUMNS, json_row(self._history.add(measurement)), strict=True))
-        values: dict[str, Any] = {**row, "valid": measurement.valid, "reason": measurement.reason}
+        known = {name: value for name, value in row.items() if value is not None}  # a schema has no null
+        values: dict[str, Any] = {**known, "valid": measurement.valid, "reason": measurement.reason}
         values["mode"] = MODES[int(row["mode"] or 0)]
         self._write("/measurement", "starhil.Measurement", at_ns, values)
 
     def _record_mode(self, transition: Transition) -> None:
-        at_ns = self._emulation.device.time.unix_ns()
+        device = self._emulation.device
         text = f"mode {transition.before.value} → {transition.after.value} ({transition.cause.value})"
-        content = {"timestamp": _stamp(at_ns), "level": INFO, "message": text, "name": "device"}
-        self._write("/events", "foxglove.Log", at_ns, content)
+        content = {**self._stamp(device.time.unix_ns()), "level": INFO, "message": text, "name": "device"}
+        self._write("/events", "foxglove.Log", device.clock.now_ns(), content)
 
     async def _record_telemetry(self) -> None:
         """Read the telemetry rows in turn."""
-        rows = list(self._emulation.device.icd.telemetry.values())
+        device = self._emulation.device
+        rows = list(device.icd.telemetry.values())
         while True:
             for row in rows:
                 try:
@@ -193,20 +190,33 @@ class McapRecorder:
                     log_internal_error(f"recording: {row.name}", error)
                 else:
                     if values := decode(row, exchange):
-                        at_ns = self._emulation.device.time.unix_ns()
-                        self._write(f"/telemetry/{row.name}", "starhil.Telemetry", at_ns, values)
+                        self._write(
+                            f"/telemetry/{row.name}", "starhil.Telemetry", device.clock.now_ns(), values
+                        )
                 await asyncio.sleep(POLL_S / len(rows))
 
     # --- the file ---
 
-    def _write(self, topic: str, schema: str, at_ns: int, content: dict[str, Any]) -> None:
-        """Queue a message for the disk thread, unless the queue is full."""
-        if self._ended:
+    def _stamp(self, unix_ns: int) -> dict[str, Any]:
+        """Return a device time as a Foxglove timestamp; nothing if it does not fit."""
+        if unix_ns in MCAP_TIMES_NS:
+            return {"timestamp": {"sec": unix_ns // NANOSECONDS, "nsec": unix_ns % NANOSECONDS}}
+        if not self._stamp_missing:
+            self._stamp_missing = True
+            log.warning(
+                "recording %s: the device's clock is set to before 1970 or after 2554; its times are left out",
+                self.file.path,
+            )
+        return {}
+
+    def _write(self, topic: str, schema: str, run_ns: int, content: dict[str, Any]) -> None:
+        """Queue a message for the disk thread, unless the queue is full; its time is that of the run."""
+        if self.file.output.failed:
             return
         if not self._room.acquire(blocking=False):
             self.dropped += 1
             return
-        write = functools.partial(self._add_to_file, topic, schema, at_ns, content)
+        write = functools.partial(self._add_to_file, topic, schema, self._start_ns + run_ns, content)
         self._disk.submit(self._on_disk, write).add_done_callback(self._written)
 
     def _written(self, _future: object) -> None:
@@ -225,16 +235,7 @@ class McapRecorder:
         )
 
     def _on_disk(self, action: Callable[[], object]) -> None:
-        """Write to the file; if this fails, the recording stops."""
-        if self._ended:
-            return
-        try:
-            action()
-        except OSError as error:
-            log.warning("recording %s stopped: %s; the run continues", self._path, error.strerror)
-            self._ended = True
-
-
-def _stamp(at_ns: int) -> dict[str, int]:
-    """Return a time as a Foxglove timestamp."""
-    return {"sec": at_ns // NANOSECONDS, "nsec": at_ns % NANOSECONDS}
+        """Write to the file, unless writing has failed."""
+        if not self.file.output.failed:
+            with self.file.output.guarded():
+                action()

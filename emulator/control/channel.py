@@ -52,6 +52,7 @@ from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.cycle import Measurement, as_quaternion
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import until_cancelled
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from starhil.emulator.truth.config import FixedConfig, TruthConfig
 from starhil.emulator.truth.live import LiveTruth
@@ -137,14 +138,15 @@ class ControlServer:
             path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
             self._socket = ControlSocket(path)
             self._server = await asyncio.start_unix_server(
-                self._serve_connection, sock=self._socket.socket, limit=MAX_LINE
+                until_cancelled(self._serve_connection), sock=self._socket.socket, limit=MAX_LINE
             )
             return f"unix:{path}"
         host, _, port = where.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
         try:
-            self._server = await asyncio.start_server(self._serve_connection, host, int(port), limit=MAX_LINE)
+            serve = until_cancelled(self._serve_connection)
+            self._server = await asyncio.start_server(serve, host, int(port), limit=MAX_LINE)
         except (OSError, ValueError) as error:  # an invalid host name is a ValueError
             raise EmulatorError(
                 f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"

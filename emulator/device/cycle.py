@@ -447,6 +447,8 @@ class FrameCycle:
     ) -> tuple[bool, str, Triple | None]:
         """Return the validity of a result after the checks of the device, the reason, and the rate."""
         if not result.valid:
+            if frame.tracking:
+                self._rates.interrupt()
             return False, result.reason, None
         self._rates.add(frame.mid_ns, Attitude(np.array(result.quaternion_xyzw)), frame.period_s)
         rate = result.rate_rad_s or self._rates.rate(self._rate_window)

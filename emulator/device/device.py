@@ -19,6 +19,7 @@ from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded, log_internal_error, one_line
+from starhil.emulator.output_file import Output
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.pipeline.messages import IDENTITY, FrameRequest, Quaternion
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
@@ -115,6 +116,8 @@ class Device:
         self.acknowledge = Acknowledge()
         self.modes = Modes(self._mode_changed)
         self.store = store
+        self.stored = Output("state")
+        """The writes to the store."""
         self.cycle = FrameCycle(
             self.scheduler,
             imager,
@@ -180,7 +183,7 @@ class Device:
     def withdraw_start(self) -> None:
         """Do not count the last start: it failed because a port or file is not available."""
         self.boot_count = (self.boot_count - 1) & 0xFFFF
-        self._persist(lambda error: log.error("%s", error) if error else None)
+        self._persist()
 
     def reset(self, cause: str) -> None:
         """Restart with a cause named in the enumeration `reset_cause`."""
@@ -211,7 +214,7 @@ class Device:
             log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
         for observer in self.on_start:
             call_guarded("start", observer)
-        self._persist(lambda error: log.error("%s", error) if error else None)
+        self._persist()
         if self.store.corrupt:
             log.warning("the stored state is corrupt and was renamed; using the defaults")
         if self._boot_end is not None:
@@ -265,10 +268,8 @@ class Device:
         def finish(error: EmulatorError | None) -> None:
             if error is None:
                 self.parameters.mark_stored(content)
-            else:
-                log.error("%s", error)
-                if self._stored_parameters is stored:  # no other save or restart has followed
-                    self._stored_parameters = before
+            elif self._stored_parameters is stored:  # no other save or restart has followed
+                self._stored_parameters = before
             done(error)
 
         self._persist(finish)
@@ -283,9 +284,15 @@ class Device:
         if not self.parameters.flip_bit(name, bit):
             self.modes.fail("parameter_store")
 
-    def _persist(self, done: Callable[[EmulatorError | None], None]) -> None:
+    def _persist(self, done: Callable[[EmulatorError | None], None] = lambda _error: None) -> None:
         content = self._persistent_state()
-        self._background(lambda: self.store.save(content), done)
+
+        def finish(error: EmulatorError | None) -> None:
+            if error is not None:
+                self.stored.fail(str(error))
+            done(error)
+
+        self._background(lambda: self.store.save(content), finish)
 
     def _persistent_state(self) -> dict[str, object]:
         """Return the state that survives a restart, including writes in progress."""

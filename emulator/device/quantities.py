@@ -21,7 +21,6 @@ from starhil.protocol.device_model import HEALTH, PARAMETER, generic, number_in
 from starhil.protocol.image_transfer import frame_checksum
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
-from starid.attitude import Attitude
 
 Getter: TypeAlias = Callable[[Snapshot], Value | None]
 
@@ -166,19 +165,11 @@ def _of_directions(letter: str, axis: int) -> None:
         f"vector_{letter}",
         lambda shot, star: float(to_reported_frame(shot.device, np.array(star.vector))[axis]),
     )
-    _of_star(f"icrs_{letter}", lambda shot, star: float(_icrs(shot, star)[axis]))
+    _of_star(f"icrs_{letter}", lambda _shot, star: star.icrs[axis])
 
 
 for _axis, _letter in enumerate("xyz"):
     _of_directions(_letter, _axis)
-
-
-def _icrs(shot: Snapshot, star: MatchedStar) -> np.ndarray:
-    if shot.frame is None:
-        return np.zeros(3)
-    attitude = Attitude(np.array(shot.frame.result.quaternion_xyzw))
-    vector: np.ndarray = attitude.matrix.T @ np.array(star.vector)
-    return vector
 
 
 # --- time ---

@@ -22,10 +22,16 @@ class RateEstimator:
 
     def __init__(self) -> None:
         self._fixes: deque[tuple[int, Attitude]] = deque(maxlen=HISTORY)
+        self._interrupted = False
+
+    def interrupt(self) -> None:
+        """End the history with the last attitude: the rate between it and the next one is not that of the motion."""
+        self._interrupted = True
 
     def clear(self) -> None:
         """Discard all attitudes."""
         self._fixes.clear()
+        self._interrupted = False
 
     @property
     def last(self) -> tuple[int, Attitude] | None:
@@ -33,9 +39,11 @@ class RateEstimator:
         return self._fixes[-1] if self._fixes else None
 
     def add(self, mid_ns: int, attitude: Attitude, period_s: float) -> None:
-        """Add a valid attitude; after a gap of more than `RATE_GAP_PERIODS`, older ones are discarded."""
-        if self._fixes and mid_ns - self._fixes[-1][0] > RATE_GAP_PERIODS * period_s * NANOSECONDS:
+        """Add a valid attitude; after an interruption or a gap of more than `RATE_GAP_PERIODS`, older ones are discarded."""
+        late = self._fixes and mid_ns - self._fixes[-1][0] > RATE_GAP_PERIODS * period_s * NANOSECONDS
+        if late or self._interrupted:
             self._fixes.clear()
+        self._interrupted = False
         self._fixes.append((mid_ns, attitude))
 
     def rate(self, window: int) -> Triple | None:

@@ -311,7 +311,9 @@ class CanopenLink:
         match event.kind:
             case EventKind.TIME:
                 self._device.time.set_unix_ns(round(event.value * 1000) * MILLISECOND_NS)
-            case EventKind.STORAGE_ERROR | EventKind.FAULT:
+            case EventKind.STORAGE_ERROR:
+                self._device.stored.fail(event.detail)
+            case EventKind.FAULT:
                 log.warning("%s: %s", event.kind, event.detail)
             case _:
                 log.debug("%s %g %s", event.kind, event.value, event.detail)
@@ -361,7 +363,7 @@ class CanopenLink:
             try:
                 self.slave.store.clear_lss()
             except StorageError as error:
-                log.warning("%s", error)
+                self._device.stored.fail(str(error))
         placed = self._dictionary.parameters
         keys = frozenset(placed[name] for name in names if name in placed)
         self._run_action(lambda now: self.slave.notify(keys, now))

@@ -7,6 +7,7 @@ from typing import Final
 
 from starhil.emulator.pipeline.messages import FrameResult
 from starhil.emulator.sky.field import disc_in_field
+from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.objects import SkyObjects
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -15,13 +16,18 @@ _WITHOUT_STARS: Final = frozenset({"too_few_stars", "no_match", "prediction_lost
 
 
 def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tuple[str, ...]:
-    """Return which of `sun`, `moon` and `earth` are in the field of view, with any part of their discs; none behind a cover."""
+    """Return which of `sun`, `moon` and `earth` are in the field of view, or light it past the baffle; none behind a cover.
+
+    A body is in the field with any part of its disc.
+    """
     if sky.blank:
         return ()
+    passing = through_baffle(sky, attitude)
     return tuple(
         name
         for name, body in (("sun", sky.sun), ("moon", sky.moon), ("earth", sky.earth))
-        if body is not None and disc_in_field(attitude.to_sensor(body.direction), body.radius_rad, camera)
+        if body is not None
+        and (name in passing or disc_in_field(attitude.to_sensor(body.direction), body.radius_rad, camera))
     )
 
 

@@ -45,13 +45,13 @@ class FolderImages:
     def __init__(self, folder: Path, *, repeat: bool) -> None:
         if not folder.is_dir():
             raise EmulatorError(
-                f"images.folder: {folder} is not a folder; name one with PNG, TIFF or JPEG images"
+                f"images.folder: {folder} is not a folder; name one with PNG, TIFF, JPEG or BMP images"
             )
         self._files = sorted(file for file in folder.iterdir() if file.is_file() and _is_image(file))
         self._folder = folder
         self._repeat = repeat
         if not self._files:
-            raise EmulatorError(f"images.folder: {folder} contains no PNG, TIFF or JPEG")
+            raise EmulatorError(f"images.folder: {folder} contains no PNG, TIFF, JPEG or BMP")
 
     def image(self, index: int) -> Counts:
         """Return the image of an exposure; colour is converted to grey."""

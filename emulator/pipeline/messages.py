@@ -194,7 +194,9 @@ class MatchedStar:
     magnitude, snr
         Measured magnitude and signal-to-noise ratio.
     vector
-        Direction in the sensor frame, by the camera of the profile.
+        Measured direction in the sensor frame, by the camera of the profile.
+    icrs
+        Modelled direction: that of the star in the catalogue, in ICRS, without aberration.
     """
 
     hip: int
@@ -203,6 +205,7 @@ class MatchedStar:
     magnitude: float
     snr: float
     vector: Triple
+    icrs: Triple
 
 
 @dataclass(frozen=True)
@@ -233,7 +236,7 @@ class FrameResult:
     background_dn, noise_dn
         Level and noise of the background, counts.
     in_field
-        Bodies in or at the field of view: `sun`, `moon`, `earth`.
+        Bodies in the field of view or within their exclusion angles: `sun`, `moon`, `earth`.
     render_s, detect_s, identify_s
         Wall time of each step, for the log but not for telemetry.
     preview

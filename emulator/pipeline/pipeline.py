@@ -72,8 +72,11 @@ _WARM_UP_BODIES: Final = SkyObjects(
 )
 """Bodies in and near the field of the identity attitude."""
 
-_WARM_UP_RATES_RAD_S: Final = ((1e-3, 0.0, 0.0), (0.03, 0.0, 0.0))
-"""Rates at which stars in a default exposure are round, or leave trails of a few pixels."""
+_WARM_UP_EXPOSURE_S: Final = 1.0
+"""Exposure in which a dim sensor too sees enough stars to follow their trails, seconds."""
+
+_WARM_UP_RATES_RAD_S: Final = ((1e-4, 0.0, 0.0), (3e-3, 0.0, 0.0))
+"""Rates at which stars in this exposure are round, or leave trails of a few pixels."""
 
 
 def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Failure:
@@ -150,14 +153,14 @@ class Pipeline:
             index=0,
             attitude_xyzw=attitude,
             rate_rad_s=ZERO,
-            exposure_s=0.1,
+            exposure_s=_WARM_UP_EXPOSURE_S,
             gain=self._sensor.gain,
             settings=settings,
             preview=self._setup.previews,
         )
         if helper is not None:
             for rate in _WARM_UP_RATES_RAD_S:
-                frame = self._renderer.render(Attitude.identity(), rate)
+                frame = self._renderer.render(Attitude.identity(), rate, exposure_s=_WARM_UP_EXPOSURE_S)
                 detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
             helper.wait()  # kernels it compiled are loaded below; any others are compiled there
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
@@ -197,7 +200,9 @@ class Pipeline:
         identifier, current = self._identifiers.get(self._identifier_setup(request))
         solution = self._solve(identifier, found, request)
         solved = time.perf_counter()
-        result = self._frame_result(request, sensor, found, solution, (begin, rendered, detected, solved))
+        modelled = identifier.catalog.vectors[solution.catalog_index]
+        times = (begin, rendered, detected, solved)
+        result = self._frame_result(request, sensor, found, solution, modelled, times)
         result = with_bodies(result, exposure.in_field)
         if request.preview:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
@@ -293,10 +298,11 @@ class Pipeline:
         sensor: SensorModel,
         found: Detections,
         solution: Solution,
+        modelled: NDArray[np.float64],
         times: tuple[float, float, float, float],
     ) -> FrameResult:
         begin, rendered, detected, solved = times
-        directions = self.camera.back_project(found.xy_px[solution.detection_index]).tolist()
+        measured = self.camera.back_project(found.xy_px[solution.detection_index])
         stars = sorted(
             (
                 MatchedStar(
@@ -305,10 +311,11 @@ class Pipeline:
                     y=float(found.xy_px[row, 1]),
                     magnitude=measured_magnitude(float(found.flux[row]), sensor),
                     snr=float(found.flux[row] / found.flux_sigma[row]),
-                    vector=(direction[0], direction[1], direction[2]),
+                    vector=_triple(direction),
+                    icrs=_triple(icrs),
                 )
-                for row, hip, direction in zip(
-                    solution.detection_index, solution.hip, directions, strict=True
+                for row, hip, direction, icrs in zip(
+                    solution.detection_index, solution.hip, measured, modelled, strict=True
                 )
             ),
             key=lambda star: (star.magnitude, star.hip),
@@ -347,6 +354,11 @@ class Pipeline:
             height, width = image.shape
             return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
+
+
+def _triple(vector: NDArray[np.float64]) -> Triple:
+    x, y, z = vector.tolist()
+    return x, y, z
 
 
 def _vector(values: Triple | None) -> NDArray[np.float64] | None:

@@ -181,7 +181,8 @@ def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:
     """Return the bodies in a sky, inside or outside the image."""
     found = []
     if sky.sun is not None:
-        found.append(_body("sun", sky.sun.ra_deg, sky.sun.dec_deg, 0.2666, camera, attitude))
+        radius_deg = math.degrees(sky.sun.radius_rad)
+        found.append(_body("sun", sky.sun.ra_deg, sky.sun.dec_deg, radius_deg, camera, attitude))
     if sky.moon is not None:
         radius_deg = sky.moon.diameter_deg / 2.0
         found.append(_body("moon", sky.moon.ra_deg, sky.moon.dec_deg, radius_deg, camera, attitude))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -157,16 +158,19 @@ class AreaLight:
             layer.cover(mean, backdrop)
 
 
-def baffle_passed(objects: SkyObjects, attitude: Attitude) -> bool:
-    """Whether the Sun or the lit Earth is within its exclusion angle, so that its light saturates the image."""
+def through_baffle(objects: SkyObjects, attitude: Attitude) -> tuple[str, ...]:
+    """Return which of `sun` and `earth` is within its exclusion angle, so that its light saturates the image."""
+    passing = []
     sun, earth = objects.sun, objects.earth
     if sun is not None and _off_axis_deg(attitude, sun) < sun.exclusion_deg:
-        return True
-    if earth is None or earth.exclusion_deg == 0.0:
-        return False
-    off_axis = _off_axis_deg(attitude, earth)
-    near_deg = min(off_axis, earth.radius_deg)
-    return off_axis - near_deg < earth.exclusion_deg and _is_lit(earth, attitude.boresight, near_deg)
+        passing.append("sun")
+    if earth is not None and earth.exclusion_deg > 0.0:
+        off_axis = _off_axis_deg(attitude, earth)
+        near_deg = min(off_axis, earth.radius_deg)
+        near = off_axis - near_deg < earth.exclusion_deg
+        if near and _is_lit(earth, attitude.boresight, near_deg):
+            passing.append("earth")
+    return tuple(passing)
 
 
 def _is_lit(earth: EarthLimb, towards: npt.NDArray[np.float64], off_nadir_deg: float) -> bool:
@@ -238,10 +242,13 @@ class AreaPainter:
 
     def paint(self, objects: SkyObjects, attitude: Attitude) -> AreaLight:
         """Return light and transmission of all extended objects at one attitude."""
-        if baffle_passed(objects, attitude):
+        if not objects.blank and through_baffle(objects, attitude):
             return AreaLight(self._size, flooded=True)
-        glare, near = self._glare(objects, attitude)
-        behind = () if objects.moon is None else self._moon_patch(objects.moon, attitude)
+        lights = [body for body in (objects.sun, self._sun_disc(objects.sun, attitude), objects.moon) if body]
+        glare, near = self._glare(lights, attitude)
+        behind = tuple(
+            patch for body in lights if isinstance(body, Moon) for patch in self._disc_patch(body, attitude)
+        )
         earth: WideEarth | None = None
         in_front: list[Patch] = []
         if objects.earth is not None and self._in_reach(objects.earth, attitude):
@@ -256,13 +263,19 @@ class AreaPainter:
         in_front += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
         return AreaLight(self._size, glare, near, earth, behind, tuple(in_front))
 
-    def _glare(self, objects: SkyObjects, attitude: Attitude) -> tuple[Image | None, tuple[NearGlare, ...]]:
+    def _sun_disc(self, sun: SunGlare | None, attitude: Attitude) -> Moon | None:
+        """Return the disc of the Sun if any part of it is in the field."""
+        if sun is None or not disc_in_field(attitude.to_sensor(sun.direction), sun.radius_rad, self._camera):
+            return None
+        return sun.disc
+
+    def _glare(
+        self, lights: Sequence[SunGlare | Moon], attitude: Attitude
+    ) -> tuple[Image | None, tuple[NearGlare, ...]]:
         """Return the glare of Sun and Moon on the grid, and near them."""
         glare, near = None, []
         grid, smooth_rad = self._grid_directions, _SMOOTH_PX * self._camera.pixel_scale_rad
-        for body in (objects.sun, objects.moon):
-            if body is None:
-                continue
+        for body in lights:
             off_axis = _off_axis_deg(attitude, body)
             if off_axis > body.reach_deg:
                 continue
@@ -293,8 +306,8 @@ class AreaPainter:
         """Electrons/s from the whole Moon."""
         return self._zero_magnitude_e_s * math.pow(10.0, -0.4 * moon.magnitude)
 
-    def _moon_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
-        """Return the Moon's disc with the terminator; nothing if it is outside the image."""
+    def _disc_patch(self, moon: Moon, attitude: Attitude) -> tuple[Patch, ...]:
+        """Return the disc of Moon or Sun with the terminator; nothing if it is outside the image."""
         source, scale = attitude.to_sensor(moon.direction), moon.radius_rad / self._camera.pixel_scale_rad
         box = self._box_around(source, moon.radius_rad + _EDGE_PX * self._camera.pixel_scale_rad)
         if box is None:

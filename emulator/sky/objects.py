@@ -79,7 +79,7 @@ class Moon(CelestialBody):
 
 @dataclass(frozen=True)
 class SunGlare(CelestialBody):
-    """Stray light of the Sun, which itself is outside the field of view.
+    """The Sun: stray light, and in the field of view a disc whose light, scattered in the lens, saturates the image.
 
     Attributes
     ----------
@@ -98,6 +98,16 @@ class SunGlare(CelestialBody):
     electrons_s: float = 1000.0
     exclusion_deg: float = 0.0
     reach_deg: float = 180.0
+
+    @property
+    def radius_rad(self) -> float:
+        """Angular radius of its disc."""
+        return self.disc.radius_rad
+
+    @cached_property
+    def disc(self) -> Moon:
+        """Its disc: the mean diameter and V of the Sun, with the light that a lens scatters from the Moon's."""
+        return Moon(self.ra_deg, self.dec_deg, diameter_deg=0.533, magnitude=-26.74)
 
 
 @dataclass(frozen=True)

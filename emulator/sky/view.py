@@ -60,9 +60,12 @@ class Sky:
         The table `[sky]`: the fields of `SkyObjects`, and
 
         - `date`: set if the stars are to be seen with aberration and parallax;
-        - `bodies`: one of `BODIES`; with `ephemeris`, a table `sun`, `moon` or `earth` without a direction
-          changes the defaults of that body, and one with a direction replaces it;
+        - `bodies`: one of `BODIES`; with `ephemeris`, a table `sun`, `moon` or `earth` with a direction replaces
+          the body of the date;
         - `aberration`: false for stars without aberration and parallax all the same.
+
+        A table `sun`, `moon` or `earth` without a direction does not place the body, but gives its look wherever the
+        date or a fault puts it.
 
     Raises
     ------
@@ -82,7 +85,14 @@ class Sky:
         fields.pop("aberration", None)
         if not isinstance(self._moving, bool):
             raise EmulatorError(f"sky aberration: must be true or false, not {self._moving!r}")
-        self._styles = {name: _styled(name, style, fields) for name, style in _STYLES.items() if self.by_date}
+        self._looks = {name: _look(fields.get(name)) for name in _STYLES}
+        """Fields of bodies in the profile, without the directions: they also hold for bodies of the date and of faults."""
+        self._styles = {
+            name: _styled(
+                name, style if self.by_date else type(style)(**_PLACE), fields, by_date=self.by_date
+            )
+            for name, style in _STYLES.items()
+        }
         self._fields = fields
         self._typed = SkyObjects.from_dict(fields)
 
@@ -102,20 +112,28 @@ class Sky:
         position_m, velocity_m_s
             Relative to the Earth's centre, GCRS (3,); None: at the centre.
         faults
-            Fields of `SkyObjects` that replace the profile's.
+            Fields of `SkyObjects` that replace the profile's; of a body, its fields.
 
         Raises
         ------
         EmulatorError
             A field of `faults` is invalid.
         """
-        objects = SkyObjects.from_dict({**self._fields, **faults}) if faults else self._typed
+        objects = self._with_faults(faults) if faults else self._typed
         if unix_s is None or not (self.by_date or self._moving):
             return SkyView(objects)
         observer = Observer(unix_s, position_m, velocity_m_s)
         if self.by_date:
             objects = self._with_bodies(objects, observer)
         return SkyView(objects, observer if self._moving else None)
+
+    def _with_faults(self, faults: Mapping[str, Any]) -> SkyObjects:
+        """Return the typed objects, changed by faults; a body that a fault places looks as in the profile."""
+        fields = {**self._fields, **faults}
+        for name, look in self._looks.items():
+            if isinstance(faults.get(name), Mapping):
+                fields[name] = {**look, **faults[name]}
+        return SkyObjects.from_dict(fields)
 
     def _with_bodies(self, objects: SkyObjects, observer: Observer) -> SkyObjects:
         """Add the bodies of the date, except given ones and bodies hidden by the Earth."""
@@ -131,13 +149,19 @@ class Sky:
         return objects.with_computed(**changes)
 
 
-def _styled(name: str, style: Any, fields: dict[str, Any]) -> Any:
+def _look(table: Any) -> dict[str, Any]:
+    """Return the fields of a body's table except its direction."""
+    fields = table if isinstance(table, Mapping) else {}
+    return {key: value for key, value in fields.items() if key not in _PLACE}
+
+
+def _styled(name: str, style: Any, fields: dict[str, Any], *, by_date: bool) -> Any:
     """Return the defaults of a body, changed by its table if that has no direction; the table is then removed."""
     table = fields.get(name)
-    if not isinstance(table, Mapping) or "ra_deg" in table or "dec_deg" in table:
+    if not isinstance(table, Mapping) or not table.keys().isdisjoint(_PLACE):
         return style
     computed = [key for key in _COMPUTED[name] if key in table]
-    if computed:
+    if computed and by_date:
         raise EmulatorError(
             f"sky {name}: {computed[0]} follows from the date; leave it out, or give ra_deg and dec_deg"
         )

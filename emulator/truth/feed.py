@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Final, Literal
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.guard import until_cancelled
 from starhil.emulator.json_lines import read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.lock_step import LockStep, Step
@@ -87,7 +88,7 @@ class LiveFeed:
                 address = transport.get_extra_info("sockname")
             else:
                 self._server = await asyncio.start_server(
-                    self._serve_connection, host, port, limit=self.truth.format.max_size
+                    until_cancelled(self._serve_connection), host, port, limit=self.truth.format.max_size
                 )
                 address = self._server.sockets[0].getsockname()
         except (OSError, ValueError) as error:  # ValueError: not a valid host name

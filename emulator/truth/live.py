@@ -4,7 +4,7 @@ Messages are JSON lines (`starhil.emulator.truth.feed_message`) or the blocks of
 (`starhil.emulator.truth.simulator_42`). A message whose rate contradicts the attitudes is rejected
 (`starhil.emulator.truth.feed_rates`).
 
-The first message sets the offset between the sender's clock and simulation time; drift is tracked
+The first message (or the last one before time starts) sets the offset between the sender's clock and simulation time; drift is tracked
 (`starhil.emulator.truth.sender_clock`) and rates are scaled accordingly. With ``timeline = "run"`` in the profile,
 ``t`` is simulation time.
 
@@ -149,7 +149,7 @@ class LiveTruth:
         self.begin_timeline()
 
     def begin_timeline(self) -> None:
-        """Discard the messages and the sender's clock, because the sender has restarted."""
+        """Discard the messages and the sender's clock: the sender has restarted, or the run has not begun."""
         self._last_t = None
         self._times.clear()
         self._states.clear()

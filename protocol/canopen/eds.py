@@ -13,6 +13,7 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.dictionary import Dictionary, encode
 from starhil.protocol.canopen.pdo_mapping import FIRST_DUMMY, LAST_DUMMY
+from starhil.protocol.export.quoting import Scope, eds_text
 
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 MANUFACTURER: Final = range(0x2000, 0x6000)
@@ -28,7 +29,11 @@ Section = list[tuple[str, str]]
 
 
 def build_eds(dictionary: Dictionary) -> str:
-    """Return the EDS of an object dictionary."""
+    """Return the EDS of an object dictionary.
+
+    Raises IcdError for two objects, or two entries of an object, with the same name.
+    """
+    scope = Scope("EDS")
     sections: list[tuple[str, Section, str]] = [
         ("FileInfo", _file_info(dictionary), ""),
         ("DeviceInfo", _device_info(dictionary), ""),
@@ -55,25 +60,20 @@ def build_eds(dictionary: Dictionary) -> str:
         entries = [(str(position), f"0x{index:04X}") for position, index in enumerate(members, 1)]
         sections.append((name, [("SupportedObjects", str(len(members))), *entries], ""))
         for index in members:
-            sections.extend(_object(dictionary.od.indices[index]))
+            item = dictionary.od.indices[index]
+            scope.claim(eds_text(item.name), f"object {index:04X}h")
+            sections.extend(_object(item))
     return "\n".join(_text(sections)) + "\n"
 
 
 def _text(sections: Iterable[tuple[str, Section, str]]) -> Iterator[str]:
     for name, entries, remark in sections:
         if remark:
-            yield f"; {_plain(remark)}"
+            yield f"; {eds_text(remark)}"
         yield f"[{name}]"
         for key, value in entries:
-            yield f"{key}={_plain(value)}"
+            yield f"{key}={eds_text(value)}"
         yield ""
-
-
-def _plain(text: str) -> str:
-    """Return text as an EDS allows: one line of ASCII without comment signs."""
-    for sign, replacement in (("°", "deg"), ("µ", "u"), (";", ","), ("#", "No."), ("\n", " ")):
-        text = text.replace(sign, replacement)
-    return text.encode("ascii", errors="replace").decode("ascii")
 
 
 def _file_info(dictionary: Dictionary) -> Section:
@@ -126,8 +126,10 @@ def _object(item: ODVariable | ODRecord | ODArray) -> Iterator[tuple[str, Sectio
         ("SubNumber", f"0x{len(item.subindices):X}"),
     ]
     yield f"{item.index:04X}", entries, ""
+    scope = Scope("EDS")
     for subindex in sorted(item.subindices):
         member = item.subindices[subindex]
+        scope.claim(eds_text(member.name), f"object {item.index:04X}h, sub-index {subindex}")
         yield f"{item.index:04X}sub{subindex:X}", _variable(member), _remark(member)
 
 

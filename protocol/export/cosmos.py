@@ -6,24 +6,30 @@ byte of the ID. COSMOS truncates computed raw values, so a scaled parameter may 
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.export.describe import meaning, number
-from starhil.protocol.export.row_key import key_bits, key_of
+from starhil.protocol.export.packets import key_bits, key_of, wire_order
+from starhil.protocol.export.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import IcdError
+from starhil.protocol.values import EnumDefinition
 
 TARGET: Final = "STARHIL"
 IDENTIFIER: Final = "PACKET_ID"
+RESERVED_ITEMS: Final = (
+    IDENTIFIER, "PACKET_TIMESECONDS", "PACKET_TIMEFORMATTED", "RECEIVED_TIMESECONDS", "RECEIVED_TIMEFORMATTED",
+    "RECEIVED_COUNT", "COSMOS_DATA_TAG", "COSMOS_EXTRA",
+)  # fmt: skip
+"""Items that every packet has."""
 
 
 def render(icd: InterfaceDefinition) -> str:
     """Return commands and telemetry as one text."""
     head = (
-        f"# {icd.name} {icd.version}: {icd.doc}",
+        f"# {cosmos_string(f'{icd.name} {icd.version}: {icd.doc}')}",
         "# Generated from the interface definition; do not edit.",
     )
     return "\n".join((*head, *commands(icd, TARGET), *telemetry(icd, TARGET))) + "\n"
@@ -32,51 +38,57 @@ def render(icd: InterfaceDefinition) -> str:
 def commands(icd: InterfaceDefinition, target: str) -> Iterator[str]:
     """Yield the telecommands, and a command that requests each telemetry row."""
     bits = key_bits(icd)
+    scope = Scope("COSMOS")
     for row in icd.rows:
-        name = row.name if row.kind == "telecommand" else f"request_{row.name}"
+        name = scope.claim(command_name(row), f"{row.kind} {row.name}")
         doc = row.doc if row.kind == "telecommand" else f"Request {row.name}."
         key = key_of(icd, row)
-        yield from ("", f"COMMAND {target} {name.upper()} BIG_ENDIAN {_quoted(doc)}")
+        yield from ("", f"COMMAND {target} {name} BIG_ENDIAN {cosmos_string(doc)}")
         yield f'  APPEND_ID_PARAMETER {IDENTIFIER} {bits} UINT {key} {key} {key} "Row ID"'
         if row.kind == "telecommand":
             yield from _fields(row, bits)
 
 
-def telemetry(icd: InterfaceDefinition, target: str) -> Iterator[str]:
-    """Yield the telemetry rows."""
+def command_name(row: Row) -> str:
+    """Return the name of the command that sends a row, or requests it."""
+    return cosmos_name(row.name if row.kind == "telecommand" else f"request_{row.name}")
+
+
+def telemetry(icd: InterfaceDefinition, target: str, reserved: Iterable[str] = ()) -> Iterator[str]:
+    """Yield the telemetry rows, whose packets cannot have the reserved names."""
     bits = key_bits(icd)
+    scope = Scope("COSMOS", reserved)
     for row in icd.rows:
         if row.kind == "telecommand":
             continue
-        yield from ("", f"TELEMETRY {target} {row.name.upper()} BIG_ENDIAN {_quoted(row.doc)}")
+        name = scope.claim(cosmos_name(row.name), f"telemetry {row.name}")
+        yield from ("", f"TELEMETRY {target} {name} BIG_ENDIAN {cosmos_string(row.doc)}")
         yield f'  APPEND_ID_ITEM {IDENTIFIER} {bits} UINT {key_of(icd, row)} "Row ID"'
         yield from _fields(row, bits)
 
 
 def _fields(row: Row, start: int) -> Iterator[str]:
-    for index, field in enumerate(row.fields):
-        yield from _field(row, field, index, start)
+    scope = Scope("COSMOS", RESERVED_ITEMS)
+    for index, field in enumerate(wire_order(row, "COSMOS")):
+        name = cosmos_name(field.name or f"unused_{index}")
+        where = f"{row.kind} {row.name}: field {field.name or 'unused'}"
+        yield from _field(row, field, scope.claim(name, where), start)
 
 
-def _field(row: Row, field: Field, index: int, start: int) -> Iterator[str]:
+def _field(row: Row, field: Field, name: str, start: int) -> Iterator[str]:
     keyword = "PARAMETER" if row.kind == "telecommand" else "ITEM"
-    name = (field.name or f"unused_{index}").upper()
-    bits = field.width or 8 * field.size
     limits = _limits(field) if row.kind == "telecommand" else ""
     endian = f" {'LITTLE' if field.slot.order == 'little' and not field.width else 'BIG'}_ENDIAN"
-    if field.width:
-        # COSMOS counts bits from the most significant one, and takes a bit field's order from its bytes
-        byte = field.shift // 8 if field.slot.order == "little" else field.size - 1 - field.shift // 8
-        if field.shift % 8 + field.width > 8 and field.slot.order == "little":
-            raise IcdError(
-                f"{row.name}.{field.name}: bits across little-endian bytes cannot be exported to COSMOS"
-            )
-        offset = start + 8 * (field.offset + byte) + 8 - field.shift % 8 - field.width
-    else:
-        offset = start + 8 * field.offset
-    yield f"  {keyword} {name} {offset} {bits} {_type(field)}{limits} {_quoted(meaning(row, field) or 'Unused')}{endian}"
+    offset = start + 8 * field.offset
+    if (
+        field.width
+    ):  # COSMOS counts bits from the most significant one, and takes a bit field's order from its bytes
+        byte, bit = field.place(field.width - 1)
+        offset = start + 8 * byte + 7 - bit
+    said = replace(field, doc=field.doc or (f"{field.name}." if field.name else "Unused."))
+    yield f"  {keyword} {name} {offset} {field.bit_count} {_type(field)}{limits} {cosmos_string(meaning(row, said))}{endian}"
     if field.enum is not None:
-        yield from (f"    STATE {_state(label)} {value}" for label, value in field.enum.values.items())
+        yield from states(field.enum, f"{row.kind} {row.name}: field {field.name}")
     elif field.kind == "flag":
         yield from ("    STATE FALSE 0", "    STATE TRUE 1")
     if field.scaled:
@@ -85,12 +97,14 @@ def _field(row: Row, field: Field, index: int, start: int) -> Iterator[str]:
         else:
             yield f"    POLY_READ_CONVERSION {number(field.bias)} {number(field.scale)}"
     if field.unit:
-        yield f"    UNITS {_quoted(field.unit)} {_quoted(field.unit)}"
+        yield f"    UNITS {cosmos_string(field.unit)} {cosmos_string(field.unit)}"
 
 
-def _state(label: str) -> str:
-    """Return the name of a state in capitals, without characters that end a word in COSMOS."""
-    return re.sub(r"[^\w.-]", "_", label).upper()
+def states(enum: EnumDefinition, where: str) -> Iterator[str]:
+    """Yield the members of an enumeration as states of an item."""
+    scope = Scope("COSMOS")
+    for label, value in enum.values.items():
+        yield f"    STATE {scope.claim(cosmos_state(label), f'{where}: {label!r}')} {value}"
 
 
 def _type(field: Field) -> str:
@@ -126,7 +140,3 @@ def _limits(field: Field) -> str:
         field.default if isinstance(field.default, (int, float)) else min(max(0.0, low_limit), high_limit)
     )
     return f" {number(low_limit)} {number(high_limit)} {number(default_value)}"
-
-
-def _quoted(text: str) -> str:
-    return '"' + text.replace('"', "'") + '"'

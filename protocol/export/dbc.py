@@ -14,6 +14,7 @@ from typing import Final
 from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.export.describe import meaning, number
+from starhil.protocol.export.quoting import Scope, dbc_string
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import EnumDefinition, IcdError
@@ -21,6 +22,7 @@ from starhil.protocol.values import EnumDefinition, IcdError
 EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""
 
+_JOINED: Final = "Messages longer than 8 bytes describe the data after their segments are joined."
 _SIGNED: Final = ("i8", "i16", "i32", "i64")
 
 
@@ -47,25 +49,33 @@ def render(icd: InterfaceDefinition) -> str:
 
 
 def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
-    yield from (f'VERSION "{icd.name} {icd.version}"', "", "NS_ :", "", "BS_:", "", "BU_: OBC SENSOR")
+    yield from (
+        f"VERSION {dbc_string(f'{icd.name} {icd.version}')}",
+        "",
+        "NS_ :",
+        "",
+        "BS_:",
+        "",
+        "BU_: OBC SENSOR",
+    )
     for message in messages:
         yield ""
         yield f"BO_ {message.can_id | EXTENDED} {message.name}: {message.size} {message.sender}"
         for signal in message.signals:
             yield from _signals(signal, "OBC" if message.sender == "SENSOR" else "SENSOR")
     yield ""
-    yield f'CM_ "{_text(icd.doc)} Messages longer than 8 bytes describe the data after their segments are joined.";'
+    yield f"CM_ {dbc_string(f'{icd.doc} {_JOINED}')};"
     for message in messages:
-        yield f'CM_ BO_ {message.can_id | EXTENDED} "{_text(message.doc)}";'
+        yield f"CM_ BO_ {message.can_id | EXTENDED} {dbc_string(message.doc)};"
         for signal in message.signals:
             if signal.slot.type != "bytes":
-                yield f'CM_ SG_ {message.can_id | EXTENDED} {signal.name} "{_text(signal.doc)}";'
+                yield f"CM_ SG_ {message.can_id | EXTENDED} {signal.name} {dbc_string(signal.doc)};"
     yield 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";'
     yield 'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";'
     signals = [(message.can_id | EXTENDED, signal) for message in messages for signal in message.signals]
     for can_id, signal in signals:
         if signal.enum is not None:
-            values = " ".join(f'{value} "{name}"' for name, value in signal.enum.values.items())
+            values = " ".join(f"{value} {dbc_string(name)}" for name, value in signal.enum.values.items())
             yield f"VAL_ {can_id} {signal.name} {values} ;"
     for can_id, signal in signals:
         if signal.kind == "float":
@@ -76,6 +86,10 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     to_device = (row.id, host, device)
     to_host = (row.id, device, host)
     signals = tuple(replace(field, doc=meaning(row, field)) for field in row.named_fields.values())
+    scope = Scope("DBC")
+    for field in signals:
+        for name in _names(field):
+            scope.claim(name, f"{row.kind} {row.name}: field {field.name}")
     code = (Field("error", "enum", Slot(0, "u8", 0, 1), enum=_error_codes(icd), doc="Error code."),)
     long = row.size > MAX_FRAME_DATA
     if row.kind == "telemetry":
@@ -108,22 +122,25 @@ def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:
     return CanId(kind, row_id, source, destination).pack()
 
 
+def _names(field: Field) -> list[str]:
+    """Return the names of the signals of a field: one for each byte of a string."""
+    if field.slot.type != "bytes":
+        return [field.name]
+    return [f"{field.name}_{index}" for index in range(field.size)]
+
+
 def _signals(field: Field, receiver: str) -> Iterator[str]:
-    start = 8 * field.offset
     if field.slot.type == "bytes":
-        for index in range(field.size):
-            yield f' SG_ {field.name}_{index} : {start + 8 * index}|8@1+ (1,0) [0|255] "" {receiver}'
+        for index, name in enumerate(_names(field)):
+            yield f' SG_ {name} : {8 * (field.offset + index)}|8@1+ (1,0) [0|255] "" {receiver}'
         return
-    width = field.width or 8 * field.size
-    first, order = start + field.shift, 1
-    if field.slot.order == "big":  # counted to the most significant bit, byte by byte
-        top = 8 * field.size - 1 if not field.width else field.shift + field.width - 1
-        first, order = start + 8 * (field.size - 1 - top // 8) + top % 8, 0
+    big = field.slot.order == "big"
+    byte, bit = field.place(field.bit_count - 1 if big else 0)
     sign = "-" if field.slot.type in _SIGNED or field.kind == "float" else "+"
     low, high = _limits(field)
     yield (
-        f" SG_ {field.name} : {first}|{width}@{order}{sign} ({number(field.scale)},{number(field.bias)}) "
-        f'[{number(low)}|{number(high)}] "{_text(field.unit)}" {receiver}'
+        f" SG_ {field.name} : {8 * byte + bit}|{field.bit_count}@{int(not big)}{sign} "
+        f"({number(field.scale)},{number(field.bias)}) [{number(low)}|{number(high)}] {dbc_string(field.unit)} {receiver}"
     )
 
 
@@ -133,8 +150,3 @@ def _limits(field: Field) -> tuple[float, float]:
     if field.kind == "float" and (field.minimum is None or field.maximum is None):
         return 0.0, 0.0
     return field.physical_limits
-
-
-def _text(text: str) -> str:
-    """Return text with its double quotes replaced."""
-    return text.replace('"', "'")

@@ -74,9 +74,9 @@ def meaning(row: Row, field: Field) -> str:
     low, high = (number(limit) for limit in field.physical_limits) if beyond(row, field) else ("", "")
     match beyond(row, field):
         case "wraps":
-            return f"{field.doc} Wraps beyond {high}."
+            return f"{field.doc} Wraps beyond {high}.".lstrip()
         case "clipped":
-            return f"{field.doc} Clipped to {low} to {high}."
+            return f"{field.doc} Clipped to {low} to {high}.".lstrip()
         case _:
             return field.doc
 
@@ -140,8 +140,8 @@ def _position(field: Field) -> str:
     if not field.width:
         last = field.offset + field.size - 1
         return str(field.offset) if field.size == 1 else f"{field.offset}–{last}"
-    byte, bit = field.offset + field.shift // 8, field.shift % 8
-    return f"{byte}.{bit}" if field.width == 1 else f"{byte}.{bit}–{bit + field.width - 1}"
+    places = (field.place(bit) for bit in sorted({0, field.width - 1}))
+    return "–".join(f"{byte}.{bit}" for byte, bit in places)
 
 
 def _type(field: Field) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator, Sequence
-from html import escape
 from typing import Final
 
 from starhil.protocol.export import describe, wire
+from starhil.protocol.export.quoting import html_text
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import Section
 
@@ -30,61 +29,47 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     heading = f"Interface definition {icd.name} {icd.version}"
     yield "<!DOCTYPE html>"
     yield '<html lang="en"><head><meta charset="utf-8">'
-    yield f"<title>{escape(heading)}</title><style>{_STYLE}</style></head><body>"
-    yield f"<h1>{escape(heading)}</h1><p>{escape(icd.doc)}</p>"
-    yield from (f"<p>{escape(paragraph)}</p>" for paragraph in describe.introduction(icd))
+    yield f"<title>{html_text(heading)}</title><style>{_STYLE}</style></head><body>"
+    yield f"<h1>{html_text(heading)}</h1><p>{html_text(icd.doc)}</p>"
+    yield from (f"<p>{html_text(paragraph)}</p>" for paragraph in describe.introduction(icd))
     after = (*describe.reference(icd), *wire.sections(icd))
-    links = [_link(section) for section in icd.sections]
-    links += [
-        '<a href="#telecommands">Telecommands</a><a href="#telemetry">Telemetry</a>',
-        *map(_link, after),
-    ]
-    yield f"<nav>{''.join(links)}</nav>"
+    anchors = {section: f"section-{number}" for number, section in enumerate((*icd.sections, *after))}
+    links = [(anchors[section], section.heading) for section in icd.sections]
+    links += [(title.lower(), title) for title, _ in describe.sections(icd)]
+    links += [(anchors[section], section.heading) for section in after]
+    yield "<nav>" + "".join(f'<a href="#{anchor}">{html_text(text)}</a>' for anchor, text in links) + "</nav>"
     for section in icd.sections:
-        yield from _section(section)
+        yield from _section(anchors[section], section)
     for title, rows in describe.sections(icd):
         yield f'<h2 id="{title.lower()}">{title}</h2>'
         yield "<table><tr><th>Id</th><th>Name</th><th>Bytes</th><th>Source</th><th>Meaning</th></tr>"
         for row in rows:
             yield (
-                f'<tr class="{row.provenance}"><td>{row.id}</td><td><a href="#{describe.anchor(row)}">{escape(row.name)}</a></td>'
-                f"<td>{row.size}</td><td>{row.provenance}</td><td>{escape(row.doc)}</td></tr>"
+                f'<tr class="{row.provenance}"><td>{row.id}</td><td><a href="#{describe.anchor(row)}">{html_text(row.name)}</a></td>'
+                f"<td>{row.size}</td><td>{row.provenance}</td><td>{html_text(row.doc)}</td></tr>"
             )
         yield "</table>"
         for row in rows:
-            yield f'<h3 id="{describe.anchor(row)}">{escape(describe.title(row))}</h3>'
-            yield f'<p>{escape(row.doc)}</p><p class="facts">{escape(describe.facts(row))}.</p>'
+            yield f'<h3 id="{describe.anchor(row)}">{html_text(describe.title(row))}</h3>'
+            yield f'<p>{html_text(row.doc)}</p><p class="facts">{html_text(describe.facts(row))}.</p>'
             if row.fields:
                 yield from _table(
                     describe.FIELD_COLUMNS,
                     ((field.provenance, describe.field_cells(row, field)) for field in row.fields),
                 )
     for section in after:
-        yield from _section(section)
+        yield from _section(anchors[section], section)
     yield "</body></html>"
 
 
-def _section(section: Section) -> Iterator[str]:
-    yield f'<h2 id="{_anchor(section)}">{escape(section.heading)}</h2>'
-    yield from (f"<p>{_text(paragraph)}</p>" for paragraph in section.paragraphs)
+def _section(anchor: str, section: Section) -> Iterator[str]:
+    yield f'<h2 id="{anchor}">{html_text(section.heading)}</h2>'
+    yield from (f"<p>{html_text(paragraph)}</p>" for paragraph in section.paragraphs)
     yield from _table(section.columns, (("confirmed", row) for row in section.rows))
 
 
-def _link(section: Section) -> str:
-    return f'<a href="#{_anchor(section)}">{escape(section.heading)}</a>'
-
-
-def _anchor(section: Section) -> str:
-    return section.heading.lower().replace(" ", "-")
-
-
-def _text(text: str) -> str:
-    """Escape a text and mark what is between backticks as code."""
-    return re.sub("`([^`]*)`", r"<code>\1</code>", escape(text))
-
-
 def _table(columns: Sequence[str], rows: Iterable[tuple[str, Sequence[str]]]) -> Iterator[str]:
-    yield "<table><tr>" + "".join(f"<th>{escape(column)}</th>" for column in columns) + "</tr>"
+    yield "<table><tr>" + "".join(f"<th>{html_text(column)}</th>" for column in columns) + "</tr>"
     for kind, cells in rows:
-        yield f'<tr class="{kind}">' + "".join(f"<td>{_text(cell)}</td>" for cell in cells) + "</tr>"
+        yield f'<tr class="{kind}">' + "".join(f"<td>{html_text(cell)}</td>" for cell in cells) + "</tr>"
     yield "</table>"

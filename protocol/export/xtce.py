@@ -6,16 +6,15 @@ byte of the ID.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from typing import Final
 from xml.etree import ElementTree as ET
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.export.describe import meaning, number
-from starhil.protocol.export.row_key import key_bits, key_of
+from starhil.protocol.export.packets import key_bits, key_of, wire_order
+from starhil.protocol.export.quoting import Scope, one_line, xtce_name
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import IcdError
 
 NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
 PACKET: Final = "Packet"
@@ -25,34 +24,24 @@ _ORDERS: Final = {"little": "leastSignificantByteFirst", "big": "mostSignificant
 
 
 def render(icd: InterfaceDefinition) -> str:
-    """Return the XML text. Raises IcdError for bits across bytes, which XTCE cannot express."""
-    name = re.sub("[.:/ ]", "_", icd.name)  # as XTCE has names
-    system = ET.Element("SpaceSystem", {"name": name, "xmlns": NAMESPACE, "shortDescription": icd.doc})
-    ET.SubElement(
-        system, "Header", {"version": icd.version, "date": "2026-01-01", "validationStatus": "Working"}
-    )
+    """Return the XML text. Raises IcdError for equal names, and for bits that XTCE cannot express."""
+    system = ET.Element("SpaceSystem", {"name": xtce_name(icd.name), "xmlns": NAMESPACE} | _short(icd.doc))
+    about = {"version": one_line(icd.version), "date": "2026-01-01", "validationStatus": "Working"}
+    ET.SubElement(system, "Header", about)
+    scope = Scope("XTCE", [IDENTIFIER, PACKET])
+    for row in icd.rows:
+        scope.claim(row.name, f"{row.kind} {row.name}")
+        if row.kind == "telecommand":
+            scope.claim(f"{row.name}_packet", f"{row.kind} {row.name}")
     if icd.telemetry:
-        _telemetry(ET.SubElement(system, "TelemetryMetaData"), icd)
+        _telemetry(ET.SubElement(system, "TelemetryMetaData"), icd, scope)
     if icd.telecommands:
-        _commands(ET.SubElement(system, "CommandMetaData"), icd)
+        _commands(ET.SubElement(system, "CommandMetaData"), icd, scope)
     ET.indent(system)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(system, encoding="unicode") + "\n"
 
 
-def wire_order(row: Row) -> Iterator[Field]:
-    """Yield the fields of a row in wire order, most significant bit of each byte first."""
-    for slot in row.slots:
-        fields = [field for field in row.fields if field.slot is slot]
-        bytes_in_order = range(slot.size) if slot.order == "little" else reversed(range(slot.size))
-        for byte in bytes_in_order if fields[0].width else (0,):
-            within = [field for field in fields if not field.width or field.shift // 8 == byte]
-            for field in within:
-                if field.width and (field.shift % 8) + field.width > 8:
-                    raise IcdError(f"{row.name}.{field.name}: bits across bytes cannot be exported")
-            yield from sorted(within, key=lambda field: -field.shift)
-
-
-def _telemetry(parent: ET.Element, icd: InterfaceDefinition) -> None:
+def _telemetry(parent: ET.Element, icd: InterfaceDefinition, scope: Scope) -> None:
     types = ET.SubElement(parent, "ParameterTypeSet")
     parameters = ET.SubElement(parent, "ParameterSet")
     containers = ET.SubElement(parent, "ContainerSet")
@@ -73,8 +62,7 @@ def _telemetry(parent: ET.Element, icd: InterfaceDefinition) -> None:
     _entries(root, "Parameter", [IDENTIFIER])
     for row in (row for row in icd.rows if row.kind == "telemetry"):
         names = []
-        for index, field in enumerate(wire_order(row)):
-            name = _name(row, field, index)
+        for name, field in _fields(row, scope):
             names.append(name)
             _type(types, "Parameter", name, field)
             about = {"name": name, "parameterTypeRef": f"{name}_type"}
@@ -86,14 +74,14 @@ def _telemetry(parent: ET.Element, icd: InterfaceDefinition) -> None:
         ET.SubElement(criteria, "Comparison", {"parameterRef": IDENTIFIER, "value": str(key_of(icd, row))})
 
 
-def _commands(parent: ET.Element, icd: InterfaceDefinition) -> None:
+def _commands(parent: ET.Element, icd: InterfaceDefinition, scope: Scope) -> None:
     types = ET.SubElement(parent, "ArgumentTypeSet")
     commands = ET.SubElement(parent, "MetaCommandSet")
     if not any(row.named_fields for row in icd.telecommands.values()):
         parent.remove(types)
     for row in (row for row in icd.rows if row.kind == "telecommand"):
         command = ET.SubElement(commands, "MetaCommand", {"name": row.name} | _short(row.doc))
-        arguments = [(_name(row, field, index), field) for index, field in enumerate(wire_order(row))]
+        arguments = list(_fields(row, scope))
         if any(field.name for _, field in arguments):
             listed = ET.SubElement(command, "ArgumentList")
             for name, field in arguments:
@@ -101,7 +89,7 @@ def _commands(parent: ET.Element, icd: InterfaceDefinition) -> None:
                     _type(types, "Argument", name, field)
                     about = {"name": field.name, "argumentTypeRef": f"{name}_type"}
                     if field.default is not None:
-                        about["initialValue"] = str(field.default)
+                        about["initialValue"] = _initial(field)
                     ET.SubElement(listed, "Argument", about | _short(meaning(row, field)))
         container = ET.SubElement(command, "CommandContainer", {"name": f"{row.name}_packet"})
         entries = ET.SubElement(container, "EntryList")
@@ -110,7 +98,7 @@ def _commands(parent: ET.Element, icd: InterfaceDefinition) -> None:
             if field.name:
                 ET.SubElement(entries, "ArgumentRefEntry", {"argumentRef": field.name})
             else:
-                _fixed(entries, name, 0, _bits(field))
+                _fixed(entries, name, 0, field.bit_count)
 
 
 def _fixed(entries: ET.Element, name: str, value: int, bits: int) -> None:
@@ -152,7 +140,7 @@ def _type(types: ET.Element, what: str, name: str, field: Field) -> None:
         _integer(kind, field)
         members = ET.SubElement(kind, "EnumerationList")
         for label, value in field.enum.values.items():
-            ET.SubElement(members, "Enumeration", {"value": str(value), "label": label})
+            ET.SubElement(members, "Enumeration", {"value": str(value), "label": one_line(label)})
         return
     elif field.kind == "flag":
         _integer(ET.SubElement(types, f"Boolean{what}Type", about), field)
@@ -175,7 +163,7 @@ def _integer(kind: ET.Element, field: Field) -> None:
         kind,
         "IntegerDataEncoding",
         {
-            "sizeInBits": str(_bits(field)),
+            "sizeInBits": str(field.bit_count),
             "encoding": "twosComplement" if _signed(field) else "unsigned",
             "byteOrder": _ORDERS[field.slot.order],
         },
@@ -205,11 +193,7 @@ def _range(kind: ET.Element, field: Field) -> None:
 def _unit(kind: ET.Element, field: Field) -> None:
     units = ET.SubElement(kind, "UnitSet")
     if field.unit:
-        ET.SubElement(units, "Unit").text = field.unit
-
-
-def _bits(field: Field) -> int:
-    return field.width or 8 * field.size
+        ET.SubElement(units, "Unit").text = one_line(field.unit)
 
 
 def _signed(field: Field) -> bool:
@@ -217,9 +201,18 @@ def _signed(field: Field) -> bool:
 
 
 def _short(doc: str) -> dict[str, str]:
-    return {"shortDescription": doc} if doc else {}
+    return {"shortDescription": one_line(doc)} if doc else {}
 
 
-def _name(row: Row, field: Field, index: int) -> str:
-    """Return a name for a field that is unique in the definition."""
-    return f"{row.name}_{field.name or f'unused_{index}'}"
+def _initial(field: Field) -> str:
+    """Return the default value; that of a string in hexadecimal."""
+    if field.slot.type == "bytes" and isinstance(field.default, str):
+        return field.default.encode("ascii").ljust(field.size, b"\0").hex()
+    return one_line(str(field.default))
+
+
+def _fields(row: Row, scope: Scope) -> Iterator[tuple[str, Field]]:
+    """Yield the fields of a row in wire order, with names that are unique in the definition."""
+    for index, field in enumerate(wire_order(row, "XTCE")):
+        name = f"{row.name}_{field.name or f'unused_{index}'}"
+        yield scope.claim(name, f"{row.kind} {row.name}: field {field.name or 'unused'}"), field

@@ -10,6 +10,7 @@ from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import takewhile
 from typing import Final
 
 from starhil.protocol.serial_framing import PacingSchedule
@@ -18,15 +19,17 @@ from starhil.protocol.transports.base import Statistics, Transport
 BACKLOG_LIMIT: Final = 64 * 1024
 """Maximum number of bytes that wait for the line or for a peer that does not read."""
 
-TICK_S: Final = 0.002
-"""Time between two writes of a long message, which is sent in chunks at the pace of the line."""
+GRAIN_S: Final = 1e-6
+"""A timer may fire this much early."""
 
 RETRY_S: Final = 0.005
 """Time until the next attempt if the port is full."""
 
 
 class PacedWriter:
-    """Writes queued bytes to a port no faster than the line carries them.
+    """Writes each message whole, at the time at which its last byte would arrive over the line.
+
+    A UART has no gaps within a message. Bytes written one by one would have some whenever the machine is busy.
 
     Parameters
     ----------
@@ -45,7 +48,7 @@ class PacedWriter:
         self.schedule = schedule
         self._statistics = statistics
         self._queue: deque[tuple[float, bytes]] = deque()
-        """Messages, each with the time at which its first byte begins."""
+        """Messages, each with the time at which it is due."""
         self._written = 0
         """Number of bytes of the first message that have been written."""
         self._backlog = 0
@@ -65,10 +68,10 @@ class PacedWriter:
             self._statistics.dropped += len(data)
             return False
         if data:
-            begin = self._loop.time()
+            due = self._loop.time()
             if self.schedule is not None:
-                begin, _ = self.schedule.reserve(begin, len(data))
-            self._queue.append((begin, data))
+                _, due = self.schedule.reserve(due, len(data))
+            self._queue.append((due, data))
             self._backlog += len(data)
             self._idle.clear()
             if self._timer is None:
@@ -105,10 +108,12 @@ class PacedWriter:
         self._become_idle()
 
     def _write_due(self) -> None:
-        """Write the bytes that are due and set the timer for the next ones."""
+        """Write the messages that are due and set the timer for the next one."""
         self._timer = None
         now = self._loop.time()
-        due, next_time = self._due_bytes(now)
+        waiting = takewhile(lambda item: item[0] <= now + GRAIN_S, self._queue)
+        due = b"".join(data for _, data in waiting)[self._written :]
+        accepted = 0
         if due:
             try:
                 accepted = self._write(due)
@@ -116,30 +121,11 @@ class PacedWriter:
                 self.clear()
                 return
             self._remove_written(accepted)
-            if accepted < len(due):
-                next_time = now + RETRY_S
         if self._queue:
-            self._timer = self._loop.call_at(max(next_time, now), self._write_due)
+            next_time = now + RETRY_S if accepted < len(due) else self._queue[0][0]
+            self._timer = self._loop.call_at(next_time, self._write_due)
         else:
             self._become_idle()
-
-    def _due_bytes(self, now: float) -> tuple[bytes, float]:
-        """Return the number of bytes that the line has carried by `now`, and the time of the next check."""
-        if self.schedule is None:
-            whole = b"".join(data for _, data in self._queue)
-            return whole[self._written :], now
-        byte_s = self.schedule.seconds_per_byte
-        chunks: list[bytes] = []
-        written = self._written
-        for begin, data in self._queue:
-            ready = min(int((now - begin) / byte_s + 1e-6), len(data))
-            if ready > written:
-                chunks.append(data[written:ready])
-            if ready < len(data):
-                end = begin + len(data) * byte_s
-                return b"".join(chunks), min(max(begin + (ready + 1) * byte_s, now + TICK_S), end)
-            written = 0
-        return b"".join(chunks), now
 
     def _remove_written(self, count: int) -> None:
         self._statistics.sent += count

@@ -44,8 +44,8 @@ def open_serial(
     symlink:
         Path of a symlink to the pseudo-terminal; created atomically, removed on close.
     paced:
-        Whether bytes are sent no faster than the bit rate; true by default, except for a real tty, which is
-        paced by its hardware.
+        Whether a message is passed on, whole, only when its last byte would have arrived at the bit rate; true
+        by default, except for a real tty, which is paced by its hardware.
 
     Raises
     ------

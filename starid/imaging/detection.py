@@ -357,9 +357,10 @@ def _peaks(scene: _Scene, sigma_px: float) -> tuple[Indices32, Grid]:
         factor = noise_factor(taps8 / INTEGER_TAPS_SUM)
         return _search(search_bytes, background, scene.settings.threshold_sigma * factor)
     taps = spot_taps(sigma_px)
+    image16 = counts.astype(np.uint16, copy=False)  # as the sums along trails, so one kernel does for both
 
     def search(threshold: Grid, peaks: Indices32, heights: Grid) -> int:
-        return find_peaks(counts, threshold, background.block_px, taps, peaks, heights)
+        return find_peaks(image16, threshold, background.block_px, taps, peaks, heights)
 
     return _search(search, background, scene.settings.threshold_sigma * noise_factor(taps))
 

@@ -1,4 +1,4 @@
-"""Reading and writing of grey PNG, TIFF and JPEG images of 8 or 16 bits."""
+"""Reading and writing of grey PNG, TIFF, JPEG and BMP images of 8 or 16 bits."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ IMAGE_LIMIT: Final = 1000 * MEGABYTE
 _PNG: Final = b"\x89PNG\r\n\x1a\n"
 _JPEG: Final = b"\xff\xd8\xff"
 _TIFFS: Final = (b"II*\x00", b"MM\x00*")
-SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+_BMP: Final = b"BM"
+SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+_FORMATS_OF_8_BITS: Final = {".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 _CHUNK_FRAME: Final = 12
 _GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in the luma of ITU-R BT.601."""
 
 
 def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
-    """Read an 8- or 16-bit grey PNG, TIFF or JPEG.
+    """Read an 8- or 16-bit grey PNG, TIFF, JPEG or BMP.
 
     Parameters
     ----------
@@ -49,7 +51,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
     try:
         content = read_bytes(source, IMAGE_LIMIT)
     except FileNotFoundError:
-        raise StaridError(f"image {source}: no such file; give a PNG, TIFF or JPEG") from None
+        raise StaridError(f"image {source}: no such file; give a PNG, TIFF, JPEG or BMP") from None
     except OSError as error:
         raise StaridError(
             f"image {source}: cannot be read ({error.strerror}); give a readable file"
@@ -102,8 +104,8 @@ def write_image(path: str | Path, image: GreyImage) -> None:
     Parameters
     ----------
     path : path
-        Its suffix selects the format: .png, .tif, .tiff, .jpg or .jpeg (8 bit only, lossy); a device or pipe
-        without one gets a PNG.
+        Its suffix selects the format: .png, .tif, .tiff, .bmp (8 bit only), .jpg or .jpeg (8 bit only, lossy); a
+        device or pipe without one gets a PNG.
     image : ndarray (height, width) or (height, width, 3) of uint8 or uint16
         Colour in BGR order.
 
@@ -116,9 +118,10 @@ def write_image(path: str | Path, image: GreyImage) -> None:
 
     target = Path(path)
     suffix = image_suffix(target)
-    if image.dtype == np.uint16 and suffix in (".jpg", ".jpeg"):
+    if image.dtype == np.uint16 and suffix in _FORMATS_OF_8_BITS:
         raise StaridError(
-            f"image {target}: JPEG holds 8 bits per pixel, this image has 16; write a PNG or TIFF"
+            f"image {target}: {_FORMATS_OF_8_BITS[suffix]} holds 8 bits per pixel, this image has 16; "
+            "write a PNG or TIFF"
         )
     done, packed = cv2.imencode(suffix, image)
     if not done:
@@ -134,15 +137,15 @@ def write_image(path: str | Path, image: GreyImage) -> None:
 
 
 def _check_whole(source: Path, content: bytes) -> None:
-    """Reject files that are not PNG, TIFF or JPEG, and truncated PNG and JPEG files."""
+    """Reject files that are not PNG, TIFF, JPEG or BMP, and truncated PNG and JPEG files."""
     if content.startswith(_PNG):
         whole = _png_is_whole(content)
     elif content.startswith(_JPEG):
         whole = content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")
-    elif content.startswith(_TIFFS):
+    elif content.startswith((*_TIFFS, _BMP)):
         whole = True
     else:
-        what = "is empty" if not content else "is not a PNG, TIFF or JPEG"
+        what = "is empty" if not content else "is not a PNG, TIFF, JPEG or BMP"
         raise StaridError(f"image {source}: {what}; give a grey image of 8 or 16 bits")
     if not whole:
         raise _truncated(source)
@@ -183,5 +186,9 @@ def _decode(source: Path, content: bytes) -> NDArray[Any]:
     finally:
         log.setLogLevel(level)
     if pixels is None or pixels.size == 0:
+        if content.startswith(_BMP):
+            raise StaridError(
+                f"image {source}: truncated, damaged or a BMP of an unsupported kind; convert it to PNG"
+            )
         raise _truncated(source)
     return np.asarray(pixels)

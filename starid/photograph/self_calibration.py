@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from starid.arrays import Array, Indices
 from starid.attitude import Attitude
@@ -26,7 +25,7 @@ from starid.calibration import (
     check_estimate,
 )
 from starid.camera import Camera
-from starid.catalog import StarCatalog, load_catalog, merge_close_stars
+from starid.catalog import StarCatalog, close_pairs, load_catalog, merge_close_stars
 from starid.errors import StaridError
 from starid.photograph.rough_search import RoughSearch
 from starid.solution import Solution
@@ -50,6 +49,8 @@ _MIN_WINDOW_PX: Final = 1.0
 _SIGMA_FLOOR_PX: Final = 0.02
 _MAGNITUDE_MARGIN: Final = 0.3
 _BLEND_PX: Final = 2.0
+_FIELD_MARGIN: Final = 1.1
+"""Radius of the part of the sky searched, in radii of the first estimate of the field."""
 
 
 class Stars(NamedTuple):
@@ -183,10 +184,13 @@ def calibrate_identified(
             )
         )
     start = solutions[indices[0]].camera or camera
-    seen = merge_close_stars(
-        sky.brighter_than(faintest + _MAGNITUDE_MARGIN), _BLEND_PX * camera.pixel_scale_rad
-    )
     _, result = next(_calibrations(matched, start, (_affordable_model(matched, ("focal", "k1")), ("focal",))))
+    bright = sky.brighter_than(faintest + _MAGNITUDE_MARGIN)
+    reach = result.camera.field_radius_rad * _FIELD_MARGIN
+    fields = [bright.in_cone(attitude.boresight, reach) for attitude in result.attitudes]
+    seen = merge_close_stars(
+        bright.subset(np.unique(np.concatenate(fields))), _BLEND_PX * camera.pixel_scale_rad
+    )
     matches: tuple[Indices, ...] = ()
     for _ in range(_ROUNDS):
         pairs = [
@@ -234,11 +238,14 @@ def _paired(
     near, xy = near[inside], xy[inside]
     measured = np.asarray(stars.xy_px, dtype=np.float64)
     window = max(_WINDOW_SIGMAS * sigma_px, _MIN_WINDOW_PX)
-    distance, of_catalog = cKDTree(xy).query(measured, distance_upper_bound=window)
-    _, of_detection = cKDTree(measured).query(xy)
-    chosen = np.flatnonzero(np.isfinite(distance))
-    chosen = chosen[of_detection[of_catalog[chosen]] == chosen]
-    return chosen, near[of_catalog[chosen]]
+    pairs = close_pairs(measured, xy, window)
+    pairs = pairs[np.argsort(np.linalg.norm(measured[pairs[:, 0]] - xy[pairs[:, 1]], axis=1), kind="stable")]
+    nearest = [np.zeros(len(pairs), dtype=np.bool_) for _ in range(2)]
+    for side in range(2):
+        nearest[side][np.unique(pairs[:, side], return_index=True)[1]] = True
+    chosen, partner = pairs[nearest[0] & nearest[1]].T
+    order = np.argsort(chosen)
+    return chosen[order], near[partner[order]]
 
 
 def _unknowns(model: Sequence[str], frames: Sequence[CalibrationFrame]) -> int:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 def star(hip, x, y, magnitude, snr):
     """An identified star where the default camera sees it."""
     (vector,) = DEFAULT_CAMERA.back_project([[x, y]]).tolist()
-    return MatchedStar(hip, x, y, magnitude, snr, tuple(vector))
+    return MatchedStar(hip, x, y, magnitude, snr, tuple(vector), (0.0, 0.0, 0.0))
 
 
 STARS = (
@@ -61,6 +62,8 @@ class FakePipeline:
     requests: list[PipelineRequest] = field(default_factory=list)
     fail: str = ""
     turn_rad: float = 0.0
+    window_rad: float = math.inf
+    """Largest error of a prediction from which the attitude is found."""
     last_index: int = -1
 
     def handle(self, request: PipelineRequest) -> PipelineReply:
@@ -77,6 +80,10 @@ class FakePipeline:
         if self.fail:
             return FrameResult(request.index, reason=self.fail, tracked=tracked, detected=2)
         attitude = Attitude(np.array(request.attitude_xyzw)).rotated((self.turn_rad, 0.0, 0.0))
+        if tracked:
+            missed = attitude.error_to(Attitude(np.array(request.predicted_xyzw))).rotation_vector_rad
+            if np.linalg.norm(missed) > self.window_rad:
+                return FrameResult(request.index, reason="prediction_lost", tracked=True, detected=40)
         x, y, z, w = attitude.quaternion_xyzw.tolist()
         return FrameResult(
             request.index,
@@ -89,7 +96,9 @@ class FakePipeline:
             detected=40,
             refused=3,
             matched=35,
-            stars=STARS,
+            stars=tuple(
+                replace(star, icrs=tuple((attitude.matrix.T @ star.vector).tolist())) for star in STARS
+            ),
             probability_false=1e-12,
             rms_px=0.1,
             background_dn=8.2,

@@ -23,6 +23,9 @@ def test_scaled_clock_follows_its_factor(monkeypatch):
     wall = [1_000]
     monkeypatch.setattr("time.monotonic_ns", lambda: wall[0])
     clock = ScaledClock(10.0)
+    wall[0] += 5_000_000
+    assert clock.now_ns() == 0
+    clock.start()
     wall[0] += 7_000_000
     assert clock.now_ns() == 70_000_000
 
@@ -59,6 +62,7 @@ def test_real_clock_passes_with_the_wall_clock(monkeypatch):
     wall = [5]
     monkeypatch.setattr("time.monotonic_ns", lambda: wall[0])
     clock = RealClock()
+    clock.start()
     wall[0] += 42
     assert clock.now_ns() == 42
 

@@ -1,6 +1,9 @@
+from itertools import permutations
+
 import pytest
 
 from starhil.emulator.control.scenario import Scenario
+from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
 from starhil.emulator.truth.config import SlewConfig
@@ -67,6 +70,35 @@ def test_a_calibrated_camera_takes_the_place_of_the_field_of_view(tmp_path):
     assert "fov_deg" not in load_profile(both).camera.values()
     back = write(tmp_path, f'extends = "{both}"\n[camera]\nfov_deg = 30.0\n', "back.toml")
     assert "focal_px" not in load_profile(back).camera.values()
+
+
+MOUNTS = {
+    "quaternion_xyzw": "quaternion_xyzw = [0.0, 0.0, 0.0, 1.0]",
+    "matrix": "matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]",
+    "euler_deg": 'euler_deg = [1.0, 2.0, 3.0]\nsequence = "213"',
+}
+
+
+@pytest.mark.parametrize(("old", "new"), list(permutations(MOUNTS, 2)))
+def test_a_mount_in_another_form_takes_the_place_of_the_old_one(tmp_path, old, new):
+    base = write(tmp_path, f'[truth]\nkind = "fixed"\n[truth.mount]\n{MOUNTS[old]}\n', "base.toml")
+    extended = write(tmp_path, f'extends = "{base}"\n[truth.mount]\n{MOUNTS[new]}\n')
+    typed = load_profile(base, [f"truth.mount.{MOUNTS[new].splitlines()[0].replace(' = ', '=')}"])
+    for profile in (load_profile(extended), typed):
+        assert getattr(profile.truth.mount, new) is not None
+        assert getattr(profile.truth.mount, old) is None
+
+
+@pytest.mark.parametrize(
+    "date", ["2035-01-01T00:00:00Z", '"2035-01-01"', "2051222400", "2035-01-01T00:00:00"]
+)
+def test_the_start_is_a_date_and_moves_the_stars(date):
+    for key in ("run.start_unix_s", "sky.date"):
+        profile = load_profile("cubestar", [f"{key}={date}"])
+        assert profile.start_unix_s == 2_051_222_400.0
+        assert pipeline_setup(profile).epoch == 2035.0
+    assert load_profile("cubestar", [f"sky.date={date}", "catalog.epoch=2000.0"]).epoch == 2000.0
+    assert load_profile("cubestar").epoch == 2026.0
 
 
 def test_a_profile_s_camera_is_known_exactly_by_default(tmp_path):
@@ -156,8 +188,6 @@ def test_an_invalid_override_is_named_in_the_error(tmp_path):
 @pytest.mark.parametrize(
     "override",
     [
-        "run.start_unix_s=1e300",
-        "run.start_unix_s=5e9",
         "device.boot_s=1e12",
         "timing.readout_s=1e9",
         "timing.detect_s=100.0",
@@ -177,6 +207,14 @@ def test_an_impossible_value_is_named_with_its_bound(override):
     key = override.partition("=")[0]
     assert message.startswith(f"--set {override}: {key}")
     assert "must be at " in message
+
+
+@pytest.mark.parametrize(
+    "override", ["run.start_unix_s=1e300", "run.start_unix_s=5e9", "run.start_unix_s=soon"]
+)
+def test_an_impossible_date_is_named_with_its_bounds(override):
+    message = refusal("cubestar", [override])
+    assert message.startswith(f"--set {override}: run.start_unix_s: must be a date from 1970 to 2100")
 
 
 def _numbers(schema, path=(), definitions=None):

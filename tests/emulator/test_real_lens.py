@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from starhil.emulator.benchmarks.ecss_campaign import REST, Condition, EcssDevice, EcssPlan
 from starhil.emulator.device.cycle import as_quaternion
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.parameters import Parameters
@@ -11,11 +12,15 @@ from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady, Solv
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.profile import CALIBRATION, load_profile
 from starhil.protocol.icd import load_unit
-from starid.attitude import Attitude, random_attitude
+from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 
 DATA_SHEET_ARCSEC = 55.44 * 2**0.5
 """About x and y together."""
 FIELDS = 4
+
+PUBLISHED_3_SIGMA_ARCSEC = np.array([55.4, 55.4, 77.4])
+"""About x, y and z."""
+SCATTERED = 100
 
 
 def errors_arcsec(pipeline, parameters) -> list[float]:
@@ -53,3 +58,15 @@ def test_a_slightly_wrong_calibration_stays_within_the_data_sheet(name, noise_ar
 @pytest.mark.parametrize("name", ["ideal", "demo"])
 def test_accurate_profiles_know_their_lens(name):
     assert not load_profile(name).parameters.keys() & CALIBRATION
+
+
+def test_noise_and_field_errors_carry_the_published_error_of_cubestar_and_bias_is_small():
+    device, condition = EcssDevice(EcssPlan("cubestar")), Condition(REST, REST, 0.0, SCATTERED)
+    errors = []
+    for number in range(SCATTERED):
+        shot, result = device.solve(condition, number)
+        assert result.valid, result
+        error = Attitude(np.array(result.quaternion_xyzw)).error_to(shot.attitude)
+        errors.append(error.rotation_vector_rad * ARCSEC_PER_RAD)
+    assert np.all(np.abs(np.mean(errors, axis=0)) < 0.25 * PUBLISHED_3_SIGMA_ARCSEC)
+    assert 3.0 * np.std(errors, axis=0) == pytest.approx(PUBLISHED_3_SIGMA_ARCSEC, rel=0.25)

@@ -12,7 +12,7 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.replay import replay
-from starhil.emulator.tape import EVENTS_FILE, RUN_FILE
+from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
@@ -20,6 +20,7 @@ from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
+ROUNDS = 10
 WITHIN_S = 60.0
 
 
@@ -46,12 +47,14 @@ async def talk(emulation, frames):
     await client.start()
     await client.set_parameter("exposure", 80)
     await client.command("save_parameters")
+    rounds = 0
     async with asyncio.timeout(WITHIN_S):
-        while emulation.device.cycle.published < frames:
+        while emulation.device.cycle.published < frames or rounds < ROUNDS:
             if emulation.stepper is not None:
                 await emulation.stepper.step(0.05)
             for name in ("precise_attitude", "identification", "device_status"):
                 await client.telemetry(name)
+            rounds += 1
             await asyncio.sleep(0.01)
     await client.close()
 
@@ -189,3 +192,99 @@ def test_a_recording_is_of_one_head(run, tmp_path):
             others=[{"links": {"can": {"address": 5}}}],
         )
     assert not (tmp_path / "recorded").exists()
+
+
+DAMAGED_LINES = {
+    "not JSON": "}",
+    "not an object": "7",
+    "empty": "",
+    "a list": "[]",
+    "nested too deeply": "[" * 100_000,
+    "no time": '{"do": "event"}',
+    "a time in words": '{"ns": "soon", "do": "event"}',
+    "a time before the start": '{"ns": -1, "do": "event"}',
+    "a time without end": '{"ns": 1e400, "do": "event"}',
+    "a fraction of a nanosecond": '{"ns": 0.5, "do": "event"}',
+    "nothing to do": '{"ns": 0}',
+    "an unknown kind": '{"ns": 0, "do": "dance"}',
+    "a kind that is no text": '{"ns": 0, "do": {}}',
+    "input without link": '{"ns": 0, "do": "in", "data": "00"}',
+    "input of an unknown link": '{"ns": 0, "do": "in", "link": "radio", "data": "00"}',
+    "input of a link that is off": '{"ns": 0, "do": "in", "link": "can", "data": [1, "00", true, false]}',
+    "input without data": '{"ns": 0, "do": "in", "link": "serial"}',
+    "half a byte": '{"ns": 0, "do": "in", "link": "serial", "data": "0"}',
+    "no hexadecimal": '{"ns": 0, "do": "out", "link": "serial", "data": "xy"}',
+    "a number as bytes": '{"ns": 0, "do": "out", "link": "serial", "data": 5}',
+    "a CAN frame on a serial line": '{"ns": 0, "do": "in", "link": "serial", "data": [1, "00", true, false]}',
+    "bytes on a CAN bus": '{"ns": 0, "do": "out", "link": "can", "data": "00"}',
+    "part of a CAN frame": '{"ns": 0, "do": "out", "link": "can", "data": [1, "00"]}',
+    "a CAN frame that cannot exist": '{"ns": 0, "do": "out", "link": "can", "data": [1, "00112233445566778899", true, false]}',
+    "no feed": '{"ns": 0, "do": "feed", "data": "{}"}',
+    "a feed without data": '{"ns": 0, "do": "feed"}',
+    "a feed that is not bytes": '{"ns": 0, "do": "feed", "data": "\u2192"}',
+    "no truth": '{"ns": 0, "do": "truth"}',
+    "an unknown truth": '{"ns": 0, "do": "truth", "config": {"kind": "x"}, "start_s": 0}',
+    "a truth that starts never": '{"ns": 0, "do": "truth", "config": {"kind": "fixed"}, "start_s": NaN}',
+    "no fault": '{"ns": 0, "do": "fault"}',
+    "an unknown fault": '{"ns": 0, "do": "fault", "request": {"weather": 1}}',
+    "a fault of a link that is off": '{"ns": 0, "do": "fault", "request": {"can": {"drop": 1.0}}}',
+    "a reply to nothing": '{"ns": 0, "do": "reply"}',
+    "the end of no write": '{"ns": 0, "do": "stored"}',
+    "no UTF-8": b"\xff",
+}
+
+
+@pytest.fixture
+def recorded(record):
+    """A short recording."""
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 2)
+
+    return record(scenario)
+
+
+@pytest.mark.parametrize("line", DAMAGED_LINES.values(), ids=DAMAGED_LINES)
+def test_a_damaged_line_is_named(recorded, line):
+    events = recorded / EVENTS_FILE
+    lines = events.read_bytes().splitlines(keepends=True)
+    lines.insert(3, (line if isinstance(line, bytes) else line.encode()) + b"\n")
+    events.write_bytes(b"".join(lines))
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    assert f"{events}: line 4: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+DAMAGED_FILES = {
+    "run: nested too deeply": (RUN_FILE, b"[" * 100_000),
+    "run: no UTF-8": (RUN_FILE, b"\xff"),
+    "run: not an object": (RUN_FILE, b"[]"),
+    "run: no folder": (RUN_FILE, b'{"profile": {}}'),
+    "run: a number as folder": (RUN_FILE, b'{"profile": {}, "folder": 5}'),
+    "scenario: not JSON": (SCENARIO_FILE, b"{"),
+    "scenario: no UTF-8": (SCENARIO_FILE, b"\xff"),
+    "scenario: nested too deeply": (SCENARIO_FILE, b"[" * 100_000),
+    "scenario: another table": (SCENARIO_FILE, b'{"at": []}'),
+    "truth log: no UTF-8": (TRUTH_FILE, b"frame\n\xff\n"),
+    "truth log: an endless cell": (TRUTH_FILE, b"frame\n" + b"1" * 200_000),
+}
+
+
+@pytest.mark.parametrize(("name", "content"), DAMAGED_FILES.values(), ids=DAMAGED_FILES)
+def test_a_damaged_file_is_named(recorded, name, content):
+    (recorded / name).write_bytes(content)
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    assert f"{recorded / name}: " in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", [RUN_FILE, EVENTS_FILE, SCENARIO_FILE, TRUTH_FILE])
+@pytest.mark.parametrize("make", [os.mkfifo, os.mkdir])
+def test_what_is_not_a_file_is_named_without_waiting(recorded, name, make):
+    (recorded / name).unlink(missing_ok=True)
+    make(recorded / name)
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    assert f"{recorded / name}: " in str(caught.value)

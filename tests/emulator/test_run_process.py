@@ -31,8 +31,8 @@ ICD = load_unit()
 
 
 def log_lines(errors: str) -> list[str]:
-    """Lines on stderr, but for the one that asks for patience."""
-    return [line for line in errors.splitlines() if "a first start compiles" not in line]
+    """Lines on stderr, but for the progress of a slow start."""
+    return [line for line in errors.splitlines() if not line.startswith("starting:")]
 
 
 class Emulator:

@@ -14,7 +14,7 @@ def send(message):
     data = pickle.dumps(message)
     stream.write(LENGTH.pack(len(data)) + data)
     stream.flush()
-receive()
+setup = receive()
 """
 """The beginning of a worker that renders no images: what it does then is the test's."""
 

@@ -18,6 +18,11 @@ from starhil.protocol.icd import load_unit
 
 READY = "import sys, time; print('ready serial=none', flush=True); "
 DIES = READY + "print('Segmentation of the sky', file=sys.stderr); sys.exit(7)"
+STARTS_SLOWLY = (
+    "import sys; print('starting: 5 s', file=sys.stderr, flush=True); print('0 WARNING', file=sys.stderr, flush=True); "
+    + READY
+    + "time.sleep(600)"
+)
 LASTS = READY + "time.sleep(600)"
 LAST_ERRORS = "unexpectedly with status 7: Segmentation of the sky"
 
@@ -44,6 +49,15 @@ def test_an_emulator_that_ended_unexpectedly_is_reported_with_its_last_errors():
         wait_for_its_end(own.emulator)
     assert own.emulator.process.stdout.closed
     assert own.emulator.process.stderr.closed
+
+
+@pytest.mark.process
+def test_the_progress_of_a_slow_start_is_shown_without_other_messages(capfd):
+    process = emulator(STARTS_SLOWLY)
+    process.start()
+    process.kill()
+    assert capfd.readouterr() == ("", "starting: 5 s\n")
+    assert process.errors == ["0 WARNING"]
 
 
 @pytest.mark.process

@@ -22,12 +22,11 @@ pytestmark = pytest.mark.process
 SPEED = 0.5
 """Simulation time per second: slow motion doubles the time-outs on a busy machine."""
 SLOW_MOTION = ["--speed", str(SPEED)]
-TIME_OUT_S = 400.0
 
 
 def run_cases(words: tuple) -> tuple[list[dict], list[str]]:
     """Run cases; return their outcomes and the identifiers of those that failed."""
-    done = starhil("conformance", *words, "--json", time_out_s=TIME_OUT_S)
+    done = starhil("conformance", *words, "--json")
     assert done.stderr == ""
     outcomes = json.loads(done.stdout)["outcomes"]
     failed = [item["id"] for item in outcomes if item["status"] == "failed"]

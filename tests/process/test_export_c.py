@@ -11,7 +11,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.export import export_folder
-from starhil.protocol.export.row_key import key_of
+from starhil.protocol.export.packets import key_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial_framing import Dialect

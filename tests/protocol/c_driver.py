@@ -17,7 +17,7 @@ import pytest
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.export.c import files, prefix_of
-from starhil.protocol.export.c.rows import member_name
+from starhil.protocol.export.quoting import c_member
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack
@@ -240,7 +240,7 @@ static void on_can(const char *verb, unsigned long id, const uint8_t *data, size
 
 
 def _printed(field: Field) -> str:
-    value = f"values.{member_name(field)}"
+    value = f"values.{c_member(field.name)}"
     if field.kind == "bytes":
         return f"print_hex({value}, sizeof {value});"
     if field.kind == "text":
@@ -253,7 +253,7 @@ def _printed(field: Field) -> str:
 
 
 def _read(field: Field) -> str:
-    value = f"values.{member_name(field)}"
+    value = f"values.{c_member(field.name)}"
     if field.kind in ("bytes", "text"):
         return f"(void)hex((uint8_t *){value});"
     if field.kind == "flag":

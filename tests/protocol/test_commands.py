@@ -13,26 +13,22 @@ import pytest
 
 from starhil.protocol.candump import read_candump
 from starhil.protocol.icd import load_unit
+from tests.emulator.cli.command_line import run_command_line
 
 STARHIL = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()"]
 
 
-def starhil(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*STARHIL, *arguments], capture_output=True, text=True, check=False, timeout=120)
-
-
 def test_export_writes_stdout_or_a_whole_file(tmp_path: Path) -> None:
-    done = starhil("icd", "export", "markdown")
-    assert (done.returncode, done.stderr) == (0, "")
+    status, text, said = run_command_line("icd", "export", "markdown")
+    assert (status, said) == (0, "")
     file = tmp_path / "icd.md"
-    written = starhil("icd", "export", "markdown", "-o", str(file))
-    assert (written.returncode, written.stdout, written.stderr) == (0, "", "")
-    assert file.read_text() == done.stdout
+    assert run_command_line("icd", "export", "markdown", "-o", str(file)) == (0, "", "")
+    assert file.read_text() == text
     assert list(tmp_path.iterdir()) == [file]
 
 
 def test_list_prints_every_row_and_parameter() -> None:
-    done = json.loads(starhil("icd", "list", "--json").stdout)
+    done = json.loads(run_command_line("icd", "list", "--json")[1])
     icd = load_unit()
     assert [(row["id"], row["name"], row["size"]) for row in done["rows"]] == [
         (r.id, r.name, r.size) for r in icd.rows
@@ -55,10 +51,10 @@ def test_list_prints_every_row_and_parameter() -> None:
     ],
 )
 def test_bad_input_is_one_line_and_exit_status_2(arguments: tuple[str, ...], message: str) -> None:
-    result = starhil(*arguments)
-    assert result.returncode == 2
-    assert result.stderr.startswith(message)
-    assert result.stderr.count("\n") == 1
+    status, _, said = run_command_line(*arguments)
+    assert status == 2
+    assert said.startswith(message)
+    assert said.count("\n") == 1
 
 
 @pytest.mark.process

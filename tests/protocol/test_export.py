@@ -23,9 +23,9 @@ from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames,
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
-from starhil.protocol.export.cosmos import _state
 from starhil.protocol.export.describe import anchor
-from starhil.protocol.export.row_key import key_bits, key_of
+from starhil.protocol.export.packets import key_bits, key_of
+from starhil.protocol.export.quoting import cosmos_state
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
@@ -482,5 +482,7 @@ def test_cosmos_reads_the_packets_of_a_unit(name: str, tmp_path: Path) -> None:
             for key, value in values.items():
                 field = row.named_fields[key]
                 read = packet.read(key.upper(), "CONVERTED")
-                expected = _state(str(value)) if isinstance(value, bool) or field.enum is not None else value
+                expected = (
+                    cosmos_state(str(value)) if isinstance(value, bool) or field.enum is not None else value
+                )
                 assert same(bytes(read) if isinstance(value, bytes) else read, expected), f"{row.name}.{key}"

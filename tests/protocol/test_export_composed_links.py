@@ -13,7 +13,7 @@ import pytest
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export.cosmos_plugin.composed import link_text
-from starhil.protocol.export.row_key import row_key
+from starhil.protocol.export.packets import row_key
 from starhil.protocol.icd import Names, load_unit
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind

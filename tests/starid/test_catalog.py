@@ -242,7 +242,10 @@ def test_close_pairs_match_a_tree(sky: StarCatalog) -> None:
         for ones, others in ((some, some), (some[::3], some[1::3])):
             near = cKDTree(ones).query_ball_tree(cKDTree(others), 2.0 * math.sin(0.5 * angle))
             theirs = {(one, other) for one, found in enumerate(near) for other in found}
-            assert {tuple(pair) for pair in catalog._close_pairs(ones, others, angle).tolist()} == theirs
+            assert {
+                tuple(pair)
+                for pair in catalog.close_pairs(ones, others, 2.0 * math.sin(0.5 * angle)).tolist()
+            } == theirs
 
 
 def lines_of_the_file(n: int) -> list[bytes]:

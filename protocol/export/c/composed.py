@@ -10,7 +10,7 @@ from typing import Final
 from starhil.protocol.checks import reversed_bits
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header, HeaderField
-from starhil.protocol.export.row_key import row_key
+from starhil.protocol.export.packets import row_key
 from starhil.protocol.link_schema import (
     CrcCheck,
     DelimitedFraming,

@@ -10,7 +10,7 @@ from typing import Any
 
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header
-from starhil.protocol.export.row_key import CLASS_SHIFT, row_key
+from starhil.protocol.export.packets import CLASS_SHIFT, row_key
 from starhil.protocol.link_schema import (
     CrcCheck,
     CustomCheck,

@@ -12,9 +12,9 @@ import pytest
 from starhil.emulator.cli.app import main
 
 
-def run_command_line(*arguments: str) -> tuple[int, str, str]:
+def run_command_line(*arguments: str, encoding: str = "utf-8") -> tuple[int, str, str]:
     """Run `starhil`; return exit status, standard output and standard error."""
-    out, err = (io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True) for _ in range(2))
+    out, err = (io.TextIOWrapper(io.BytesIO(), encoding, write_through=True) for _ in range(2))
     with (
         mock.patch.object(sys, "argv", ["starhil", *arguments]),
         contextlib.redirect_stdout(out),
@@ -28,4 +28,4 @@ def run_command_line(*arguments: str) -> tuple[int, str, str]:
 
 def _text(stream: io.TextIOWrapper) -> str:
     assert isinstance(stream.buffer, io.BytesIO)
-    return stream.buffer.getvalue().decode()
+    return stream.buffer.getvalue().decode(stream.encoding)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,15 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
 from starid import cache
+from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.runs import CAMERA
+from tests.emulator.workers import WORKER
 
 MEGABYTE = np.zeros(125_000)
+RECORDS_SETUP = (
+    WORKER.replace("{", "{{").replace("}", "}}")
+    + "open('{path}', 'w').write(f'{{setup.previews}} {{setup.sky}}')\nsend({outcome})\nreceive()\n"
+)
 
 
 @pytest.fixture
@@ -92,3 +100,30 @@ def test_a_limit_that_is_not_a_number_is_reported_and_the_default_used(
         monkeypatch.setenv("STARHIL_CACHE_LIMIT_MB", text)
         assert cache.size_limit() == 500_000_000
     assert "must be a number of megabytes" in caplog.text
+
+
+def test_kernels_are_counted_from_a_time_on(folder: Path) -> None:
+    machine_code = folder / "kernels" / "0123456789abcdef"
+    machine_code.mkdir(parents=True)
+    for number, written_s in enumerate((1000, 2000, 3000)):
+        path = machine_code / f"module.kernel-{number}.py311.1.nbc"
+        path.write_bytes(b"code")
+        os.utime(path, (written_s, written_s))
+        path.with_suffix(".nbi").write_bytes(b"index")
+    assert [cache.kernels_written_since(begin_s) for begin_s in (0, 2000, 4000)] == [3, 2, 0]
+
+
+def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel(
+    folder: Path, worker: Callable[..., object]
+) -> None:
+    worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome=f"PipelineReady({CAMERA}, 5, 0.0)"))
+    status, out, said = run_command_line("cache", "warm", "ideal")
+    assert (status, said) == (0, "")
+    assert out.startswith("0 kernels compiled in ")
+    assert str(folder) in out
+    assert (folder.parent / "setup").read_text() == "True {'bodies': 'ephemeris'}"
+
+
+def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, worker: Callable[..., object]) -> None:
+    worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome="Failure('no catalogue')"))
+    assert run_command_line("cache", "warm") == (2, "", "starhil: no catalogue\n")

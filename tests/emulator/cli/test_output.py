@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ import typer
 
 from starhil.emulator.cli import app, output
 from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.workers import WORKER
 
 PROGRAM = [sys.executable, "-c", "from starhil.emulator.cli import main; main()"]
 WRITTEN = {"--output", "--annotate", "--junit", "--html", "--truth-log"}
@@ -77,10 +79,10 @@ def test_missing_folders_are_made_and_a_file_in_their_place_is_rejected(
     assert "is a folder" in refusal(*arguments.split(), str(path.parent))
 
 
-def test_an_export_to_the_standard_output_by_name_is_the_export(tmp_path: Path) -> None:
-    plain = starhil("icd", "export", "markdown").stdout
+def test_an_export_to_the_standard_output_is_in_utf_8_whatever_its_encoding_is() -> None:
+    plain = starhil("icd", "export", "markdown", PYTHONIOENCODING="ascii").stdout
     assert starhil("icd", "export", "markdown", "-o", "/proc/self/fd/1").stdout == plain
-    assert starhil("icd", "export", "markdown", PYTHONIOENCODING="ascii").stdout == plain
+    assert run_command_line("icd", "export", "markdown") == (0, plain.decode("utf-8"), "")
     assert not plain.isascii()
 
 
@@ -95,9 +97,9 @@ def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error() 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp437", "utf-8"])
 def test_an_output_of_any_encoding_shows_every_character(encoding: str) -> None:
-    done = starhil("catalog", "--star", "11767", PYTHONIOENCODING=encoding)
-    assert (done.returncode, done.stderr) == (0, b"")
-    assert "37.97" in done.stdout.decode(encoding)
+    status, out, said = run_command_line("catalog", "--star", "11767", encoding=encoding)
+    assert (status, said) == (0, "")
+    assert "37.97" in out
 
 
 def test_characters_that_an_encoding_lacks_are_spelled_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,3 +156,36 @@ def test_an_invalid_image_name_is_rejected_before_rendering(arguments: str, tmp_
 )
 def test_nonsensical_arguments_are_rejected_in_one_line(arguments: str, said: str) -> None:
     assert said in refusal(*arguments.split())
+
+
+@pytest.fixture
+def slow_worker(worker: Callable[..., object], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Start workers that fail once there is a file, whose path is returned, and report progress at once."""
+    gate = tmp_path / "gate"
+    waits = f"import pathlib, time\nwhile not pathlib.Path({str(gate)!r}).exists():\n    time.sleep(0.01)\n"
+    worker(WORKER + waits + "send(Failure('no catalogue'))\n")
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(output, "PROGRESS_S", 0.05)
+    return gate
+
+
+@pytest.mark.parametrize("command", [("run", "--can", "off"), ("cache", "warm")])
+def test_a_slow_start_reports_its_progress_on_stderr(
+    command: tuple[str, ...], slow_worker: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled = iter((0, 7))
+
+    def count(_since: float) -> int:
+        try:
+            return next(compiled)
+        except StopIteration:
+            slow_worker.touch()
+            return 7
+
+    monkeypatch.setattr("starid.cache.kernels_written_since", count)
+    status, out, said = run_command_line(*command)
+    assert (status, out) == (2, "")
+    first, second, *_, last = said.splitlines()
+    assert first == "starting: 0 s"
+    assert second == "starting: 0 s, 7 kernels compiled; later starts use them"
+    assert last.endswith("no catalogue")

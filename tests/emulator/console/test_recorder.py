@@ -15,6 +15,7 @@ from tests.emulator.conftest import ORION, PREVIEW
 from tests.emulator.runs import command
 
 WITHIN_S = 20.0
+JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": int, "boolean": bool}
 
 
 def options(path, **more):
@@ -28,6 +29,10 @@ def messages(path):
             found.setdefault(channel.topic, []).append(
                 (schema.name, message.log_time, json.loads(message.data))
             )
+            properties = json.loads(schema.data)["properties"]
+            for name, value in found[channel.topic][-1][2].items():
+                wanted = properties.get(name, {}).get("type")
+                assert wanted is None or isinstance(value, JSON_TYPES[wanted]), (channel.topic, name, value)
         return found
 
 
@@ -113,9 +118,9 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
         run(scenario, options=options(tmp_path / "run.mcap"))
     finally:
         recorder_module.Writer = original
-    said = [record.getMessage() for record in caplog.records if record.name == "starhil.record"]
+    said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(said) == 1
-    assert said[0].endswith("stopped: No space left on device; the run continues")
+    assert "run.mcap: cannot be written (No space left on device); it ends here" in said[0]
 
 
 def test_each_head_has_its_own_file(run, tmp_path):
@@ -128,3 +133,29 @@ def test_each_head_has_its_own_file(run, tmp_path):
     run(scenario, options=options(tmp_path / "run.mcap"), others=[other], **tracking)
     first, second = (messages(tmp_path / name) for name in ("run.mcap", "run.2.mcap"))
     assert len(first["/measurement"]) == len(second["/measurement"]) >= 2
+
+
+@pytest.mark.parametrize("unix_s", [(1 << 64) // 1_000_000, -1_000_000_000, (1 << 63) - 1])
+def test_a_clock_telecommand_does_not_destroy_the_recording(run, tmp_path, caplog, unix_s):
+    path = tmp_path / "run.mcap"
+
+    async def scenario(emulation, _line):
+        await record(emulation)
+        emulation.device.time.set_unix_ns(unix_s * 1_000_000_000)
+        for _ in range(5):
+            await emulation.stepper.step(1.0)
+        command(emulation, "set_mode", mode="standby")
+        emulation.device.time.set_unix_ns(1_800_000_000 * 1_000_000_000)
+        command(emulation, "set_mode", mode="lost_in_space")
+        await emulation.stepper.step(3.0)
+
+    run(scenario, options=options(path))
+    found = messages(path)
+    truths = found["/truth"]
+    times = [at for _, at, _ in truths]
+    assert times == sorted(times)
+    assert times[-1] - times[0] < 20e9  # the run's own time
+    assert [("timestamp" in content) for _, _, content in truths].count(False) >= 4
+    assert truths[-1][2]["timestamp"]["sec"] // 10 == 180_000_000
+    (said,) = [each.getMessage() for each in caplog.records if each.levelname in ("WARNING", "ERROR")]
+    assert "its times are left out" in said

@@ -1,16 +1,21 @@
 """The attitude as the device reports it: with the truth, its validity and its rate."""
 
 import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import pytest
 
 from starhil.emulator.profile import Profile
-from starhil.emulator.truth.source import RateTruth
+from starhil.emulator.truth.source import FixedTruth, RateTruth, TruthState
 from starid.attitude import Attitude
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 F32 = 1e-6
+TUMBLE_STEP_S = 0.05
+WINDOW_RAD = math.radians(0.94)
+"""The tracking window of the default camera: 20 px."""
 
 
 def test_attitude_agrees_with_the_truth_in_every_row(make_bench):
@@ -122,6 +127,55 @@ def test_a_rate_is_never_taken_over_a_gap(make_bench):
     assert (attitude["valid"], attitude["rate_valid"]) == (True, False)
     bench.step(1.0)
     assert bench.read("rates")["rate_y"] == pytest.approx(0.5, abs=1e-4)
+
+
+@dataclass(frozen=True)
+class Tumble:
+    """A body rate of 4 degrees per second whose axis turns by 9.5 degrees per second about z, from a table."""
+
+    kind = "rate"
+
+    @cached_property
+    def _path(self) -> list[Attitude]:
+        path = [ORION]
+        for n in range(int(40.0 / TUMBLE_STEP_S)):
+            phase = np.radians(9.5) * (n + 0.5) * TUMBLE_STEP_S
+            rate = np.radians(4.0) * np.array([np.cos(phase), np.sin(phase), 0.0])
+            path.append(path[-1].rotated(rate * TUMBLE_STEP_S))
+        return path
+
+    def state(self, t_s: float) -> TruthState:
+        return TruthState(self._path[round(t_s / TUMBLE_STEP_S)], np.zeros(3))
+
+
+def reasons(bench, seconds: int) -> list[str]:
+    """The reason of each frame."""
+    seen = []
+    for _ in range(seconds):
+        bench.step(1.0)
+        seen.append(bench.read("precise_attitude")["reason"])
+    return seen
+
+
+def test_one_frame_without_stars_in_a_tumble_costs_no_other(make_bench):
+    bench = make_bench(truth=Tumble()).start()
+    bench.pipeline.window_rad = WINDOW_RAD
+    bench.command("set_mode", mode="lost_in_space")
+    assert set(reasons(bench, 8)) == {"ok"}
+    assert bench.pipeline.frames[-1].predicted_xyzw is not None
+    bench.pipeline.fail = "too_few_stars"
+    assert reasons(bench, 1) == ["too_few_stars"]
+    bench.pipeline.fail = ""
+    assert set(reasons(bench, 20)) == {"ok"}
+    assert bench.pipeline.frames[-1].predicted_xyzw is not None
+
+
+def test_a_jump_marks_no_frame_but_that_which_lost_it(bench):
+    bench.pipeline.window_rad = WINDOW_RAD
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(4.5)
+    bench.device.cycle.truth = FixedTruth(ORION.rotated((0.5, 0.0, 0.0)))
+    assert reasons(bench, 4) == ["prediction_lost", "ok", "ok", "ok"]
 
 
 def test_too_high_a_rate_is_flagged(make_bench):

@@ -217,7 +217,9 @@ def test_a_store_that_cannot_write_refuses_and_is_logged(make_bench, tmp_path, m
     assert bench.command("save_parameters") is ErrorCode.INTERNAL
     assert bench.read("acknowledge")["error"] == "internal"
     assert bench.read("device_status")["parameters_changed"]
-    assert [each.getMessage() for each in caplog.records] == ["state file: cannot be written"]
+    assert [each.getMessage() for each in caplog.records] == [
+        "state file: cannot be written; the run continues and will exit with status 1"
+    ]
     bench.store.close()
 
 

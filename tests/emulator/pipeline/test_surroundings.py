@@ -16,6 +16,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
+from starid.catalog import load_catalog
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 BETELGEUSE = 27989
@@ -65,12 +66,44 @@ def test_the_earth_across_the_field_blinds_the_sensor(pipeline):
     assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("earth",))
 
 
+@pytest.mark.parametrize("off_deg", [0.0, 2.0, 20.5])
+def test_the_sun_in_the_field_blinds_the_sensor(pipeline, off_deg):
+    sun = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg}
+    result = pipeline.handle(replace(REQUEST, faults={"sun": sun}))
+    assert (result.valid, result.reason, result.in_field) == (False, "blinded", ("sun",))
+
+
+def test_the_sun_within_its_exclusion_angle_blinds_the_sensor_unless_the_lens_is_covered(pipeline):
+    def seen(off_deg, **others):
+        sun = {"ra_deg": 83.8, "dec_deg": -1.2 + off_deg, "exclusion_deg": 40.0, "electrons_s": 100.0}
+        return pipeline.handle(replace(REQUEST, faults={"sun": sun, **others}))
+
+    assert (seen(39.0).valid, seen(39.0).reason, seen(39.0).in_field) == (False, "blinded", ("sun",))
+    assert (seen(41.0).valid, seen(41.0).in_field) == (True, ())
+    covered = seen(10.0, blank=True)
+    assert (covered.reason, covered.in_field) == ("too_few_stars", ())
+
+
 def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline):
     for index, predicted in ((10, None), (11, as_quaternion(ORION)), (12, None), (13, as_quaternion(ORION))):
         for cover in ({"blank": True}, {"blocked_share": 1.0}):
             request = replace(REQUEST, index=index, predicted_xyzw=predicted, faults=cover)
             result = pipeline.handle(request)
             assert (result.valid, result.reason, result.matched) == (False, "too_few_stars", 0), cover
+
+
+def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measured_one(pipeline):
+    catalog = load_catalog(epoch=Profile().catalog.epoch)
+    wanted = {int(hip): vector for hip, vector in zip(catalog.hip, catalog.vectors, strict=True)}
+    moved = replace(REQUEST, index=30, observer_velocity=(20_000.0, -20_000.0, 5_000.0))
+    for request in (replace(REQUEST, index=31), moved):
+        result = pipeline.handle(request)
+        measured = np.array([star.vector for star in result.stars])
+        measured = measured @ Attitude(np.array(result.quaternion_xyzw)).matrix
+        modelled = np.array([star.icrs for star in result.stars])
+        assert len(modelled) > 10
+        assert modelled == pytest.approx(np.array([wanted[star.hip] for star in result.stars]), abs=1e-12)
+        assert np.abs(measured - modelled).max() > 1e-6
 
 
 def test_an_image_that_is_saturated_all_over_cannot_be_searched(pipeline):

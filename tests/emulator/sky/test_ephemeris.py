@@ -13,7 +13,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
-from starhil.emulator.sky.light import baffle_passed
+from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import unix_time
@@ -277,7 +277,7 @@ def test_a_sensor_is_blinded_along_its_orbit_where_geometry_predicts(off_sun_deg
     def by_emulator(second: int) -> bool:
         state = orbit.state(NEW_YEAR + second)
         objects = sky.view(NEW_YEAR + second, state.position_m, state.velocity_m_s).objects
-        return baffle_passed(objects, attitude)
+        return bool(through_baffle(objects, attitude))
 
     def by_geometry(second: int) -> bool:
         at = NEW_YEAR + second
@@ -337,6 +337,15 @@ def test_given_bodies_replace_or_change_those_of_the_date():
     assert objects.moon.ra_deg == BY_DATE.view(NEW_YEAR).objects.moon.ra_deg
 
 
+@pytest.mark.parametrize("bodies", ["typed", "ephemeris"])
+def test_a_body_that_a_fault_places_looks_as_in_the_profile(bodies):
+    sky = Sky({"bodies": bodies, "sun": {"exclusion_deg": 40.0, "electrons_s": 7.0}})
+    if bodies == "typed":
+        assert sky.view(NEW_YEAR).objects.sun is None
+    sun = sky.view(NEW_YEAR, faults={"sun": {"ra_deg": 1.0, "dec_deg": 2.0, "electrons_s": 8.0}}).objects.sun
+    assert (sun.ra_deg, sun.dec_deg, sun.exclusion_deg, sun.electrons_s) == (1.0, 2.0, 40.0, 8.0)
+
+
 @pytest.mark.parametrize(
     ("values", "said"),
     [
@@ -345,7 +354,8 @@ def test_given_bodies_replace_or_change_those_of_the_date():
         ({"bodies": "ephemeris", "sun": {"colour": 1}}, "unknown key 'colour'"),
         ({"bodies": "ephemeris", "moon": {"magnitude": -1.0}}, "follows from the date"),
         ({"bodies": "ephemeris", "sun": {"exclusion_deg": 200.0}}, "exclusion_deg"),
-        ({"sun": {"exclusion_deg": 20.0}}, "'dec_deg' is missing"),
+        ({"sun": {"ra_deg": 20.0}}, "'dec_deg' is missing"),
+        ({"sun": {"colour": 1}}, "unknown key 'colour'"),
         ({"earth": {"ra_deg": 0.0, "dec_deg": 0.0, "sun_ra_deg": 1.0}}, "belong together"),
     ],
 )

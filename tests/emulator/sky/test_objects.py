@@ -69,6 +69,21 @@ def test_the_sun_brightens_the_side_where_it_is(renderer: Renderer) -> None:
     assert top - offset > 4.0 * (bottom - offset)
 
 
+@pytest.mark.parametrize("off_deg", [2.0, 20.0])
+def test_the_sun_in_the_field_saturates_the_image(renderer: Renderer, off_deg: float) -> None:
+    frame = renderer.render(ORION, objects=SkyObjects(sun=SunGlare(83.8, -1.2 + off_deg)))
+    assert np.mean(frame.image == renderer.sensor.max_dn) > 0.999  # the rest are dead
+
+
+def test_a_short_exposure_shows_the_disc_of_the_sun(renderer: Renderer) -> None:
+    sun = SunGlare(83.8, -1.2)
+    short = renderer.with_sensor(renderer.sensor.with_(aperture_m=1e-4, transmission=1e-3))
+    image = short.render(ORION, objects=SkyObjects(sun=sun), exposure_s=5e-5).image.astype(np.float64)
+    light = image - short.sensor.offset_dn
+    half_px = np.sqrt(np.count_nonzero(light > 0.5 * np.median(light[466:471, 466:471])) / np.pi)
+    assert half_px == pytest.approx(0.2665 / np.degrees(DEFAULT_CAMERA.pixel_scale_rad), abs=0.5)
+
+
 @pytest.mark.parametrize("electrons_s", [0.0, 2e6])
 def test_the_earth_covers_stars_behind_it(renderer: Renderer, electrons_s: float) -> None:
     earth = EarthLimb(83.8, -70.0, radius_deg=64.0, electrons_s=electrons_s)

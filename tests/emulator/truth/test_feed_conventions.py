@@ -11,6 +11,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 from scipy.spatial.transform import Rotation
 
+from starhil.emulator.launch import RunOptions
 from starhil.emulator.truth.config import MountConfig, TruthConfig
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.feed_rates import FeedError
@@ -194,3 +195,23 @@ def test_an_unconjugated_feed_in_lock_step_is_rejected_in_the_answer(run):
     assert [answer["ok"] for answer in answers] == [True, False, False]
     assert "truth.convention" in answers[1]["error"]
     assert math.isclose(answers[2]["run_time_s"], 0.2)
+
+
+@pytest.mark.parametrize("through", ["truth", "control"])
+def test_a_run_that_ends_within_a_long_step_ends_quietly(run, caplog, through):
+    async def scenario(emulation, _line):
+        if through == "control":
+            address = emulation.ready_fields["control"].removeprefix("unix:")
+            _, writer = await asyncio.open_unix_connection(address)
+            writer.write(b'{"do": "step", "seconds": 86400}\n')
+        else:
+            host, port = emulation.ready_fields["truth"].removeprefix("tcp:").rsplit(":", 1)
+            _, writer = await asyncio.open_connection(host, int(port))
+            writer.write(line(0.0, ORION).encode() + b"\n" + line(80_000.0, ORION).encode() + b"\n")
+        async with asyncio.timeout(20.0):
+            while emulation.clock.now_ns() == 0:
+                await asyncio.sleep(0.0)
+
+    truth = {"kind": "live", "protocol": "tcp", "lockstep": True}
+    run(scenario, truth=truth, options=RunOptions(control="auto"), parameters={"start_mode": "lost_in_space"})
+    assert not [record for record in caplog.records if record.levelname == "ERROR"]

@@ -14,8 +14,11 @@ import pytest
 import serial
 
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports import TransportError, open_serial
-from starhil.protocol.transports.paced import BACKLOG_LIMIT
+from starhil.protocol.transports.base import Statistics
+from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedWriter
+from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 
 
@@ -53,6 +56,49 @@ def test_bytes_leave_no_faster_than_the_bit_rate(kind: str, tmp_path: Path) -> N
                 assert moment - begin >= count * 10 / 115200 - 1e-6
 
     asyncio.run(main())
+
+
+@pytest.mark.parametrize("kind", SERIAL_KINDS)
+def test_a_paced_message_arrives_whole_with_its_last_byte(kind: str, tmp_path: Path) -> None:
+    """As on a UART, there are no gaps within a message, however busy the machine is."""
+
+    async def main() -> None:
+        async with serial_pair(kind, tmp_path, baud=9600) as pair:
+            loop = asyncio.get_running_loop()
+            arrived: list[tuple[float, bytes]] = []
+            pair.two._on_receive = lambda data: arrived.append((loop.time(), data))  # type: ignore[assignment]
+            begin = loop.time()
+            pair.one.send(bytes(60))
+            pair.one.send(bytes(30))
+            await until(lambda: sum(len(data) for _, data in arrived) == 90)
+            assert [len(data) for _, data in arrived] == [60, 30]
+            assert arrived[0][0] - begin >= 60 * 10 / 9600 - 1e-6
+            assert arrived[1][0] - begin >= 90 * 10 / 9600 - 1e-6
+
+    asyncio.run(main())
+
+
+def test_a_paced_message_is_written_at_the_moment_its_last_byte_ends() -> None:
+    async def main(loop: asyncio.AbstractEventLoop) -> None:
+        written: list[tuple[float, int]] = []
+
+        def write(data: bytes) -> int:
+            written.append((loop.time(), len(data)))
+            return len(data)
+
+        writer = PacedWriter(write, PacingSchedule(1000), Statistics())
+        for size in (60, 3):
+            writer.send(bytes(size))
+        await writer.drain()
+        await asyncio.sleep(1.0)
+        writer.send(bytes(10))
+        await writer.drain()
+        assert [size for _, size in written] == [60, 3, 10]
+        assert [moment for moment, _ in written] == pytest.approx([0.60, 0.63, 1.73])
+
+    loop = SimulatedLoop()
+    loop.run_until_complete(main(loop))
+    loop.close()
 
 
 @pytest.mark.parametrize("kind", SERIAL_KINDS)

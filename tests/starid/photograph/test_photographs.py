@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -178,6 +181,12 @@ def test_a_coarser_view_gives_the_same_detections(sky, bits) -> None:
     assert coarse.background == pytest.approx(plain.background, rel=0.01)
     assert coarse.noise == pytest.approx(plain.noise, rel=0.2)
     assert coarse.trail_px == pytest.approx(plain.trail_px, rel=0.1)
+
+
+def test_solving_a_photograph_does_not_wait_for_trees_of_scipy() -> None:
+    code = "import starid.photograph.field_sweep, sys; print(*{'scipy.spatial', 'scipy.sparse'} & {*sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
 
 
 def test_pattern_stars_match_the_plain_rule() -> None:
