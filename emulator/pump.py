@@ -119,7 +119,7 @@ class StepPump:
         self._clock = clock
         self._time_passes = time_passes
         self._imagers = [imager for _, imager in devices]
-        self._transports = transports
+        self._transports = [transport for transport in transports if not transport.immediate]
         self._stalled: dict[Transport[Any], int] = {}
         """Transports for which steps do not wait, with the items sent when the peer stopped reading."""
         self._lock = asyncio.Lock()

@@ -9,7 +9,7 @@ import resource
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from pydantic import TypeAdapter
 
@@ -21,6 +21,7 @@ from starhil.emulator.pipeline.error_model import ErrorModelImager
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import MAX_STEP_S
+from starhil.emulator.replay import prepare_recording
 from starhil.emulator.tape import Recorder
 from starhil.emulator.truth.config import TruthConfig
 from starhil.protocol.can_framing import CanFrame
@@ -44,6 +45,8 @@ class MemoryTransport(Transport[Item]):
     reads
         Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader.
     """
+
+    immediate: ClassVar[bool] = True
 
     def __init__(self, description: str) -> None:
         super().__init__(description)
@@ -141,6 +144,8 @@ class UnitUnderTest:
         Definition of the unit.
     unit
         Its name or folder.
+    links
+        The links to open.
     profile
         Keys of the profile.
     seed
@@ -149,27 +154,24 @@ class UnitUnderTest:
         Folder of the state, best in memory (tmpfs).
     rendered
         Whether images are rendered and solved; otherwise the pipeline is an error model.
-    recorder
-        Records the run until power is switched off.
+    record
+        Folder of a recording, which holds the time since power was last switched on.
 
-    Attributes
-    ----------
-    links
-        Names of the links: `serial`, `can`, `canopen`.
     """
 
     def __init__(
         self,
         icd: InterfaceDefinition,
         unit: str,
+        links: tuple[str, ...],
         profile: Mapping[str, Any],
         seed: int,
         folder: Path,
         *,
         rendered: bool = False,
-        recorder: Recorder | None = None,
+        record: Path | None = None,
     ) -> None:
-        self.links = links_of(icd)
+        self.links = links
         run = {
             **profile.get("run", {}),
             "seed": seed,
@@ -177,10 +179,15 @@ class UnitUnderTest:
             "worker": "thread" if rendered else "error_model",
             "state_dir": str(folder.resolve() / STATE_FOLDER),
         }
-        links = {"canopen": {"node": node_of(icd) if "canopen" in self.links else 0}}
-        self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": links})
+        channels: dict[str, Any] = {
+            "serial": {"port": "auto" if "serial" in links else "off"},
+            "can": {"channel": "auto" if "can" in links or icd.canopen_only else "off"},
+            "canopen": {"node": node_of(icd) if "canopen" in links else 0},
+        }
+        self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
         self._folder = folder
-        self._recorder = recorder
+        self._record = record
+        self._recorder: Recorder | None = None
         self._emulation: Emulation | None = None
         self._faults: Faults | None = None
         self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -204,6 +211,11 @@ class UnitUnderTest:
         }
         for name, transport in self._transports.items():
             transport.reads = reads.get(name, True)
+        if self._record is not None:
+            shutil.rmtree(self._record, ignore_errors=True)
+            prepare_recording(self._record, self.profile, "")
+            self._recorder = Recorder(self._record, SteppedClock())
+            self._recorder.open()
         tape = MemoryTape(self._transports, self._recorder)
         self._emulation = Emulation(self.profile, tape=tape)
         await self._emulation.open()
@@ -214,6 +226,8 @@ class UnitUnderTest:
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
         await self.emulation.close()
+        if self._recorder is not None:
+            self._recorder.close()
         if factory:
             shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
 
@@ -224,16 +238,34 @@ class UnitUnderTest:
         """Simulation time since power was switched on, seconds."""
         return self.emulation.clock.now_ns() / NANOSECONDS
 
-    async def step(self, seconds: float) -> None:
-        """Let simulation time pass, and the same time of the event loop."""
+    async def step(self, seconds: float, *, most: int | None = None) -> None:
+        """Let simulation time pass, and the same time of the event loop.
+
+        Parameters
+        ----------
+        seconds
+            Time.
+        most
+            End early once the unit has taken about this many frames, or sent as many messages.
+        """
         stepper = self.emulation.stepper
         assert stepper is not None
-        left = seconds
+        left, chunk, busy = seconds, seconds if most is None else 1.0, self._activity
         while left > 0.0:
-            chunk = min(left, MAX_STEP_S)
+            chunk = min(left, chunk, MAX_STEP_S)
             await stepper.step(chunk)
+            await asyncio.sleep(chunk)
             left -= chunk
-        await asyncio.sleep(seconds)
+            done = self._activity - busy
+            if most is not None and done >= most:
+                break
+            chunk *= 2.0 if most is None or done < most // 4 else 1.0
+
+    @property
+    def _activity(self) -> int:
+        """Number of exposures and of items on the links, since power was switched on."""
+        sent = max((len(transport.sent) for transport in self._transports.values()), default=0)
+        return self.emulation.device.cycle.index + sent
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
         """Pass bytes or a frame to the device."""
@@ -255,11 +287,16 @@ class UnitUnderTest:
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults, a request as on the control channel."""
         assert self._faults is not None
-        self._faults.inject(FaultRequest.model_validate(dict(fault)))
+        request = FaultRequest.model_validate(dict(fault))
+        if self._recorder is not None:
+            self._recorder.enter("fault", request=request.model_dump(mode="json"))
+        self._faults.inject(request)
 
     def clear_faults(self) -> None:
         """End all faults."""
         assert self._faults is not None
+        if self._recorder is not None:
+            self._recorder.enter("clear_faults")
         self._faults.clear()
 
     def end_pipeline(self) -> None:

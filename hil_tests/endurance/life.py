@@ -36,8 +36,8 @@ Step = dict[str, Any]
 SHORTEST_S: Final = 0.001
 LONGEST_S: Final = 40_000.0
 """Waits are log-uniform between these limits."""
-MOST_FRAMES: Final = 400
-"""Waits are cut so that about this many frames are taken in one of them."""
+MOST_FRAMES: Final = 60
+"""Waits end early once about this many frames have been taken, or messages sent."""
 USUAL_SHARE: Final = 0.75
 """Share of values that are set to their default, so that the unit mostly works."""
 EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
@@ -54,6 +54,8 @@ class Life:
         Name or folder of the unit.
     seed
         Seed of the life and of the noise in it.
+    links
+        The links that are open: `serial`, `can`, `canopen`.
     profile
         Keys of the unit's profile.
     steps
@@ -62,6 +64,7 @@ class Life:
 
     unit: str
     seed: int
+    links: tuple[str, ...]
     profile: dict[str, Any]
     steps: tuple[Step, ...]
 
@@ -71,10 +74,16 @@ def make_life(icd: InterfaceDefinition, unit: str, links: tuple[str, ...], seed:
     random_of_life = random.Random(f"{unit} {seed}")  # noqa: S311 (reproducible, not secret)
     commanded = any(row.action == "set_mode" for row in icd.telecommands.values())
     start_mode = random_of_life.choice(["standby", "lost_in_space"]) if commanded else "lost_in_space"
-    profile: dict[str, Any] = {"parameters": {"start_mode": start_mode}}
-    profile["run"] = {"start_unix_s": float(random_of_life.choice([1_767_225_600, 2**31 - 3600, 4_102_444_800]))}
-    generator = LifeGenerator(icd, links, random_of_life)
-    return Life(unit, seed, profile, tuple(generator.steps(count)))
+    update_rate = round(10.0 ** random_of_life.uniform(-2.0, 1.0), 3)
+    profile: dict[str, Any] = {"parameters": {"start_mode": start_mode, "update_rate": update_rate}}
+    if update_rate > 2.0:
+        profile["parameters"]["exposure"] = 50
+    profile["run"] = {
+        "start_unix_s": float(random_of_life.choice([1_767_225_600, 2**31 - 3600, 4_102_444_800]))
+    }
+    used = tuple(link for link in links if random_of_life.random() < 0.6) or (random_of_life.choice(links),)
+    generator = LifeGenerator(icd, used, random_of_life)
+    return Life(unit, seed, used, profile, tuple(generator.steps(count)))
 
 
 class LifeGenerator:
@@ -90,7 +99,9 @@ class LifeGenerator:
         Source of chance.
     """
 
-    def __init__(self, icd: InterfaceDefinition, links: tuple[str, ...], random_of_life: random.Random) -> None:
+    def __init__(
+        self, icd: InterfaceDefinition, links: tuple[str, ...], random_of_life: random.Random
+    ) -> None:
         self._icd = icd
         self._links = links
         self._random = random_of_life
@@ -160,7 +171,9 @@ class LifeGenerator:
         values = self._values(row)
         for field in row.named_fields.values():
             if field.argument == "mode" and field.enum is not None:
-                wanted = [name for name in ("lost_in_space", "tracking", "standby") if name in field.enum.values]
+                wanted = [
+                    name for name in ("lost_in_space", "tracking", "standby") if name in field.enum.values
+                ]
                 if wanted:
                     values[field.name] = self._random.choice([wanted[0], *wanted])
         return self._request(row, row.encode(values, check=False))
@@ -232,7 +245,11 @@ class LifeGenerator:
                 return self._random.uniform(low, high)
             case _:
                 low_raw, high_raw = field.raw_limits
-                raw = self._random.choice((low_raw, high_raw)) if chance > 0.9 else self._random.randint(low_raw, high_raw)
+                raw = (
+                    self._random.choice((low_raw, high_raw))
+                    if chance > 0.9
+                    else self._random.randint(low_raw, high_raw)
+                )
                 return field.to_physical(raw)
 
     # --- invalid input ---
@@ -271,7 +288,9 @@ class LifeGenerator:
     def _truth(self) -> Step:
         attitude = {
             "ra_deg": self._random.choice([0.0, 359.9999, self._random.uniform(0.0, 360.0)]),
-            "dec_deg": self._random.choice([-90.0, 90.0, math.degrees(math.asin(self._random.uniform(-1.0, 1.0)))]),
+            "dec_deg": self._random.choice(
+                [-90.0, 90.0, math.degrees(math.asin(self._random.uniform(-1.0, 1.0)))]
+            ),
             "roll_deg": self._random.uniform(0.0, 360.0),
         }
         if self._random.random() < 0.6:
@@ -291,7 +310,9 @@ class LifeGenerator:
         for link in sorted(links):
             kinds.append({link: {"drop": self._random.choice([0.1, 1.0])}})
             kinds.append({link: {"corrupt": 0.3, "junk": 0.3}})
-            kinds.append({link: {"delay_s": self._random.uniform(0.0, 3.0), "split": 3 if link == "serial" else 0}})
+            kinds.append(
+                {link: {"delay_s": self._random.uniform(0.0, 3.0), "split": 3 if link == "serial" else 0}}
+            )
         return {"do": "fault", "fault": self._random.choice(kinds)}
 
     def _power(self) -> Step:

@@ -88,6 +88,8 @@ class Oracle:
         self.modes: set[str] = {"boot"}
         self.counts: dict[str, int | None] = {}
         self._boot_count: int | None = None
+        self.attitudes = 0
+        """Number of valid attitudes compared with the truth."""
         self.disk_full = False
         self.stuck = False
         self.disturbed: set[str] = set()
@@ -127,7 +129,9 @@ class Oracle:
         self.values = {**self._defaults, **self._stored}
         self.modes = {"boot"}
         self.counts = {"telecommands": 0, "telemetry": 0}
-        self._boot_count = None if self._boot_count is None or self.disk_full else (self._boot_count + 1) & 0xFFFF
+        self._boot_count = (
+            None if self._boot_count is None or self.disk_full else (self._boot_count + 1) & 0xFFFF
+        )
         self._clock: tuple[float, int] | None = (at_s, self._start_unix_ns)
         self._clock_set_s = at_s
         self._has_imaged = False
@@ -354,7 +358,12 @@ class Oracle:
             if field.kind in ("flag", "integer", "bits", "enum") and flag(value) != flag(expected):
                 raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
         elif isinstance(expected, str) or isinstance(value, str):
-            if isinstance(value, str) and isinstance(expected, str) and not field.aliases and value != expected:
+            if (
+                isinstance(value, str)
+                and isinstance(expected, str)
+                and not field.aliases
+                and value != expected
+            ):
                 raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
         else:
             unit = self._icd.device_parameters[name].unit
@@ -463,21 +472,32 @@ class Oracle:
             raise Violation(f"{row}: a valid attitude in {', '.join(sorted(self.modes))}")
         window_s = self._window_s()
         if self._dark_since is not None and self.now_s > self._dark_since + window_s - STALE_S:
-            raise Violation(f"{row}: a valid attitude {self.now_s - self._dark_since:.3f} s after the lens was covered")
+            raise Violation(
+                f"{row}: a valid attitude {self.now_s - self._dark_since:.3f} s after the lens was covered"
+            )
 
     def _check_error(
-        self, row: str, measured: Quaternion | None, read: Mapping[str, tuple[Field, Value]], tolerance_rad: float
+        self,
+        row: str,
+        measured: Quaternion | None,
+        read: Mapping[str, tuple[Field, Value]],
+        tolerance_rad: float,
     ) -> None:
         window_s = self._window_s()
         if measured is None or math.isinf(window_s):
             return
         stated = [read.get("attitude.sigma_cross"), read.get("attitude.sigma_roll")]
         cross, roll = (
-            (largest if item is None else float(item[1]) * (factor(item[0].unit, "arcsec") or 1.0)) * ARCSEC * SIGMAS
+            (largest if item is None else float(item[1]) * (factor(item[0].unit, "arcsec") or 1.0))
+            * ARCSEC
+            * SIGMAS
             for item, largest in zip(stated, self._sigma_arcsec, strict=True)
         )
         errors = self._errors(measured, window_s)
-        if any(item.cross_rad <= cross + tolerance_rad and abs(item.z) <= roll + tolerance_rad for item in errors):
+        self.attitudes += 1
+        if any(
+            item.cross_rad <= cross + tolerance_rad and abs(item.z) <= roll + tolerance_rad for item in errors
+        ):
             return
         best = min(errors, key=lambda item: item.cross_rad + abs(item.z))
         raise Violation(
@@ -540,13 +560,6 @@ class Oracle:
                 longest = max(longest, period_s)
         self._periods = self._periods[-20:]
         return (STALE_PERIODS + 1) * longest + STALE_S + PROCESSING_S
-
-    def busiest_hz(self) -> float:
-        """Return the number of frames and unsolicited messages per second that the unit may produce."""
-        rates = [self._number("unsolicited_rate")]
-        if self.modes & IMAGING or "boot" in self.modes or "standby" in self.modes:
-            rates.append(self._number("update_rate"))
-        return max(rate if math.isfinite(rate) else 100.0 for rate in rates)
 
 
 def flag(value: Value) -> bool:

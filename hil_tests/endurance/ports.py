@@ -8,12 +8,12 @@ from typing import Any, Final, Protocol
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
-from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, row_transfer
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_interface import SerialStack
 
 HOST: Final = 1
 """CAN address of the OBC."""
@@ -41,8 +41,8 @@ class Port(Protocol):
 class SerialPort:
     """An OBC on a serial line."""
 
-    def __init__(self, icd: InterfaceDefinition, deliver: Deliver, take: Take, dialect: Dialect | None) -> None:
-        self._stack = build_serial_stack(icd)
+    def __init__(self, stack: SerialStack, deliver: Deliver, take: Take, dialect: Dialect | None) -> None:
+        self._stack = stack
         self._deliver, self._take = deliver, take
         self.dialect = dialect
         self._expected: list[tuple[Request, int]] = []
@@ -99,9 +99,11 @@ class CanPort:
 class CanopenPort:
     """A CANopen master that executes each request by SDO transfers."""
 
-    def __init__(self, icd: InterfaceDefinition, deliver: Deliver, take: Take, node: int) -> None:
+    def __init__(
+        self, icd: InterfaceDefinition, dictionary: DeviceDictionary, deliver: Deliver, take: Take, node: int
+    ) -> None:
         self._icd = icd
-        self._dictionary = build_dictionary(icd)
+        self._dictionary = dictionary
         self._deliver, self._take = deliver, take
         self.node = node
         self._answers: list[Reply | LinkFault] = []

@@ -11,6 +11,7 @@ from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle, Violation, fl
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort
 from starhil.hil_tests.endurance.truth import Motion
 from starhil.protocol.can_framing import CanFrame, CanId
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.errors import ProtocolError
@@ -19,6 +20,7 @@ from starhil.protocol.link_schema import FixedFraming
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect
+from starhil.protocol.values import IcdError
 
 TIME_OUT_S: Final = 0.7
 """Silence after which a unit has dropped an incomplete message."""
@@ -37,7 +39,7 @@ class Unit(Protocol):
     def now_s(self) -> float: ...
     async def power_on(self) -> None: ...
     async def power_off(self, *, factory: bool = False) -> None: ...
-    async def step(self, seconds: float) -> None: ...
+    async def step(self, seconds: float, *, most: int | None = None) -> None: ...
     def deliver(self, link: str, item: bytes | CanFrame) -> None: ...
     def take(self, link: str) -> list[Any]: ...
     async def set_truth(self, truth: Mapping[str, Any]) -> None: ...
@@ -96,11 +98,14 @@ class LifeRun:
         self._life = life
         self._icd = icd
         self._unit = unit
-        parameters = life.profile.get("parameters", {})
+        parameters = dict(life.profile.get("parameters", {}))
         start_unix_s = life.profile.get("run", {}).get("start_unix_s", 1_767_225_600.0)
         self._oracle = Oracle(icd, parameters, start_unix_s, sigma_arcsec)
-        self._fixed_framing = icd.link.serial is not None and isinstance(icd.link.serial.framing, FixedFraming)
+        self._fixed_framing = icd.link.serial is not None and isinstance(
+            icd.link.serial.framing, FixedFraming
+        )
         self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
+        self._dictionary = build_dictionary(icd) if icd.canopen is not None else None
         self._ports: dict[str, Port] = {}
         self._not_read: set[str] = set()
         """Links whose peer does not read."""
@@ -136,6 +141,7 @@ class LifeRun:
             self.outcome.violation = str(violation)
             self.outcome.step = number
         finally:
+            self.outcome.attitudes = self._oracle.attitudes
             self.outcome.device_s = self._lived_s + self._unit.now_s
             self._unit.set_disk(full=False)
             await self._unit.power_off()
@@ -148,7 +154,9 @@ class LifeRun:
         if self._unit.queued_events() > QUEUE_LIMIT:
             raise Violation(f"{self._unit.queued_events()} events are queued")
         if self._unit.open_descriptors() > self._descriptors + 4:
-            raise Violation(f"{self._unit.open_descriptors()} descriptors are open, {self._descriptors} at the start")
+            raise Violation(
+                f"{self._unit.open_descriptors()} descriptors are open, {self._descriptors} at the start"
+            )
 
     # --- time and power ---
 
@@ -157,8 +165,8 @@ class LifeRun:
         self._oracle.time_passed(self._unit.now_s)
 
     async def _wait(self, step: Step) -> None:
-        limit_s = MOST_FRAMES / max(self._oracle.busiest_hz(), 1e-3)
-        await self._pass_time(min(step["s"], limit_s))
+        await self._unit.step(step["s"], most=MOST_FRAMES)
+        self._oracle.time_passed(self._unit.now_s)
         for name in self._unit.links:
             self._discard(name)
 
@@ -198,11 +206,18 @@ class LifeRun:
                 return unit.take(link)
 
             if link == "serial":
-                self._ports[link] = SerialPort(self._icd, deliver, take, self._dialect())
+                assert self._stack is not None
+                self._ports[link] = SerialPort(self._stack, deliver, take, self._dialect())
             elif link == "can":
                 self._ports[link] = CanPort(deliver, take, number("can_address", 4))
             else:
-                self._ports[link] = CanopenPort(self._icd, deliver, take, number("canopen_node", 44))
+                self._ports[link] = CanopenPort(
+                    self._icd, self._objects(), deliver, take, number("canopen_node", 44)
+                )
+
+    def _objects(self) -> DeviceDictionary:
+        assert self._dictionary is not None
+        return self._dictionary
 
     def _dialect(self) -> Dialect | None:
         only = chosen_dialect(self._icd, None)
@@ -244,13 +259,10 @@ class LifeRun:
 
     def _in_dictionary(self, row: Row | None, data: bytes) -> bool:
         """Return whether a request can be made by SDO."""
-        from starhil.protocol.canopen.device_dictionary import build_dictionary
-        from starhil.protocol.values import IcdError
-
         if row is None or len(data) != (row.size if row.kind == "telecommand" else 0):
             return False
         try:
-            entries = build_dictionary(self._icd).entries_of(row)
+            entries = self._objects().entries_of(row)
         except IcdError:
             return False
         return row.kind == "telemetry" or len(entries) == 1
@@ -309,7 +321,9 @@ class LifeRun:
         refusable = self._can_refuse(link, request.klass)
         if nack is not None:
             if verdict is ErrorCode.OK:
-                raise Violation(f"{what} {request.data.hex()}: refused with {int(nack.code)}, must be accepted")
+                raise Violation(
+                    f"{what} {request.data.hex()}: refused with {int(nack.code)}, must be accepted"
+                )
             if verdict is not None and not self._same_code(link, nack, verdict):
                 wanted = int(self._icd.error_number(verdict))
                 raise Violation(f"{what} {request.data.hex()}: refused with {int(nack.code)}, not {wanted}")
@@ -320,7 +334,9 @@ class LifeRun:
             if verdict is ErrorCode.OK and any(answer != "echo" for answer in expected):
                 raise Violation(f"{what} {request.data.hex()}: no answer")
             if verdict not in (None, ErrorCode.OK) and refusable and expected and not self._fixed_framing:
-                raise Violation(f"{what} {request.data.hex()}: no answer, must be refused with {verdict.name}")
+                raise Violation(
+                    f"{what} {request.data.hex()}: no answer, must be refused with {verdict.name}"
+                )
             if verdict is None and expected:
                 await self._unknown_outcome(link, request.kind.value)
                 return
@@ -507,7 +523,6 @@ class LifeRun:
         self._oracle.read(row, replies[-1].data)
         if not flag(row.decode(replies[-1].data)[field]):
             raise Violation(f"{row.name}: no valid attitude {RECOVERY_S:g} s after the last fault has ended")
-        self.outcome.attitudes += 1
 
 
 def _text(answer: Reply | LinkFault) -> str:
