@@ -31,7 +31,9 @@ class SimulatedLoop(asyncio.SelectorEventLoop):
         self._simulated = _SimulatedSelector()
         super().__init__(self._simulated)
 
-    def run_in_executor(self, _executor: Any, func: Any, *args: Any) -> Any:
+    def run_in_executor(  # type: ignore[override]  # the types of the arguments belong to the base class
+        self, _executor: Any, func: Any, *args: Any
+    ) -> asyncio.Future[Any]:
         """Call a function now: a thread would take an unknown share of the simulated time."""
         future = self.create_future()
         try:

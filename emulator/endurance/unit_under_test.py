@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import resource
 import shutil
 from collections.abc import Callable, Mapping
@@ -17,10 +16,11 @@ from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
 from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.device.device import Background
 from starhil.emulator.emulation import Emulation
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.error_model import ErrorModelImager
 from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.profile import Profile
-from starhil.emulator.pump import MAX_STEP_S
+from starhil.emulator.pump import MAX_STEP_S, StepPump
 from starhil.emulator.replay import prepare_recording
 from starhil.emulator.tape import Recorder
 from starhil.emulator.truth.config import TruthConfig
@@ -89,12 +89,16 @@ class MemoryTape:
 
     plays: Final = False
 
-    def __init__(self, transports: Mapping[str, MemoryTransport[Any]], recorder: Recorder | None) -> None:
-        self._transports = transports
+    def __init__(
+        self, port: MemorySerial, buses: Mapping[str, MemoryTransport[CanFrame]], recorder: Recorder | None
+    ) -> None:
+        self.port = port
+        self._buses = buses
         self._recorder = recorder
         self.clock: Clock = SteppedClock() if recorder is None else recorder.clock
 
     def begin(self) -> None:
+        """Begin: time passes."""
         if self._recorder is not None:
             self._recorder.begin()
 
@@ -102,25 +106,30 @@ class MemoryTape:
         """Do nothing: the clock is stepped."""
 
     def write(self, kind: str, **values: Any) -> None:
+        """Record an entry."""
         if self._recorder is not None:
             self._recorder.write(kind, **values)
 
     def enter(self, kind: str, **values: Any) -> None:
+        """Record an entry."""
         self.write(kind, **values)
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
-        port = self._transports["serial"]
-        assert isinstance(port, MemorySerial)
+        """Return the serial line."""
+        port = self.port
         return port if self._recorder is None else self._recorder.serial(lambda: port)
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (no bus is opened)
-        bus = self._transports[name]
+        """Return a CAN bus."""
+        bus = self._buses[name]
         return bus if self._recorder is None else self._recorder.can(name, lambda: bus)
 
     def imager(self, inner: Imager) -> Imager:
+        """Return the pipeline."""
         return inner if self._recorder is None else self._recorder.imager(inner)
 
     def background(self, inner: Background) -> Background:
+        """Return the function that runs writes."""
         return inner if self._recorder is None else self._recorder.background(inner)
 
 
@@ -132,6 +141,7 @@ class _InternalErrors(logging.Handler):
         self.texts: list[str] = []
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Keep a message."""
         self.texts.append(record.getMessage())
 
 
@@ -198,17 +208,27 @@ class UnitUnderTest:
     @property
     def emulation(self) -> Emulation:
         """The emulation; power must be on."""
-        assert self._emulation is not None
+        if self._emulation is None:
+            raise EmulatorError("endurance: power is off")
         return self._emulation
+
+    @property
+    def faults(self) -> Faults:
+        """The faults of the unit; power must be on."""
+        if self._faults is None:
+            raise EmulatorError("endurance: power is off")
+        return self._faults
 
     # --- power ---
 
     async def power_on(self) -> None:
         """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
         reads = {name: transport.reads for name, transport in self._transports.items()}
-        self._transports = {
-            name: MemorySerial("serial") if name == "serial" else MemoryTransport(name) for name in self.links
+        port = MemorySerial("serial")
+        buses: dict[str, MemoryTransport[CanFrame]] = {
+            name: MemoryTransport(name) for name in ("can", "canopen")
         }
+        self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():
             transport.reads = reads.get(name, True)
         if self._record is not None:
@@ -216,7 +236,7 @@ class UnitUnderTest:
             prepare_recording(self._record, self.profile, "")
             self._recorder = Recorder(self._record, SteppedClock())
             self._recorder.open()
-        tape = MemoryTape(self._transports, self._recorder)
+        tape = MemoryTape(port, buses, self._recorder)
         self._emulation = Emulation(self.profile, tape=tape)
         await self._emulation.open()
         self._faults = Faults(self._emulation.device, self._emulation.links)
@@ -226,8 +246,8 @@ class UnitUnderTest:
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
         await self.emulation.close()
-        if self._recorder is not None:
-            self._recorder.close()
+        if self._recorder is not None and self._recorder.file is not None:
+            self._recorder.file.close()
         if factory:
             shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
 
@@ -248,8 +268,7 @@ class UnitUnderTest:
         most
             End early once the unit has taken about this many frames, or sent as many messages.
         """
-        stepper = self.emulation.stepper
-        assert stepper is not None
+        stepper = self._stepper
         left, chunk, busy = seconds, seconds if most is None else 1.0, self._activity
         while left > 0.0:
             chunk = min(left, chunk, MAX_STEP_S)
@@ -260,6 +279,13 @@ class UnitUnderTest:
             if most is not None and done >= most:
                 break
             chunk *= 2.0 if most is None or done < most // 4 else 1.0
+
+    @property
+    def _stepper(self) -> StepPump:
+        stepper = self.emulation.stepper
+        if stepper is None:
+            raise EmulatorError("endurance: the clock is not stepped")
+        return stepper
 
     @property
     def _activity(self) -> int:
@@ -286,18 +312,16 @@ class UnitUnderTest:
 
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults, a request as on the control channel."""
-        assert self._faults is not None
         request = FaultRequest.model_validate(dict(fault))
         if self._recorder is not None:
             self._recorder.enter("fault", request=request.model_dump(mode="json"))
-        self._faults.inject(request)
+        self.faults.inject(request)
 
     def clear_faults(self) -> None:
         """End all faults."""
-        assert self._faults is not None
         if self._recorder is not None:
             self._recorder.enter("clear_faults")
-        self._faults.clear()
+        self.faults.clear()
 
     def end_pipeline(self) -> None:
         """End the image pipeline, as the death of its process does."""
@@ -323,7 +347,7 @@ class UnitUnderTest:
 
     def open_descriptors(self) -> int:
         """Return the number of open file descriptors of this process."""
-        return len(os.listdir("/proc/self/fd"))
+        return len(list(Path("/proc/self/fd").iterdir()))
 
     def queued_events(self) -> int:
         """Return the number of events in the queue of the device."""

@@ -146,7 +146,8 @@ class ErrorModelImager:
         faintest = min(reach, settings.limiting_magnitude)
         share = self._camera.width * self._camera.height / focal_px**2 / (4.0 * math.pi)
         seen = 1.0 - float(request.faults.get("blocked_share", 0.0))
-        return STARS_TO_V6 * 10.0 ** (0.5 * (faintest - 6.0)) * min(share, 1.0) * seen
+        density = STARS_TO_V6 * math.pow(10.0, 0.5 * (faintest - 6.0))
+        return density * min(share, 1.0) * seen
 
     def _failure(self, request: FrameRequest, matched: int) -> str:
         """Return the reason why a frame cannot be solved, or an empty text."""
@@ -175,7 +176,8 @@ class ErrorModelImager:
         true_radial = true_focal * (1.0 + k1 * edge**2 + k2 * edge**4)
         tangential = true_focal * math.hypot(settings.p1 - p1, settings.p2 - p2) * edge**2
         # a shift of the centre is nearly a rotation; what remains is its projection
-        return abs(radial - true_radial) * edge + 3.0 * tangential + turn * edge**2
+        error_px: float = abs(radial - true_radial) * edge + 3.0 * tangential + turn * edge**2
+        return error_px
 
 
 def turned(attitude: Quaternion, turn_rad: list[float]) -> Quaternion:

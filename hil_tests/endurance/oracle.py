@@ -10,18 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.truth import (
-    IDENTITY,
-    Error,
-    Motion,
-    Quaternion,
-    conjugate,
-    frame_turned,
-    of_matrix,
-    product,
-)
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
+from starhil.hil_tests.endurance.truth import Motion
+from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.device_model import PARAMETER
 from starhil.protocol.icd import InterfaceDefinition
@@ -29,27 +23,12 @@ from starhil.protocol.messages import ErrorCode
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import MessageError, Value
 
-SIGMAS: Final = 6.0
-"""A valid attitude is within this many of its stated standard deviations of the truth."""
 BOOT_S: Final = 0.6
 """Longest boot of the profile of a run."""
-PROCESSING_S: Final = 1.0
-"""Longest time from the end of an exposure to its result."""
-STALE_PERIODS: Final = 3
-STALE_S: Final = 2.0
-"""An attitude is not reported longer than `STALE_PERIODS` update periods and `STALE_S` after its exposure."""
 RECOVERY_S: Final = 15.0
 """Longest time from the end of the last fault to a valid attitude, with default parameters."""
 IMAGING: Final = frozenset({"lost_in_space", "tracking"})
-ARCSEC: Final = math.radians(1.0 / 3600.0)
 SECOND_NS: Final = 1_000_000_000
-
-Known = tuple[Value, float]
-"""A value and its tolerance."""
-
-
-class Violation(Exception):  # noqa: N818 (what it is called)
-    """Something that a unit must never do."""
 
 
 class Oracle:
@@ -76,7 +55,6 @@ class Oracle:
     ) -> None:
         self._icd = icd
         self._start_unix_ns = round(start_unix_s * SECOND_NS)
-        self._sigma_arcsec = sigma_arcsec
         calibrated = {"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"}
         self._defaults: dict[str, Known | None] = {
             name: None if name in calibrated else (parameter.default, 1e-9)
@@ -88,23 +66,46 @@ class Oracle:
         self.modes: set[str] = {"boot"}
         self.counts: dict[str, int | None] = {}
         self._boot_count: int | None = None
-        self.attitudes = 0
-        """Number of valid attitudes compared with the truth."""
+        self.attitudes: Final = AttitudeJudge(icd.conventions, sigma_arcsec)
         self.disk_full = False
         self.stuck = False
         self.disturbed: set[str] = set()
         """Links on which answers may be lost, late or damaged."""
         self.bursts = False
         """Whether packets of a file may arrive."""
-        self._dark_since: float | None = None
         self.now_s = 0.0
-        self._motions: list[Motion] = []
-        self._periods: list[tuple[float, float]] = []
         self._has_imaged = False
         self._frames: int | None = None
         self._selected: int | None = None
         self._last: tuple[int, ErrorCode] | None = None
-        self._turn_cache: tuple[tuple[float, ...], Quaternion] = ((), IDENTITY)
+        self._effects: dict[str, Callable[[Row, Mapping[str, Any]], None]] = {
+            "set_parameters": self._parameters_set,
+            "set_parameter": self._parameter_set,
+            "select_parameter": self._parameter_selected,
+            "select_unsolicited": self._unsolicited_selected,
+            "save_parameters": self._parameters_saved,
+            "restore_parameters": self._parameters_restored,
+            "default_parameters": self._defaults_set,
+            "clear_counters": self._counters_cleared,
+            "set_clock": self._clock_changed,
+            "set_mode": self._mode_commanded,
+            "start_burst": self._burst_started,
+        }
+        self._checks: dict[str, Callable[[str, Field, Value], None]] = {
+            "mode": self._check_mode,
+            "counters.telecommands": partial(self._check_count, "telecommands"),
+            "counters.telemetry": partial(self._check_count, "telemetry"),
+            "counters.requests": self._check_requests,
+            "clock.unix": partial(self._check_clock, 1.0, 2**32),
+            "clock.seconds": partial(self._check_clock, 1.0, 2**32),
+            "clock.milliseconds": partial(self._check_clock, 1e3, 1),
+            "uptime": self._check_uptime,
+            "uptime.seconds": self._check_uptime,
+            "boot.count": self._check_boot_count,
+            "frame.counter": self._check_frames,
+            "selected.id": self._check_selected,
+            "request.last": self._check_last,
+        }
         self._start(0.0)
 
     # --- what happens to the unit ---
@@ -116,8 +117,8 @@ class Oracle:
         self.now_s = 0.0
         self.stuck = False
         self.disturbed.clear()
-        self._dark_since = None
-        self._motions = [motion]
+        self.attitudes.dark_since_s = None
+        self.attitudes.motions = [motion]
         self._start(0.0)
 
     def restarted(self) -> None:
@@ -139,7 +140,7 @@ class Oracle:
         self._selected = next(iter(self._icd.parameters_by_id), None)
         self._last = None
         self.bursts = False
-        self._periods = [(at_s, self._period_s())]
+        self.attitudes.started(at_s, self.values)
 
     def time_passed(self, now_s: float) -> None:
         """Simulation time has passed."""
@@ -156,7 +157,7 @@ class Oracle:
 
     def moved(self, motion: Motion) -> None:
         """The truth was replaced, now."""
-        self._motions.append(motion)
+        self.attitudes.motions.append(motion)
 
     def failed(self) -> None:
         """The unit must be in the error mode, now."""
@@ -169,9 +170,9 @@ class Oracle:
     def covered(self, *, fully: bool) -> None:
         """The lens was covered, now, or is not fully covered any more."""
         if not fully:
-            self._dark_since = None
-        elif self._dark_since is None:
-            self._dark_since = self.now_s
+            self.attitudes.dark_since_s = None
+        elif self.attitudes.dark_since_s is None:
+            self.attitudes.dark_since_s = self.now_s
 
     def forget(self) -> None:
         """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
@@ -181,7 +182,7 @@ class Oracle:
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
         self.modes = {"boot", "standby", "error", *IMAGING}
         self.bursts = True
-        self._periods = [(self.now_s, math.inf)]
+        self.attitudes.retimed(self.now_s, self.values)
 
     # --- requests ---
 
@@ -219,12 +220,7 @@ class Oracle:
                 return None
 
     def _mode_verdict(self, wanted: str) -> ErrorCode | None:
-        allowed = {
-            "boot": set(),
-            "error": {"standby"},
-            **dict.fromkeys(("standby", *IMAGING), {"standby", *IMAGING}),
-        }
-        votes = {wanted in allowed[mode] for mode in self.modes}
+        votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
         if votes == {False} or (wanted == "tracking" and not self._has_imaged):
             return ErrorCode.SEQUENCE
         certain = votes == {True} and wanted != "tracking" and "error" not in self.modes
@@ -251,21 +247,21 @@ class Oracle:
         if row is None or code is not ErrorCode.OK:
             return
         arguments = _by_argument(row, row.decode(data))
-        effect = _EFFECTS.get(row.action or "nothing")
-        if effect is None:
+        action = row.action or "nothing"
+        if action in self._effects:
+            self._effects[action](row, arguments)
+        elif action not in _WITHOUT_EFFECT:
             self.forget()
-        else:
-            effect(self, row, arguments)
 
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
         if changes.keys() & _BOUND:
-            self._periods.append((self.now_s, self._period_s()))
+            self.attitudes.retimed(self.now_s, self.values)
 
     def _parameters_set(self, row: Row, arguments: Mapping[str, Any]) -> None:
         self._set(
             {
-                field.parameter: (arguments[field.name], _resolution(field))
+                field.parameter: (arguments[field.name], resolution(field))
                 for field in row.named_fields.values()
                 if field.parameter is not None
             }
@@ -309,9 +305,6 @@ class Oracle:
         self.modes = set(IMAGING) if wanted in IMAGING else {wanted}
         self._has_imaged = self._has_imaged or wanted in IMAGING
 
-    def _unchanged(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        """The state that the oracle knows stays as it is."""
-
     def _burst_started(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
         self.bursts = True
 
@@ -342,16 +335,17 @@ class Oracle:
             where = f"{row.name}.{field.name}"
             if quantity.startswith(PARAMETER):
                 self._check_parameter(where, field, value, quantity.removeprefix(PARAMETER))
-            elif (check := _CHECKS.get(quantity)) is not None:
-                check(self, where, field, value)
+            elif quantity in self._checks:
+                self._checks[quantity](where, field, value)
         if "attitude.valid" in by_quantity:
-            self._check_attitude(row.name, by_quantity)
+            imaging = bool(self.modes & IMAGING)
+            self.attitudes.judge(row.name, by_quantity, self.now_s, self.values, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
         known = self.values[name]
         if known is None:
             if not field.aliases and not (field.kind == "enum" and not isinstance(value, str)):
-                self.values[name] = (value, _resolution(field))
+                self.values[name] = (value, resolution(field))
             return
         expected, tolerance = known
         if isinstance(expected, bool) or isinstance(value, bool):
@@ -382,7 +376,7 @@ class Oracle:
             off = abs((float(value) - expected + 0.5 * span) % span - 0.5 * span)
         else:
             off = abs(float(value) - min(max(expected, low), high))
-        if off > tolerance + _resolution(field) + 1.2e-7 * abs(expected) * (field.kind == "float"):
+        if off > tolerance + resolution(field) + 1.2e-7 * abs(expected) * (field.kind == "float"):
             raise Violation(f"{where}: {value!r}, not {expected!r}")
 
     def _check_mode(self, where: str, field: Field, value: Value) -> None:
@@ -392,40 +386,30 @@ class Oracle:
             raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
         self.modes = set(IMAGING) if value in IMAGING else {value}
 
-    def _check_count(self, name: str) -> Callable[[str, Field, Value], None]:
-        def check(where: str, field: Field, value: Value) -> None:
-            known = self.counts[name]
-            if known is not None:
-                self._expect(where, field, value, known)
-            elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
-                self.counts[name] = value
-
-        return check
+    def _check_count(self, name: str, where: str, field: Field, value: Value) -> None:
+        known = self.counts[name]
+        if known is not None:
+            self._expect(where, field, value, known)
+        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
+            self.counts[name] = value
 
     def _check_requests(self, where: str, field: Field, value: Value) -> None:
         telecommands, telemetry = self.counts["telecommands"], self.counts["telemetry"]
         if telecommands is not None and telemetry is not None:
             self._expect(where, field, value, telecommands + telemetry)
 
-    def _check_clock(self, scale: float, *, modulo: float = math.inf) -> Callable[[str, Field, Value], None]:
-        def check(where: str, field: Field, value: Value) -> None:
-            if self._clock is None:
-                return
-            since_s, unix_ns = self._clock
-            now_ns = self._icd.conventions.reported_ns(unix_ns + round((self.now_s - since_s) * SECOND_NS))
-            expected = now_ns % (2**32 * SECOND_NS if modulo == math.inf else SECOND_NS) / SECOND_NS
-            whole = math.floor(expected * scale + 1e-6) if field.kind != "float" else expected * scale
-            self._expect(where, field, value, whole, 1.0 if field.kind != "float" else 1e-6 * scale)
+    def _check_clock(self, scale: float, modulo_s: int, where: str, field: Field, value: Value) -> None:
+        if self._clock is None:
+            return
+        since_s, unix_ns = self._clock
+        now_ns = self._icd.conventions.reported_ns(unix_ns + round((self.now_s - since_s) * SECOND_NS))
+        expected = now_ns % (modulo_s * SECOND_NS) / SECOND_NS * scale
+        self._expect(where, field, value, expected, 1.0 if field.kind != "float" else 1e-6 * scale)
 
-        return check
-
-    def _check_uptime(self, scale: float) -> Callable[[str, Field, Value], None]:
-        def check(where: str, field: Field, value: Value) -> None:
-            if self._started_s is not None:
-                uptime_s = self.now_s - self._started_s
-                self._expect(where, field, value, uptime_s * scale, 1.01 + 1e-6 * scale)
-
-        return check
+    def _check_uptime(self, where: str, field: Field, value: Value) -> None:
+        if self._started_s is not None:
+            uptime_s = self.now_s - self._started_s
+            self._expect(where, field, value, uptime_s * (factor("s", field.unit) or 1.0), 1.01)
 
     def _check_boot_count(self, where: str, field: Field, value: Value) -> None:
         if self._boot_count is not None:
@@ -447,125 +431,6 @@ class Oracle:
         if self._last is not None:
             self._expect(where, field, value, self._last[0])
 
-    # --- attitude ---
-
-    def _check_attitude(self, row: str, read: Mapping[str, tuple[Field, Value]]) -> None:
-        four = [read.get(f"attitude.{letter}") for letter in "xyzw"]
-        valid = flag(read["attitude.valid"][1])
-        numbers = [0.0 if item is None else float(item[1]) for item in four if not isinstance(item, str)]
-        if not valid:
-            if any(item is not None and abs(float(item[1])) > _resolution(item[0]) for item in four):
-                raise Violation(f"{row}: quaternion {numbers} though the attitude is invalid")
-            return
-        self._check_may_be_valid(row)
-        if any(item is None for item in four):
-            return
-        resolution = max(_resolution(item[0]) for item in four if item is not None) + 1e-7
-        length = math.sqrt(sum(number * number for number in numbers))
-        if abs(length - 1.0) > 4.0 * resolution:
-            raise Violation(f"{row}: the quaternion has length {length!r}")
-        x, y, z, w = (number / length for number in numbers)
-        self._check_error(row, self._to_sensor((x, y, z, w)), read, 4.0 * resolution)
-
-    def _check_may_be_valid(self, row: str) -> None:
-        if not self.modes & IMAGING:
-            raise Violation(f"{row}: a valid attitude in {', '.join(sorted(self.modes))}")
-        window_s = self._window_s()
-        if self._dark_since is not None and self.now_s > self._dark_since + window_s - STALE_S:
-            raise Violation(
-                f"{row}: a valid attitude {self.now_s - self._dark_since:.3f} s after the lens was covered"
-            )
-
-    def _check_error(
-        self,
-        row: str,
-        measured: Quaternion | None,
-        read: Mapping[str, tuple[Field, Value]],
-        tolerance_rad: float,
-    ) -> None:
-        window_s = self._window_s()
-        if measured is None or math.isinf(window_s):
-            return
-        stated = [read.get("attitude.sigma_cross"), read.get("attitude.sigma_roll")]
-        cross, roll = (
-            (largest if item is None else float(item[1]) * (factor(item[0].unit, "arcsec") or 1.0))
-            * ARCSEC
-            * SIGMAS
-            for item, largest in zip(stated, self._sigma_arcsec, strict=True)
-        )
-        errors = self._errors(measured, window_s)
-        self.attitudes += 1
-        if any(
-            item.cross_rad <= cross + tolerance_rad and abs(item.z) <= roll + tolerance_rad for item in errors
-        ):
-            return
-        best = min(errors, key=lambda item: item.cross_rad + abs(item.z))
-        raise Violation(
-            f"{row}: a valid attitude {best.cross_rad / ARCSEC:.2f} arcsec across and {abs(best.z) / ARCSEC:.2f} about "
-            f"the boresight from the truth; {SIGMAS:g} sigma are {cross / ARCSEC:.2f} and {roll / ARCSEC:.2f}"
-        )
-
-    def _errors(self, measured: Quaternion, window_s: float) -> list[Error]:
-        """Return the errors to the truth at the times at which the exposure may have been."""
-        errors: list[Error] = []
-        begin_s = self.now_s - window_s
-        for number, motion in enumerate(self._motions):
-            later = self._motions[number + 1].start_s if number + 1 < len(self._motions) else self.now_s
-            if later < begin_s:
-                continue
-            start_s, end_s = max(begin_s, motion.start_s), max(min(later, self.now_s), motion.start_s)
-            turn_rad = motion.speed_rad_s * (end_s - start_s)
-            count = 1 + min(5000, math.ceil(turn_rad / 0.02))
-            slack_s = 0.5 * (end_s - start_s) / count + 1e-3
-            for step in range(count):
-                mid_s = start_s + (step + 0.5) * (end_s - start_s) / count
-                errors.append(Error.between(measured, motion.at(mid_s)).along(motion.rate_rad_s, slack_s))
-        return errors
-
-    def _to_sensor(self, reported: Quaternion) -> Quaternion | None:
-        """Return a reported attitude in the sensor frame; None if the mounting is not known."""
-        conventions = self._icd.conventions
-        if conventions.quaternion == "attitude":
-            reported = conjugate(reported)
-        angles = [self.values[f"mounting_{name}"] for name in ("alpha", "beta", "gamma")]
-        if any(angle is None for angle in angles):
-            return None
-        numbers = tuple(float(angle[0]) for angle in angles if angle is not None)
-        if self._turn_cache[0] != numbers:
-            turn = IDENTITY
-            for axis, angle in enumerate(numbers):
-                unit = [float(index == axis) for index in range(3)]
-                turn = product(frame_turned(unit, math.radians(angle)), turn)
-            self._turn_cache = (numbers, product(of_matrix(conventions.rows), turn))
-        return product(conjugate(self._turn_cache[1]), reported)
-
-    # --- times ---
-
-    def _number(self, name: str) -> float:
-        known = self.values.get(name)
-        return math.inf if known is None else float(known[0])
-
-    def _period_s(self) -> float:
-        """Return the time between exposures with the present parameters; infinite if they are not known."""
-        rate = self._number("update_rate")
-        exposure_s = (self._number("exposure") + self._number("delay_time")) / 1000.0
-        return math.inf if math.isinf(rate) else max(1.0 / rate, exposure_s)
-
-    def _window_s(self) -> float:
-        """Return the largest age that a valid attitude may have now."""
-        longest = self._period_s()
-        for number, (_, period_s) in enumerate(self._periods):
-            until = self._periods[number + 1][0] if number + 1 < len(self._periods) else self.now_s
-            if self.now_s - until <= (STALE_PERIODS + 1) * period_s + STALE_S + PROCESSING_S:
-                longest = max(longest, period_s)
-        self._periods = self._periods[-20:]
-        return (STALE_PERIODS + 1) * longest + STALE_S + PROCESSING_S
-
-
-def flag(value: Value) -> bool:
-    """Return a truth value that may have been sent as a member of an enumeration."""
-    return value == "true" if isinstance(value, str) else bool(value)
-
 
 def _by_argument(row: Row, values: Mapping[str, Value]) -> dict[str, Any]:
     """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
@@ -578,57 +443,29 @@ def _by_argument(row: Row, values: Mapping[str, Value]) -> dict[str, Any]:
     return found
 
 
-def _resolution(field: Field) -> float:
-    """Return the largest difference between a value and what its field carries of it."""
-    if field.kind == "float":
-        return 1e-9 * abs(field.scale)
-    return 0.51 * abs(field.scale)
-
-
+_RUNNING: Final = frozenset({"standby", *IMAGING})
+_COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
+"""Modes that can be commanded from a mode; `_RUNNING` from all others."""
 _BOUND: Final = frozenset({"update_rate", "exposure", "delay_time"})
 """Parameters that bound each other."""
 _COUNTER: Final = {"telecommand": "telecommands", "telemetry": "telemetry"}
+_WITHOUT_EFFECT: Final = frozenset(
+    [
+        "nothing",
+        "reset",
+        "subscribe",
+        "save_image",
+        "open_image",
+        "load_image_chunk",
+        "load_file_block",
+        "set_hole_map",
+    ]
+)
+"""Actions that leave what the oracle knows as it is."""
 _TIME_UNITS: Final = {
     "unix": "s",
     "seconds": "s",
     "milliseconds": "ms",
     "microseconds": "us",
     "nanoseconds": "ns",
-}
-
-_EFFECTS: Final[dict[str, Callable[[Oracle, Row, Mapping[str, Any]], None]]] = {
-    "set_parameters": Oracle._parameters_set,
-    "set_parameter": Oracle._parameter_set,
-    "select_parameter": Oracle._parameter_selected,
-    "select_unsolicited": Oracle._unsolicited_selected,
-    "save_parameters": Oracle._parameters_saved,
-    "restore_parameters": Oracle._parameters_restored,
-    "default_parameters": Oracle._defaults_set,
-    "clear_counters": Oracle._counters_cleared,
-    "set_clock": Oracle._clock_changed,
-    "set_mode": Oracle._mode_commanded,
-    "start_burst": Oracle._burst_started,
-    **dict.fromkeys(
-        (
-            "nothing", "reset", "subscribe", "save_image", "open_image", "load_image_chunk", "load_file_block",
-            "set_hole_map",
-        ),
-        Oracle._unchanged,
-    ),
-}  # fmt: skip
-
-_CHECKS: Final[dict[str, Callable[[Oracle, str, Field, Value], None]]] = {
-    "mode": Oracle._check_mode,
-    "counters.telecommands": lambda oracle, *read: oracle._check_count("telecommands")(*read),
-    "counters.telemetry": lambda oracle, *read: oracle._check_count("telemetry")(*read),
-    "counters.requests": Oracle._check_requests,
-    "clock.unix": lambda oracle, *read: oracle._check_clock(1.0)(*read),
-    "clock.seconds": lambda oracle, *read: oracle._check_clock(1.0)(*read),
-    "clock.milliseconds": lambda oracle, *read: oracle._check_clock(1e3, modulo=1.0)(*read),
-    "uptime": lambda oracle, *read: oracle._check_uptime(1.0)(*read),
-    "uptime.seconds": lambda oracle, *read: oracle._check_uptime(1.0)(*read),
-    "boot.count": Oracle._check_boot_count,
-    "frame.counter": Oracle._check_frames,
-    "selected.id": Oracle._check_selected,
-    "request.last": Oracle._check_last,
 }

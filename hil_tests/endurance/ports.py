@@ -49,16 +49,19 @@ class SerialPort:
         self.reset()
 
     def reset(self) -> None:
+        """Forget what is incomplete."""
         self._receiver = self._stack.host(self.dialect)
         self._expected.clear()
 
     def ask(self, request: Request, reply_size: int, now_s: float) -> None:  # noqa: ARG002 (the same for all)
+        """Send a request."""
         self._expected.append((request, reply_size))
         if len(self._expected) == 1:
             self._receiver.expect(request, reply_size)
         self._deliver(self._stack.encode_request(request))
 
     def answers(self, now_s: float) -> list[Reply | LinkFault]:
+        """Return what has arrived."""
         found: list[Reply | LinkFault] = []
         for chunk in self._take():
             # byte by byte, because each reply determines what is expected next
@@ -86,13 +89,16 @@ class CanPort:
         self.reset()
 
     def reset(self) -> None:
+        """Forget what is incomplete."""
         self._receiver = CanHostReceiver(HOST, self.device)
 
     def ask(self, request: Request, reply_size: int, now_s: float) -> None:  # noqa: ARG002 (the same for all)
+        """Send a request."""
         for frame in encode_request_frames(request, HOST, self.device):
             self._deliver(frame)
 
     def answers(self, now_s: float) -> list[Reply | LinkFault]:
+        """Return what has arrived."""
         return [event for frame in self._take() for event in self._receiver.feed(frame, now_s)]
 
 
@@ -109,6 +115,7 @@ class CanopenPort:
         self._answers: list[Reply | LinkFault] = []
 
     def reset(self) -> None:
+        """Forget what is incomplete."""
         self._answers.clear()
 
     def ask(self, request: Request, reply_size: int, now_s: float) -> None:  # noqa: ARG002 (the same for all)
@@ -135,6 +142,7 @@ class CanopenPort:
         return responses[0].data.ljust(8, b"\0") if responses else None
 
     def answers(self, now_s: float) -> list[Reply | LinkFault]:  # noqa: ARG002 (the same for all)
+        """Return the answers to the requests since the last call."""
         found, self._answers = self._answers, []
         return found
 

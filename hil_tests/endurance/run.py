@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 from starhil.hil_tests.endurance.life import MOST_FRAMES, Life, Step
-from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle, Violation, flag
+from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort
 from starhil.hil_tests.endurance.truth import Motion
+from starhil.hil_tests.endurance.violation import Violation, flag
+from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanFrame, CanId
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.codec import Row
@@ -31,26 +33,71 @@ ORION: Final = {"kind": "fixed", "attitude": {"ra_deg": 83.8, "dec_deg": -1.2, "
 
 
 class Unit(Protocol):
-    """A unit with its surroundings; see `starhil.emulator.endurance.unit_under_test`."""
+    """A unit with its power and surroundings, in simulated time."""
 
     links: tuple[str, ...]
+    """Names of the open links."""
 
     @property
-    def now_s(self) -> float: ...
-    async def power_on(self) -> None: ...
-    async def power_off(self, *, factory: bool = False) -> None: ...
-    async def step(self, seconds: float, *, most: int | None = None) -> None: ...
-    def deliver(self, link: str, item: bytes | CanFrame) -> None: ...
-    def take(self, link: str) -> list[Any]: ...
-    async def set_truth(self, truth: Mapping[str, Any]) -> None: ...
-    def fault(self, fault: Mapping[str, Any]) -> None: ...
-    def clear_faults(self) -> None: ...
-    def end_pipeline(self) -> None: ...
-    def set_disk(self, *, full: bool) -> None: ...
-    def set_peer(self, link: str, *, reads: bool) -> None: ...
-    def internal_errors(self) -> list[str]: ...
-    def open_descriptors(self) -> int: ...
-    def queued_events(self) -> int: ...
+    def now_s(self) -> float:
+        """Simulation time since power was switched on, seconds."""
+        ...
+
+    async def power_on(self) -> None:
+        """Switch the unit on."""
+        ...
+
+    async def power_off(self, *, factory: bool = False) -> None:
+        """Switch the unit off; `factory` deletes its stored state."""
+        ...
+
+    async def step(self, seconds: float, *, most: int | None = None) -> None:
+        """Let time pass, or less once about `most` frames have been taken."""
+        ...
+
+    def deliver(self, link: str, item: bytes | CanFrame) -> None:
+        """Pass bytes or a frame to the unit."""
+        ...
+
+    def take(self, link: str) -> list[Any]:
+        """Return what the unit has sent."""
+        ...
+
+    async def set_truth(self, truth: Mapping[str, Any]) -> None:
+        """Replace the truth."""
+        ...
+
+    def fault(self, fault: Mapping[str, Any]) -> None:
+        """Inject faults."""
+        ...
+
+    def clear_faults(self) -> None:
+        """End all faults."""
+        ...
+
+    def end_pipeline(self) -> None:
+        """End the image pipeline unexpectedly."""
+        ...
+
+    def set_disk(self, *, full: bool) -> None:
+        """Set whether files can be written."""
+        ...
+
+    def set_peer(self, link: str, *, reads: bool) -> None:
+        """Set whether the peer of a link reads."""
+        ...
+
+    def internal_errors(self) -> list[str]:
+        """Return the internal errors since the last call."""
+        ...
+
+    def open_descriptors(self) -> int:
+        """Return the number of open file descriptors."""
+        ...
+
+    def queued_events(self) -> int:
+        """Return the number of queued events."""
+        ...
 
 
 @dataclass
@@ -62,7 +109,7 @@ class Outcome:
     violation
         What the unit did and must never do; empty if nothing.
     step
-        Number of the step at which it did it.
+        Number of the last step.
     device_s
         Simulation time lived, seconds.
     requests, readings, attitudes
@@ -129,19 +176,18 @@ class LifeRun:
 
     async def run(self) -> Outcome:
         """Execute all steps, or those up to the first violation."""
-        number = -1
         try:
             await self._unit.power_on()
             self._powered(factory=True)
             self._descriptors = self._unit.open_descriptors()
-            for number, step in enumerate(self._life.steps):
+            for step in self._life.steps:
+                self.outcome.step += 1
                 await self._actions[step["do"]](step)
                 self._check_inside()
         except Violation as violation:
             self.outcome.violation = str(violation)
-            self.outcome.step = number
         finally:
-            self.outcome.attitudes = self._oracle.attitudes
+            self.outcome.attitudes = self._oracle.attitudes.count
             self.outcome.device_s = self._lived_s + self._unit.now_s
             self._unit.set_disk(full=False)
             await self._unit.power_off()
@@ -205,8 +251,7 @@ class LifeRun:
             def take(link: str = link) -> list[Any]:
                 return unit.take(link)
 
-            if link == "serial":
-                assert self._stack is not None
+            if self._stack is not None and link == "serial":
                 self._ports[link] = SerialPort(self._stack, deliver, take, self._dialect())
             elif link == "can":
                 self._ports[link] = CanPort(deliver, take, number("can_address", 4))
@@ -216,7 +261,8 @@ class LifeRun:
                 )
 
     def _objects(self) -> DeviceDictionary:
-        assert self._dictionary is not None
+        if self._dictionary is None:
+            raise BenchError(f"unit {self._icd.name}: has no CANopen")
         return self._dictionary
 
     def _dialect(self) -> Dialect | None:
@@ -316,47 +362,50 @@ class LifeRun:
         if len(replies) != len(answers):
             raise Violation(f"{what}: malformed answer: {_text(answers[0])}")
         expected = row.answers if row is not None else ("reply",)
+        sent = f"{what} {request.data.hex()}".rstrip()
         nack = next((reply for reply in replies if reply.kind is ReplyKind.NACK), None)
-        silent = not replies or all(reply.kind is ReplyKind.ECHO for reply in replies)
-        refusable = self._can_refuse(link, request.klass)
+        silent = all(reply.kind is ReplyKind.ECHO for reply in replies)
         if nack is not None:
-            if verdict is ErrorCode.OK:
-                raise Violation(
-                    f"{what} {request.data.hex()}: refused with {int(nack.code)}, must be accepted"
-                )
-            if verdict is not None and not self._same_code(link, nack, verdict):
-                wanted = int(self._icd.error_number(verdict))
-                raise Violation(f"{what} {request.data.hex()}: refused with {int(nack.code)}, not {wanted}")
+            self._judge_refusal(sent, link, nack, verdict)
             if sum(reply.kind is not ReplyKind.ECHO for reply in replies) != 1:
-                raise Violation(f"{what}: {len(replies)} answers to a refused request")
-            code = verdict or ErrorCode.INTERNAL
+                raise Violation(f"{sent}: {len(replies)} answers to a refused request")
         elif silent:
-            if verdict is ErrorCode.OK and any(answer != "echo" for answer in expected):
-                raise Violation(f"{what} {request.data.hex()}: no answer")
-            if verdict not in (None, ErrorCode.OK) and refusable and expected and not self._fixed_framing:
-                raise Violation(
-                    f"{what} {request.data.hex()}: no answer, must be refused with {verdict.name}"
-                )
+            self._judge_silence(sent, verdict, expected, refusable=self._can_refuse(link, request.klass))
             if verdict is None and expected:
                 await self._unknown_outcome(link, request.kind.value)
                 return
-            code = verdict or ErrorCode.OK
-            if code is not ErrorCode.OK:
+            if verdict is not ErrorCode.OK:
                 await self._settle(link)
                 if self._fixed_framing:
                     self._oracle.forget()
-        else:
-            if verdict not in (None, ErrorCode.OK):
-                raise Violation(f"{what} {request.data.hex()}: accepted, must be refused with {verdict.name}")
-            finals = sum(reply.final for reply in replies)
-            if finals != 1:
-                raise Violation(f"{what}: {finals} answers")
-            code = ErrorCode.OK
+        elif verdict not in (None, ErrorCode.OK):
+            raise Violation(f"{sent}: accepted, must be refused")
+        elif sum(reply.final for reply in replies) != 1:
+            raise Violation(f"{sent}: {sum(reply.final for reply in replies)} answers")
         if request.kind is RequestKind.TELECOMMAND:
-            await self._executed(row, request, code, unknown=nack is not None and verdict is None)
+            refused = ErrorCode.INTERNAL if nack is not None else ErrorCode.OK
+            await self._executed(
+                row, request, verdict or refused, unknown=nack is not None and verdict is None
+            )
         for reply in replies:
             if reply.kind is ReplyKind.TELEMETRY:
                 self._read(what, row, request, reply)
+
+    def _judge_refusal(self, sent: str, link: str, nack: Reply, verdict: ErrorCode | None) -> None:
+        if verdict is ErrorCode.OK:
+            raise Violation(f"{sent}: refused with {int(nack.code)}, must be accepted")
+        if verdict is not None and not self._same_code(link, nack, verdict):
+            wanted = int(self._icd.error_number(verdict))
+            raise Violation(f"{sent}: refused with {int(nack.code)}, not {wanted}")
+
+    def _judge_silence(
+        self, sent: str, verdict: ErrorCode | None, expected: Sequence[str], *, refusable: bool
+    ) -> None:
+        if verdict is ErrorCode.OK and any(answer != "echo" for answer in expected):
+            raise Violation(f"{sent}: no answer")
+        refused = verdict not in (None, ErrorCode.OK)
+        if refused and refusable and expected and not self._fixed_framing:
+            raise Violation(f"{sent}: no answer, must be refused")
 
     async def _executed(self, row: Row | None, request: Request, code: ErrorCode, *, unknown: bool) -> None:
         oracle = self._oracle
