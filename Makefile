@@ -17,16 +17,19 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
-$(VENV)/.product: pyproject.toml
+$(VENV)/pyvenv.cfg:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "starhil needs Python 3.11 or newer; call: make PYTHON=/path/to/python3.11")'
 	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.product: pyproject.toml | $(VENV)/pyvenv.cfg
 	$(BIN)/pip install --quiet --editable .
 	@touch $@
 
-$(VENV)/.developer: $(VENV)/.product
-	$(BIN)/pip install --quiet --editable '.[test,lint]'
-	-$(BIN)/pip install --quiet --editable '.[basilisk]'  # 100 MB; without it, the tests with Basilisk are skipped
-	@touch $@
+# Python compiles what is imported; Basilisk (100 MB) is not available everywhere, and its tests are skipped then
+$(VENV)/.developer: pyproject.toml | $(VENV)/pyvenv.cfg
+	$(BIN)/pip install --quiet --no-compile --editable '.[test,lint,basilisk]' \
+		|| $(BIN)/pip install --quiet --no-compile --editable '.[test,lint]'
+	@touch $(VENV)/.product $@
 
 demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo

@@ -271,6 +271,7 @@ class Emulation:
             truth.start_s = self._now_s()  # reading has taken time
         feed: LiveFeed | None = None
         if isinstance(config, FeedConfig) and isinstance(truth, LiveTruth):
+            truth.set_clock_speed(make_clock(self.profile.run.clock).speed)  # not of a replay's clock
             step = self._step_in_lock if self._is_lockstep(config) else None
             feed = LiveFeed(truth, self._now_s, step, self._message_received)
             if self.tape is not None and self.tape.plays:

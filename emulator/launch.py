@@ -266,7 +266,7 @@ class Run:
             A pipeline cannot start; one line.
         """
         with self._rejecting():
-            lines = [await head.emulation.ready() for head in self.heads]
+            lines = await asyncio.gather(*(head.emulation.ready() for head in self.heads))
         line = lines[0]
         for head, further in zip(self.heads[1:], (each.split()[1:] for each in lines[1:]), strict=True):
             line += "".join(
@@ -283,6 +283,8 @@ class Run:
         closers += [head.emulation.close for head in reversed(self.heads)]
         if self.control is not None:
             closers.insert(0, self.control.close)
+        if self._recorder is not None and not self._rejected:
+            closers.append(self._recorder.end)
         closers += [file.discard if self._rejected else file.close for file in self._files]
         if self._rejected and self._recorder is not None and self._recorder.file is not None:
             closers.append(self._recorder.discard)

@@ -296,8 +296,8 @@ class Profile(Strict):
     calibration: dict[str, Any] = Field(default_factory=dict)
     """Notes by `starhil calibrate` for the reader; not used."""
     health: dict[str, float] = Field(default_factory=dict)
-    """Numbers reported as the quantities `health.NAME`, such as temperatures, in the unit of the field;
-    default: 0."""
+    """Numbers reported as the quantities `health.NAME`, such as temperatures, in the unit of the field.
+    Default: in °C, V, A or W what `[thermal]` and `[power]` give, otherwise 0."""
     parameters: dict[str, Any] = Field(default_factory=dict)
     """Defaults of device parameters, named as in the interface definition."""
 

@@ -58,6 +58,12 @@ class _RunFile(BaseModel):
 
     folder: str
     profile: Profile
+    ends: bool = False
+    """Whether the tape of a complete run ends with the entry `end`: not if an older version recorded it."""
+
+
+class _DeviationError(EmulatorError):
+    """The device behaves differently, so that the recording cannot be played further."""
 
 
 class _Timed(Strict):
@@ -69,7 +75,7 @@ class _Timed(Strict):
 class _Plain(_Timed):
     """An entry that consists of its time."""
 
-    do: Literal["event", "reply", "stored", "ready", "clear_faults"]
+    do: Literal["event", "reply", "stored", "ready", "clear_faults", "end"]
 
 
 class _Item(_Timed):
@@ -162,6 +168,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
         "starhil": importlib.metadata.version("starhil"),
         "folder": str(profile.folder.resolve()),
         "profile": values,
+        "ends": True,
     }
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
@@ -290,13 +297,13 @@ class PlayedImager:
 
         Raises
         ------
-        EmulatorError
+        _DeviationError
             The device has sent fewer requests than in the recorded run.
         """
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
-            raise EmulatorError("the device has requested fewer frames than in the recorded run")
+            raise _DeviationError("the device requests fewer frames than in the recorded run")
         self.pending -= 1
         self._arrived.popleft()()
 
@@ -312,7 +319,7 @@ class ReplayReport:
     sent
         Number of serial bytes or CAN frames sent, by link.
     differences
-        One line for each link or file that differs; empty if all are identical.
+        One line for each link or file that differs, is missing or is truncated; empty if all are identical.
     """
 
     entries: int = 0
@@ -320,8 +327,8 @@ class ReplayReport:
     differences: list[str] = field(default_factory=list)
 
 
-def read_run(folder: Path) -> Profile:
-    """Read the profile of a recording.
+def read_run(folder: Path) -> tuple[Profile, bool]:
+    """Return the profile of a recording, and whether its tape ends with the entry `end`.
 
     Raises
     ------
@@ -336,7 +343,7 @@ def read_run(folder: Path) -> Profile:
     run = _validated(_RunFile, text, path)
     is_copied = isinstance(run.profile.truth, FileConfig)
     run.profile._source = (folder if is_copied else Path(run.folder)) / RUN_FILE  # noqa: SLF001 (private: not a key of the file)
-    return run.profile
+    return run.profile, run.ends
 
 
 def _read(path: Path) -> str:
@@ -377,15 +384,22 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
         raise EmulatorError(f"replay {path}: {error.strerror}") from None
 
 
-async def replay(folder: Path) -> ReplayReport:
+async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
     """Play a recording on the stepped clock, and compare sent items and measurements with it.
+
+    Parameters
+    ----------
+    folder
+        The recording.
+    profile
+        Profile of the device, instead of the recorded one; `run` except the algorithm, and `links`, are as recorded.
 
     Raises
     ------
     EmulatorError
-        The folder is not a recording, or the device behaves differently, so that it cannot be continued.
+        The folder is not a recording, or the device cannot be started with the profile.
     """
-    recorded = read_run(folder)
+    recorded, ends = read_run(folder)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
     report = ReplayReport()
     with tempfile.TemporaryDirectory(prefix="starhil-replay-") as scratch:
@@ -398,9 +412,9 @@ async def replay(folder: Path) -> ReplayReport:
         links = recorded.links.model_copy(
             update={"serial": recorded.links.serial.model_copy(update={"symlink": ""})}
         )
-        run = recorded.run.model_copy(update={"state_dir": state})
-        profile = recorded.model_copy(update={"links": links, "run": run})
-        emulation = Emulation(profile, tape=player)
+        played = recorded if profile is None else profile
+        run = recorded.run.model_copy(update={"state_dir": state, "algorithm": played.run.algorithm})
+        emulation = Emulation(played.model_copy(update={"links": links, "run": run}), tape=player)
         log = TruthLog(truth_log, wall_times=False)
         try:
             await emulation.open()
@@ -409,22 +423,13 @@ async def replay(folder: Path) -> ReplayReport:
             _enter_scenario(folder, emulation, faults)
             warm = await emulation.imager.start()
             play = _Playing(emulation, player, faults, warm)
-            expected: dict[str, list[Any]] = {}
-            for where, entry in read_events(folder):
-                if isinstance(entry, _Item) and entry.do == "out":
-                    expected.setdefault(entry.link, []).append(as_json(entry.item))
-                    continue
-                player.stepped.set_ns(max(entry.ns, player.stepped.now_ns()))
-                try:
-                    await play.entry(entry)
-                except (EmulatorError, ProtocolError, StaridError) as error:
-                    raise EmulatorError(f"replay {where}: {error}") from None
-                report.entries += 1
-            _compare_sent(expected, player.sent, report)
+            expected = await play.entries(folder, report, ends=ends)
+            to_the_end = not report.differences
+            _compare_sent(expected, player.sent, report, to_the_end=to_the_end)
         finally:
             await emulation.close()
             log.close()
-        _compare_truth(folder / TRUTH_FILE, truth_log, report)
+        _compare_truth(folder / TRUTH_FILE, truth_log, report, to_the_end=to_the_end)
     return report
 
 
@@ -444,12 +449,39 @@ class _Playing:
         self._faults = faults
         self._warm = warm
 
+    async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> dict[str, list[Any]]:
+        """Play a tape to its end, or to the entry at which the device deviates; return what was sent until there, by link."""
+        expected: dict[str, list[Any]] = {}
+        ended = not ends
+        stepped = self._player.stepped
+        for where, entry in read_events(folder):
+            if isinstance(entry, _Item) and entry.do == "out":
+                expected.setdefault(entry.link, []).append(as_json(entry.item))
+                continue
+            if isinstance(entry, _Plain) and entry.do == "end":
+                ended = True
+                continue
+            stepped.set_ns(max(entry.ns, stepped.now_ns()))
+            try:
+                await self.entry(entry)
+            except _DeviationError as deviation:
+                report.differences.append(f"{where}: {deviation}")
+                return expected
+            except (EmulatorError, ProtocolError, StaridError) as error:
+                raise EmulatorError(f"replay {where}: {error}") from None
+            report.entries += 1
+        if not ended:
+            report.differences.append(
+                f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
+            )
+        return expected
+
     async def entry(self, entry: Entry) -> None:
         """Play one entry at the current time.
 
         Raises
         ------
-        EmulatorError
+        _DeviationError
             The device behaves differently, so that the entry cannot be played.
         """
         emulation = self._emulation
@@ -459,11 +491,11 @@ class _Playing:
             case _Item():
                 receive = self._player.receivers.get(entry.link)
                 if receive is None:
-                    raise EmulatorError(_deviation(entry, f"the link {entry.link} is off"))
+                    raise _DeviationError(_deviation(entry, f"the link {entry.link} is off"))
                 receive(entry.item)
             case _Feed():
                 if emulation.feed is None:
-                    raise EmulatorError(_deviation(entry, "there is no live feed"))
+                    raise _DeviationError(_deviation(entry, "there is no live feed"))
                 await emulation.feed.process(entry.data.encode("latin-1"))
             case _Truth():
                 await emulation.play_truth(entry.config, entry.start_s)
@@ -477,13 +509,13 @@ class _Playing:
             case "event":
                 due = device.scheduler.pop_due(player.clock.now_ns())
                 if due is None:
-                    raise EmulatorError(_deviation(entry, "no event is due"))
+                    raise _DeviationError(_deviation(entry, "no event is due"))
                 call_guarded("event", due.action, due.due_ns)
             case "reply" if player.pipeline is not None:
                 await player.pipeline.deliver()
             case "stored":
                 if not player.writes:
-                    raise EmulatorError(_deviation(entry, "nothing is being written"))
+                    raise _DeviationError(_deviation(entry, "nothing is being written"))
                 player.writes.popleft()()
             case "ready":
                 self._emulation.pipeline_ready(self._warm)
@@ -495,28 +527,39 @@ def _deviation(entry: Entry, why: str) -> str:
     return f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently: {why}"
 
 
-def _compare_sent(expected: dict[str, list[Any]], sent: dict[str, list[Any]], report: ReplayReport) -> None:
-    """Compare the items sent on each link."""
+def _compare_sent(
+    expected: dict[str, list[Any]], sent: dict[str, list[Any]], report: ReplayReport, *, to_the_end: bool
+) -> None:
+    """Compare the items sent on each link, if not to the end then as far as they were recorded."""
     for link in sorted(expected.keys() | sent.keys()):
         before, now = expected.get(link, []), sent.get(link, [])
         if link == "serial":  # on a serial line only the bytes matter, not how they are divided into items
-            before, now = (["".join(pieces)] if pieces else [] for pieces in (before, now))
-            report.sent[link] = len(before[0]) // 2 if before else 0
-        else:
-            report.sent[link] = len(before)
+            before, now = (
+                [pair for piece in pieces for pair in _bytes_of(piece)] for pieces in (before, now)
+            )
+        report.sent[link] = len(before)
+        if not to_the_end:
+            now = now[: len(before)]
         if before != now:
             at = next(
                 (n for n, pair in enumerate(zip(before, now, strict=False)) if pair[0] != pair[1]),
                 min(len(before), len(now)),
             )
+            what = "byte" if link == "serial" else "message"
             report.differences.append(
-                f"{link}: differs from message {at + 1} on: {len(before)} recorded, {len(now)} now"
+                f"{link}: differs from {what} {at + 1} on: {len(before)} recorded, {len(now)} now"
             )
 
 
-def _compare_truth(recorded: Path, now: Path, report: ReplayReport) -> None:
+def _bytes_of(text: str) -> list[str]:
+    """Return the bytes of hexadecimal text."""
+    return [text[n : n + 2] for n in range(0, len(text), 2)]
+
+
+def _compare_truth(recorded: Path, now: Path, report: ReplayReport, *, to_the_end: bool) -> None:
     """Compare the truth logs, except for wall times."""
     if not recorded.exists():
+        report.differences.append(f"{recorded}: missing")
         return
     before, after = (_rows(path) for path in (recorded, now))
     for number, (one, other) in enumerate(zip(before, after, strict=False), start=1):
@@ -524,7 +567,7 @@ def _compare_truth(recorded: Path, now: Path, report: ReplayReport) -> None:
         if changed:
             report.differences.append(f"truth log: row {number} differs in {changed[0]}")
             return
-    if len(before) != len(after):
+    if to_the_end and len(before) != len(after):
         report.differences.append(f"truth log: {len(before)} rows recorded, {len(after)} now")
 
 

@@ -5,7 +5,7 @@ a message of a feed, a command on the control channel, or the end of a write. Th
 processed, so that a run on the real clock can be repeated exactly on the stepped clock.
 
 A recording is a folder: `run.json` (profile and version), `events.jsonl` (entries and output, one JSON object per
-line, in order), `truth.csv` (truth log), and other files that the run needs: `scenario.json`, `state/`.
+line, in order, the last one `end`), `truth.csv` (truth log), and other files that the run needs: `scenario.json`, `state/`.
 """
 
 from __future__ import annotations
@@ -205,6 +205,10 @@ class Recorder:
             inner(work, ended)
 
         return background
+
+    def end(self) -> None:
+        """Write the last entry, without which the tape is truncated."""
+        self.write("end")
 
     def discard(self) -> None:
         """Remove the folder, whose content this run has made, because the run was rejected."""

@@ -110,6 +110,8 @@ class AsyncObcClient:
     ) -> Ack:
         """Send a telecommand and wait for its acknowledge; fields as a mapping, by keyword, or both.
 
+        A telecommand that the link does not answer, such as `reset` on the serial line of CubeStar, counts as accepted.
+
         Parameters
         ----------
         checked
@@ -132,7 +134,7 @@ class AsyncObcClient:
         """Send a telecommand with its data as bytes, which may be invalid."""
         row = self.icd.telecommands[name]
         request = self.icd.request(row, data)
-        if not row.answers:
+        if not self.link.answers(row):
             self.link.request(request, 0)
             return Ack(row.name, 0.0)
         _reply, latency = await self.transact(request, row.name, 0, timeout_s=timeout_s, retries=retries)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
@@ -23,6 +24,10 @@ from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import LinkFault, Reply, RequestKind
 from starhil.protocol.unit_folders import DEFAULT_UNIT
+
+__tracebackhide__ = operator.methodcaller(
+    "errisinstance", BenchError
+)  # pytest shows the caller's line instead
 
 Parameters = ParamSpec("Parameters")
 T = TypeVar("T")

@@ -7,7 +7,7 @@ import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
 from starhil.hil_tests.transactions import Reading
@@ -16,7 +16,7 @@ from starhil.protocol.image_transfer import (
     MAP_PARTS,
     MAX_BLOCK,
     HoleMap,
-    block_checksum,
+    file_checksum,
     frame_checksum,
     packet_count,
     parse_burst_packet,
@@ -37,7 +37,7 @@ class Downloader(Protocol):
         """Read telemetry with its latency."""
         ...
 
-    async def telemetry(self, name: str) -> Mapping[str, Value]:
+    async def telemetry(self, name: str) -> Mapping[str, Any]:
         """Read telemetry as values by name."""
         ...
 
@@ -49,6 +49,8 @@ POLL_S: Final = 0.04
 
 BMP_HEADER_SIZE: Final = 54
 """Size of the two headers of a BMP file."""
+FILES_MAX: Final = 1000
+"""Number of files after which a list without end is given up."""
 BURST_ROUNDS: Final = 20
 """Number of requests for the missing packets of a block."""
 BURST_SILENCE_S: Final = 0.5
@@ -155,42 +157,72 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 
 
 async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
-    """Save an image and download its file in bursts of up to 1024 numbered packets.
+    """Save an image, and download the newest file of the list in bursts of up to 1024 numbered packets.
 
-    The header of the file, loaded first, contains its length.
+    Raises
+    ------
+    BadReplyError
+        The list is empty, or the file does not have the checksum in the list.
     """
     await save_image(client, size, within_s=within_s)
     begin = time.monotonic()
-    header, repeats = await _download_block(client, 0, BMP_HEADER_SIZE, within_s)
-    length = bmp_file_size(header)
-    data = bytearray()
-    while len(data) < length:
-        block, rounds = await _download_block(client, len(data), min(MAX_BLOCK, length - len(data)), within_s)
+    files = await list_files(client, within_s=within_s)
+    if not files:
+        raise BadReplyError("file_info: the list of files is empty after save_image")
+    file = files[-1]
+    data, repeats = b"", 0
+    while len(data) < int(file["size"]):
+        block, rounds = await _download_block(client, int(file["counter"]), len(data), within_s)
         data += block
         repeats += rounds
-    pixels, width, height = decode_bmp(bytes(data))
+    if file_checksum(data) != file["crc"]:
+        raise BadReplyError(
+            f"the downloaded file has checksum {file_checksum(data)}, the list {file['crc']!r}"
+        )
+    pixels, width, height = decode_bmp(data)
     return Image(pixels, width, height, len(data), repeats, time.monotonic() - begin)
 
 
-async def _download_block(client: Downloader, offset: int, length: int, within_s: float) -> tuple[bytes, int]:
+async def list_files(client: Downloader, *, within_s: float) -> list[Mapping[str, Any]]:
+    """Return the information of each stored file, as `file_info` reports it, oldest first."""
+    await client.command("reset_file_list")
+    files: list[Mapping[str, Any]] = []
+    deadline = time.monotonic() + within_s
+    while len(files) < FILES_MAX:
+        info = await client.telemetry("file_info")
+        if info["updating"]:
+            if time.monotonic() > deadline:
+                raise BenchError(f"file_info: file {len(files) + 1} not looked up within {within_s:g} s")
+            await asyncio.sleep(POLL_S)
+            continue
+        if not any(info.values()):
+            return files
+        files.append(info)
+        await client.command("advance_file_list")
+    raise BadReplyError(f"file_info: the list does not end after {FILES_MAX} files")
+
+
+async def _download_block(
+    client: Downloader, counter: int, offset: int, within_s: float
+) -> tuple[bytes, int]:
     """Load one block of the file and receive its packets; return it and the number of repeated requests."""
-    await _when_not_busy(
-        client,
-        "load_file_block",
-        within_s,
-        {"file_type": "bmp", "file_counter": 0, "offset": offset, "length": length},
-    )
+    block: dict[str, Value] = {
+        "file_type": "bmp",
+        "file_counter": counter,
+        "offset": offset,
+        "length": MAX_BLOCK,
+    }
+    await _when_not_busy(client, "load_file_block", within_s, block)
     deadline = time.monotonic() + within_s
     state = await client.telemetry("file_block")
     while not state["ready"]:
         if state["parameter_error"]:
-            raise BadReplyError(f"load_file_block: the device has no {length} bytes at {offset} of the file")
+            raise BadReplyError(f"load_file_block: the device has no bytes at {offset} of file {counter}")
         if time.monotonic() > deadline:
             raise BenchError(f"load_file_block: offset {offset} not ready within {within_s:g} s")
         await asyncio.sleep(POLL_S)
         state = await client.telemetry("file_block")
-    if state["length"] != length:
-        raise BadReplyError(f"file block at {offset}: {state['length']!r} bytes loaded, {length} requested")
+    length = int(state["length"])
     count = packet_count(length)
     packets: dict[int, bytes] = {}
     for repeats in range(BURST_ROUNDS):
@@ -199,9 +231,9 @@ async def _download_block(client: Downloader, offset: int, length: int, within_s
         await client.command("start_burst", {"ignore_hole_map": repeats == 0})
         await _gather(client, packets, count)
         if len(packets) == count:
-            block = b"".join(packets[number] for number in range(count))[:length]
-            if block_checksum(block) == state["checksum"]:
-                return block, repeats
+            data = b"".join(packets[number] for number in range(count))[:length]
+            if file_checksum(data) == state["checksum"]:
+                return data, repeats
             packets.clear()
         await _send_hole_map(client, packets)
     raise BadReplyError(
@@ -228,19 +260,6 @@ async def _send_hole_map(client: Downloader, packets: dict[int, bytes]) -> None:
     holes = HoleMap(packets)
     for part in range(1, MAP_PARTS + 1):
         await client.command(f"set_hole_map_{part}", {"map": holes.part(part)})
-
-
-def bmp_file_size(header: bytes) -> int:
-    """Return the length of a BMP file from its header.
-
-    Raises
-    ------
-    BadReplyError
-        The data are not the header of a BMP file.
-    """
-    if len(header) < BMP_HEADER_SIZE or header[:2] != b"BM":
-        raise BadReplyError(f"the downloaded file is not a BMP image: it begins with {header[:8].hex(' ')}")
-    return int(struct.unpack_from("<I", header, 2)[0])
 
 
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:

@@ -10,12 +10,13 @@ from typing import Final, Generic, TypeVar
 from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
+from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
 from starhil.protocol.receiver import Receiver
 from starhil.protocol.serial_interface import HostEnd
-from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect
+from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect, serial_answers
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -73,6 +74,10 @@ class HostLink(ABC, Generic[Item]):
     @abstractmethod
     def reset_receiver(self) -> None:
         """Discard an incomplete reply that is no longer awaited."""
+
+    def answers(self, row: Row) -> tuple[str, ...]:
+        """Return the answers of a row on this link; none if no reply may be awaited."""
+        return row.answers
 
     async def start(self) -> None:
         """Open the port or join the bus."""
@@ -158,6 +163,7 @@ class SerialHostLink(HostLink[bytes]):
         log: WireLog | None = None,
     ) -> None:
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
+        self._icd = icd
         self._stack = build_serial_stack(icd)
         self._dialect = chosen_dialect(icd, dialect)
         self._receiver = self._stack.host(self._dialect)
@@ -166,6 +172,10 @@ class SerialHostLink(HostLink[bytes]):
         """Frame and send a request."""
         self._receiver.expect(request, reply_size)
         self.send(self._stack.encode_request(request))
+
+    def answers(self, row: Row) -> tuple[str, ...]:
+        """Return the answers of a row on the serial line."""
+        return serial_answers(self._icd, row)
 
     def reset_receiver(self) -> None:
         """Discard an incomplete reply."""

@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import operator
 import threading
 from collections.abc import Coroutine
 from concurrent.futures import Future
 from typing import Any, TypeVar
+
+from starhil.hil_tests.errors import BenchError
+
+__tracebackhide__ = operator.methodcaller(
+    "errisinstance", BenchError
+)  # pytest shows the caller's line instead
 
 T = TypeVar("T")
 
@@ -27,6 +34,8 @@ class LoopThread:
         except KeyboardInterrupt:
             future.cancel()
             raise
+        except BenchError as error:
+            raise error.with_traceback(None) from error.__cause__  # its frames are those of the loop
 
     @property
     def alive(self) -> bool:

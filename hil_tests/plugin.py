@@ -6,9 +6,10 @@ In a test::
         starhil_serial.command("set_mode", mode="lost_in_space")
         starhil_serial.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20)
 
-Without options, an emulator process is started once per module and ended after it. With `--starhil-serial DEV`
-or `--starhil-can CHANNEL`, the same tests run against a connected unit. The time-out of a reply is
-`--starhil-timeout` seconds; a test that needs another one passes `timeout_s`.
+Without options, an emulator process is started for a module, reset before each test, and ended after the module.
+With `--starhil-serial DEV` or `--starhil-can CHANNEL`, the same tests run against a connected unit, and a test that
+needs another link or an emulator is skipped. The time-out of a reply is `--starhil-timeout` seconds; a test that
+needs another one passes `timeout_s`.
 
 pytest loads this module in every run, so the bench is imported only when a fixture is used.
 """
@@ -16,6 +17,7 @@ pytest loads this module in every run, so the bench is imported only when a fixt
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +25,7 @@ import pytest
 
 if TYPE_CHECKING:
     from starhil.hil_tests.client import ObcClient
+    from starhil.hil_tests.control import ControlClient, Truth
     from starhil.hil_tests.emulator_process import EmulatorProcess
 
 
@@ -51,48 +54,113 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
-@pytest.fixture(scope="module")
-def starhil_emulator(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[EmulatorProcess]:
-    """Start an emulator on a pty and on a CAN bus (vcan0, or else a private hub).
+def pytest_configure(config: pytest.Config) -> None:
+    """Register the marker."""
+    config.addinivalue_line(
+        "markers", "starhil(profile=None, settings=()): profile and settings of the emulator for a test"
+    )
 
-    `.ready` has the fields of its ready line. It is ended with SIGTERM after the last test of the module; an
-    exit status other than 0 is an error.
-    """
-    from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-    from starhil.hil_tests.private_can_bus import private_can_bus
 
-    folder: Path = tmp_path_factory.mktemp("starhil")
-    with private_can_bus() as channel:
+class _Emulators:
+    """The emulators of a module, one after the other; a test with another profile gets another one."""
+
+    def __init__(self, config: pytest.Config, folder: Path) -> None:
+        self._config = config
+        self._folder = folder
+        self._started = 0
+        self._stack = ExitStack()
+        self._wanted: tuple[str | None, tuple[str, ...]] | None = None
+        self._running: EmulatorProcess | None = None
+
+    def get(self, profile: str | None, settings: tuple[str, ...]) -> EmulatorProcess:
+        """Return an emulator after power-on: the running one, reset, or a new one."""
+        from starhil.hil_tests.control import ControlClient
+        from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+        from starhil.hil_tests.private_can_bus import private_can_bus
+
+        if self._running is not None and self._wanted == (profile, settings):
+            with ControlClient(self._running.ready["control"]) as control:
+                control.reset()
+            return self._running
+        self.close()
+        self._started += 1
+        option = self._config.getoption
         command = emulator_command(
-            profile=request.config.getoption("--starhil-profile"),
-            unit=request.config.getoption("--starhil-unit"),
+            profile=profile,
+            unit=option("--starhil-unit"),
             serial="auto",
-            can=channel,
-            dialect=request.config.getoption("--starhil-dialect"),
-            seed=request.config.getoption("--starhil-seed"),
-            state_dir=folder / "state",
-            truth_log=folder / "truth.csv",
+            can=self._stack.enter_context(private_can_bus()),
+            dialect=option("--starhil-dialect"),
+            seed=option("--starhil-seed"),
+            settings=settings,
+            state_dir=self._folder / f"state-{self._started}",
+            truth_log=self._folder / f"truth-{self._started}.csv",
+            extra=["--control", "auto"],
         )
-        with EmulatorProcess(command) as emulator:
-            yield emulator
+        self._running = self._stack.enter_context(EmulatorProcess(command))
+        self._wanted = (profile, settings)
+        return self._running
+
+    def close(self) -> None:
+        """End the emulator; an exit status other than 0 is an error."""
+        self._running = None
+        self._stack.close()
+
+
+@pytest.fixture(scope="module")
+def _starhil_emulators(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[_Emulators]:
+    emulators = _Emulators(request.config, tmp_path_factory.mktemp("starhil"))
+    yield emulators
+    emulators.close()
+
+
+def _unit_option(config: pytest.Config) -> str:
+    """Return the option that names a unit, or an empty text if tests run with an emulator."""
+    return next(
+        (name for name in ("--starhil-serial", "--starhil-can") if config.getoption(name) is not None), ""
+    )
+
+
+@pytest.fixture
+def starhil_emulator(request: pytest.FixtureRequest) -> EmulatorProcess:
+    """Return an emulator on a pty and on a CAN bus (vcan0, or else a private hub), as after power-on.
+
+    `.ready` has the fields of its ready line. The marker `starhil` selects its profile.
+    """
+    unit = _unit_option(request.config)
+    if unit:
+        pytest.skip(f"{unit} names a unit, and this test needs an emulator")
+    marker = request.node.get_closest_marker("starhil")
+    wanted = {} if marker is None else dict(marker.kwargs)
+    profile = wanted.pop("profile", None) or request.config.getoption("--starhil-profile")
+    settings = tuple(wanted.pop("settings", ()))
+    if wanted or (marker is not None and marker.args):
+        pytest.fail("the marker starhil takes profile=… and settings=[…]", pytrace=False)
+    emulators: _Emulators = request.getfixturevalue("_starhil_emulators")
+    return emulators.get(profile, settings)
 
 
 def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
     from starhil.hil_tests.client import ObcClient
 
-    spec, unit = request.config.getoption(f"--starhil-{link}"), request.config.getoption("--starhil-unit")
+    option = request.config.getoption
+    spec, unit, other = option(f"--starhil-{link}"), option("--starhil-unit"), _unit_option(request.config)
+    if spec is not None and request.node.get_closest_marker("starhil") is not None:
+        pytest.skip(f"{other} names a unit, and the marker starhil needs an emulator")
+    if spec is None and other:
+        where = {"serial": "port", "can": "bus"}[link]
+        pytest.skip(f"{other} names a unit; give its {where} with --starhil-{link} to run this test")
     if spec is None:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
         spec, unit = emulator.ready.get(link), emulator.unit
         if spec is None:
-            pytest.fail(f"unit {unit} has no {link} link")
-    timeout_s = request.config.getoption("--starhil-timeout")
-    common = {"unit": unit or "cubestar", "timeout_s": timeout_s}
+            pytest.skip(f"unit {unit} has no {link} link")
+    common = {"unit": unit or "cubestar", "timeout_s": option("--starhil-timeout")}
     if link == "can":
         return ObcClient.open(can=spec, **common)
-    return ObcClient.open(serial=spec, dialect=request.config.getoption("--starhil-dialect"), **common)
+    return ObcClient.open(serial=spec, dialect=option("--starhil-dialect"), **common)
 
 
 @pytest.fixture
@@ -107,3 +175,20 @@ def starhil_can(request: pytest.FixtureRequest) -> Iterator[ObcClient]:
     """Return an OBC client on the CAN bus of the unit or emulator."""
     with _client(request, "can") as client:
         yield client
+
+
+@pytest.fixture
+def starhil_control(starhil_emulator: EmulatorProcess) -> Iterator[ControlClient]:
+    """Return a client of the emulator's control channel: `do(action, **keys)`."""
+    from starhil.hil_tests.control import ControlClient
+
+    with ControlClient(starhil_emulator.ready["control"]) as control:
+        yield control
+
+
+@pytest.fixture
+def starhil_truth(starhil_control: ControlClient) -> Truth:
+    """Return the truth of the emulator: `point`, `set`, `attitude` and `error`."""
+    from starhil.hil_tests.control import Truth
+
+    return Truth(starhil_control)

@@ -68,6 +68,11 @@ def build_check(
             if found is None:
                 raise IcdError(f"link.serial.check: the plugin has no check named {model.name!r}")
             compute = found
+            empty: object = compute(b"")
+            if not isinstance(empty, bytes):
+                raise IcdError(
+                    f"link.serial.check: check {model.name} must return bytes, not {type(empty).__name__}"
+                )
         case _:
             assert_never(model)
     return Check(len(compute(b"")), frozenset(model.covers), compute)

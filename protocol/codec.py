@@ -362,7 +362,7 @@ class Row:
     klass: str = ""
     """Name of the row's class, if the unit has classes."""
     action: str | None = None
-    """Name of the action that a telecommand performs."""
+    """Name of the action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: Mapping[str, bool | int | float | str] = dataclass_field(default_factory=dict)
     """Fixed arguments of the action."""
     answers: tuple[str, ...] = ("reply",)

@@ -41,6 +41,7 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
+from starhil.protocol.plugin import guarded
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_interface import RowShape, SerialStack
 from starhil.protocol.values import IcdError
@@ -102,7 +103,7 @@ class ComposedStack(SerialStack):
     byte_order
         Byte order of the unit.
     framings, checks
-        Framings and checks defined by the unit's plugin, by name.
+        Framings, as classes, and checks defined by the unit's plugin, by name.
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class ComposedStack(SerialStack):
         rows: Sequence[RowShape] = (),
         byte_order: Order = "little",
         *,
-        framings: Mapping[str, Framing] | None = None,
+        framings: Mapping[str, Callable[[], object]] | None = None,
         checks: Mapping[str, CheckFunction] | None = None,
     ) -> None:
         self.baud = link.baud
@@ -434,7 +435,30 @@ class ComposedHostReceiver:
         return values[role] * self._stack.reply_header.count_ns(role) if role in values else 0
 
 
-def _build_framing(link: SerialLinkModel, custom: Mapping[str, Framing]) -> Framing:
+class _PluginFraming(Framing):
+    """A framing of a plugin, whose failures are raised as an IcdError of one line."""
+
+    def __init__(self, name: str, framing: object) -> None:
+        if not isinstance(framing, Framing):
+            raise IcdError(f"framing {name} must be a class derived from starhil.protocol.framings.Framing")
+        self._name = name
+        self._framing = framing
+        self.start, self.end = framing.start, framing.end
+
+    def encode(self, body: bytes) -> bytes:
+        line: object = guarded(f"framing {self._name}", self._framing.encode)(body)
+        if not isinstance(line, bytes):
+            raise IcdError(f"framing {self._name} must encode to bytes, not {type(line).__name__}")
+        return line
+
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        made: object = guarded(f"framing {self._name}", self._framing.deframer)(receiving)
+        if not isinstance(made, Deframer):
+            raise IcdError(f"framing {self._name} must make a Deframer, not {type(made).__name__}")
+        return made
+
+
+def _build_framing(link: SerialLinkModel, custom: Mapping[str, Callable[[], object]]) -> Framing:
     model = link.framing
     match model:
         case EscapedFraming():
@@ -448,7 +472,7 @@ def _build_framing(link: SerialLinkModel, custom: Mapping[str, Framing]) -> Fram
         case CustomFraming():
             if model.name not in custom:
                 raise IcdError(f"link.serial.framing: the plugin has no framing named {model.name!r}")
-            return custom[model.name]
+            return _PluginFraming(model.name, custom[model.name]())
         case CubeSpaceFraming():
             raise IcdError("link.serial.framing: cubespace has its own codec")
         case _:

@@ -19,13 +19,14 @@ EPOCHS: Final = {"unix": "1970-01-01", "gps": "1980-01-06", "j2000": "2000-01-01
 
 @dataclass(frozen=True)
 class Conventions:
-    """Quaternion direction and sign, axes, epoch and byte order of a unit."""
+    """Quaternion direction and sign, axes, epoch, byte order and telecommands with a CRC of a unit."""
 
     quaternion: Literal["rotation", "attitude"] = "rotation"
     scalar_sign: Literal["positive", "any"] = "positive"
     axes: tuple[str, str, str] = SENSOR_AXES
     epoch: str = "unix"
     byte_order: Literal["little", "big"] = "little"
+    telecommand_crc: bool = False
 
     def __post_init__(self) -> None:
         """Reject axes that do not form a right-handed frame, and an unknown epoch."""

@@ -35,6 +35,8 @@ PARAMETER: Final = "parameter."
 """Quantities with this prefix report a parameter of the device."""
 HEALTH: Final = "health."
 """Quantities with this prefix report a number from the profile's table `[health]`."""
+HEALTH_DEFAULTS: Final = ("temperature.detector", "power.voltage", "power.current", "power.now")
+"""Quantities that stand for a number that is not in `[health]`: the one in whose unit the field is."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,10 @@ class DeviceModel:
             return None if parameter is None else _of_parameter(name, parameter)
         if name.startswith(HEALTH):
             return QuantityModel(
-                name=name, type="float", unit="*", doc="A number from the profile's table [health]."
+                name=name,
+                type="float",
+                unit="*",
+                doc="A number from the profile's table [health]; default: the temperature, voltage, current or power of the model.",
             )
         found = self.quantities.get(generic(name))
         numbers = [int(number) for number in _NUMBER.findall(name)]

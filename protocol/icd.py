@@ -195,13 +195,11 @@ def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
     return _load_bundled(path) if path.parent == UNITS_FOLDER else _load(path)
 
 
-def check_unit(name_or_folder: str | Path) -> list[str]:
+def check_unit(name_or_folder: str | Path, *, run_plugin: bool = True) -> list[str]:
     """Return all errors in a definition, each with file, row and field; none if the unit can be emulated."""
-    from starhil.protocol.icd_bindings import unbound
-    from starhil.protocol.icd_builder import read_definition
+    from starhil.protocol.unit_examples import examine
 
-    definition, errors = read_definition(find_unit(name_or_folder))
-    return errors if definition is None else unbound(definition)
+    return examine(name_or_folder, run_plugin=run_plugin)[1]
 
 
 @cache
@@ -213,7 +211,7 @@ def _load(path: Path) -> InterfaceDefinition:
     from starhil.protocol.icd_builder import read_definition
 
     definition, errors = read_definition(path)
-    if definition is None:
+    if errors:
         more = f" ({len(errors) - 1} more: starhil unit check {path})" if len(errors) > 1 else ""
         raise IcdError(f"{errors[0]}{more}")
     return definition

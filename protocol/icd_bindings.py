@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.device_model import DeviceModel, did_you_mean, generic
 from starhil.protocol.icd import InterfaceDefinition
@@ -13,25 +15,39 @@ from starhil.protocol.values import IcdError
 ANY_UNIT = "*"
 
 
-def check_row(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
-    """Check the bindings of the fields of a row.
+def check_row(
+    row: Row, model: DeviceModel, plugin: Plugin, where: str, *, complete: bool = True
+) -> Iterator[str]:
+    """Yield the errors in the bindings of the fields of a row; `complete`: it has all its fields.
 
-    Raises IcdError, whose text names the field and, for an unknown name, similar ones.
+    A text names the field and, for an unknown name, similar ones.
     """
-    action = _action(row, model, plugin, where)
+    custom = row.action in plugin.actions  # checks its arguments itself
+    action = None if row.action is None or custom else model.actions.get(row.action)
+    if action is None and row.action is not None and not custom and plugin.skipped is None:
+        known = [*model.actions, *plugin.actions]
+        yield f"{where}: no action named {row.action!r}{did_you_mean(row.action, known)}"
     for field in row.named_fields.values():
-        here = f"{where}: field {field.name}"
-        sources = [
-            name for name in ("value", "argument", "const", "parameter") if getattr(field, name) is not None
-        ]
-        if len(sources) > 1 and sources != ["argument", "parameter"]:
-            raise IcdError(f"{here}: has {' and '.join(sources)}; keep one of them")
-        if field.value is not None:
-            _check_value(field, row, model, plugin, here)
-        if field.argument is not None:
-            _check_argument(field, row, action, model, here)
-    if action is not None:
-        _check_required(row, action, where)
+        try:
+            _check_field(field, row, action, model, plugin, f"{where}: field {field.name}")
+        except IcdError as error:
+            yield str(error)
+    if action is not None and complete:
+        yield from _missing(row, action, where)
+
+
+def _check_field(
+    field: Field, row: Row, action: ActionModel | None, model: DeviceModel, plugin: Plugin, where: str
+) -> None:
+    sources = [
+        name for name in ("value", "argument", "const", "parameter") if getattr(field, name) is not None
+    ]
+    if len(sources) > 1 and sources != ["argument", "parameter"]:
+        raise IcdError(f"{where}: has {' and '.join(sources)}; keep one of them")
+    if field.value is not None:
+        _check_value(field, row, model, plugin, where)
+    if field.argument is not None:
+        _check_argument(field, row, action, model, where)
 
 
 def unbound(icd: InterfaceDefinition) -> list[str]:
@@ -60,21 +76,13 @@ def quantity_of(name: str, model: DeviceModel, plugin: Plugin) -> QuantityModel 
     return model.quantity(name)
 
 
-def _action(row: Row, model: DeviceModel, plugin: Plugin, where: str) -> ActionModel | None:
-    if row.action is None or row.action in plugin.actions:
-        return None
-    found = model.actions.get(row.action)
-    if found is None:
-        known = [*model.actions, *plugin.actions]
-        raise IcdError(f"{where}: no action named {row.action!r}{did_you_mean(row.action, known)}")
-    return found
-
-
 def _check_value(field: Field, row: Row, model: DeviceModel, plugin: Plugin, where: str) -> None:
     name = str(field.value)
     if row.kind != "telemetry":
         raise IcdError(f"{where}: `value` is for telemetry; a field of a telecommand has an `argument`")
     found = quantity_of(name, model, plugin)
+    if found is None and plugin.skipped is not None:
+        return
     if found is None:
         raise IcdError(f"{where}: no quantity named {name!r}{model.near_quantities(name)}")
     if name not in plugin.quantities:
@@ -91,7 +99,7 @@ def _check_argument(
     if row.action is None:
         raise IcdError(f"{where}: argument {name}: the row has no `action`")
     if action is None:
-        return  # an action of the plugin, which checks its arguments itself
+        return  # unknown, or an action of the plugin
     found = model.argument(action, name)
     if found is None:
         known = [item.name for item in action.arguments]
@@ -146,16 +154,12 @@ def _check_members(field: Field, found: QuantityModel, model: DeviceModel, where
         )
 
 
-def _check_required(row: Row, action: ActionModel, where: str) -> None:
+def _missing(row: Row, action: ActionModel, where: str) -> Iterator[str]:
     given = {generic(str(field.argument)) for field in row.named_fields.values()} | set(row.arguments)
     missing = [item.name for item in action.arguments if item.required and item.name not in given]
-    if missing:
-        raise IcdError(
-            f"{where}: action {action.name} needs the argument {missing[0]}; bind a field to it with `argument`"
-        )
+    for name in missing:
+        yield f"{where}: action {action.name} needs the argument {name}; bind a field to it with `argument`"
     known = {item.name for item in action.arguments}
     for name in row.arguments:
         if name not in known:
-            raise IcdError(
-                f"{where}: action {action.name} has no argument {name!r}{did_you_mean(name, known)}"
-            )
+            yield f"{where}: action {action.name} has no argument {name!r}{did_you_mean(name, known)}"

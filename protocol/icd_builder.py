@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from starhil.protocol import icd_schema as schema
 from starhil.protocol.codec import Row, RowKind
@@ -23,12 +24,25 @@ from starhil.protocol.messages import ErrorCode, MessageClass, RequestKind
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.user_file import read_user_text
-from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, FieldError, IcdError, Parameter, Section
+from starhil.protocol.values import (
+    INTEGER_RANGES,
+    EnumDefinition,
+    FieldError,
+    IcdError,
+    MissingNameError,
+    Parameter,
+    Section,
+)
 
 SETS: Final = "set_"
 """Prefix of the names of telecommands that can be read back."""
 HIGHEST_ID: Final = 0xFF
 """Highest ID if the link does not limit it."""
+
+CLASS: Final = "class"
+"""Table of the classes; among the broken names if a class is missing."""
+UNKNOWN_UNIT: Final = {"name": "", "version": "", "doc": "", "provenance": "ours"}
+"""Stands for a table [unit] with errors."""
 
 _MODELS: Final[dict[str, type[BaseModel]]] = {
     "unit": schema.UnitModel,
@@ -46,16 +60,40 @@ _MODELS: Final[dict[str, type[BaseModel]]] = {
 """Table → its schema, to suggest keys."""
 
 
-def read_definition(path: Path) -> tuple[InterfaceDefinition | None, list[str]]:
-    """Read a folder of TOML files, or one file; return the definition or None, and the errors."""
+def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDefinition, list[str]]:
+    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors.
+
+    An error that another one may cause is left out, such as a row that is missing because it has an error itself.
+    """
     files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
-    if not files:
-        return None, [f"{path}: no .toml file in this folder"]
-    builder = _Builder(path)
+    builder = _Builder(path, run_plugin=run_plugin)
     for file in files:
         builder.read(file)
     definition = builder.build()
-    return (None, builder.errors) if builder.errors else (definition, [])
+    return definition, builder.errors if files else [f"{path}: no .toml file in this folder"]
+
+
+def _place(error: ErrorDetails) -> tuple[int | str, ...]:
+    """Return the place of what cannot be used because of an error: a key, a field, a table."""
+    location = error["loc"]
+    if error["type"] == "extra_forbidden":
+        return location
+    if len(location) > 3 and location[2] == "fields":
+        return location[:4]
+    return location[: 2 if isinstance(location[1 % len(location)], int) else 1]
+
+
+def _order(place: tuple[int | str, ...]) -> tuple[tuple[int, str], ...]:
+    return tuple((step, "") if isinstance(step, int) else (-1, step) for step in place)
+
+
+def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
+    """Return the name of the table at a place."""
+    try:
+        name = document[place[0]][place[1]]["name"]
+    except (IndexError, KeyError, TypeError):
+        return None
+    return name if isinstance(name, str) else None
 
 
 def _key_path(document: object, location: tuple[int | str, ...]) -> str:
@@ -82,8 +120,13 @@ def _known_keys(location: tuple[int | str, ...]) -> list[str]:
 class _Builder:
     """Collects the files of a definition and validates them together."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, run_plugin: bool) -> None:
         self.errors: list[str] = []
+        self._run_plugin = run_plugin
+        self._unread = False
+        """Whether a file could not be read, so that names may be missing because of that."""
+        self._broken: set[str] = set()
+        """Names of tables with errors, which are missing, or lack a field."""
         self._path = path
         self._model: DeviceModel = device_model()
         self._enums: dict[str, EnumDefinition] = {}
@@ -104,9 +147,11 @@ class _Builder:
             document = tomllib.loads(read_user_text(file))
         except OSError as error:
             self.errors.append(f"{file}: cannot read the interface definition: {error.strerror}")
+            self._unread = True
             return
         except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:
             self.errors.append(f"{file}: not valid TOML: {error}")
+            self._unread = True
             return
         try:
             model = schema.FileModel.model_validate(document)
@@ -118,22 +163,43 @@ class _Builder:
                     self.errors.append(f"{where}: unknown key{hint}")
                 else:
                     self.errors.append(f"{where}: {item['msg']}")
-            return
+            for place in sorted({_place(item) for item in error.errors()}, key=_order, reverse=True):
+                self._remove(document, place)
+            model = schema.FileModel.model_validate(document)
         self._files.append((file, model))
 
-    def _attempt(self, step: Callable[..., None], *arguments: object) -> None:
-        """Run one step of building and record its error."""
+    def _remove(self, document: Any, place: tuple[int | str, ...]) -> None:
+        """Remove what is invalid from a document, and record the names that are missing because of that."""
+        *path, last = place
+        named = [name for name in (_name_at(document, place[:2]),) if name is not None]
+        self._broken |= {*named, *(name.removeprefix(SETS) for name in named)}
+        if place[0] == CLASS:
+            self._broken.add(CLASS)
+        if place == ("unit",):
+            document["unit"] = UNKNOWN_UNIT
+            self._plugin = Plugin(skipped="")
+            return
+        for step in path:
+            document = document[step]
+        del document[last]
+
+    def _attempt(self, step: Callable[..., None], *arguments: object) -> bool:
+        """Run one step of building and record its error; return whether there was none."""
         try:
             step(*arguments)
         except IcdError as error:
+            self._record(error)
+            return False
+        return True
+
+    def _record(self, error: IcdError) -> None:
+        """Record an error, except for a name that is missing because of another error."""
+        caused = isinstance(error, MissingNameError) and (self._unread or error.name in self._broken)
+        if not caused:
             self.errors.append(str(error))
 
-    def build(self) -> InterfaceDefinition | None:
-        """Build the definition; return None if an error makes this impossible."""
-        if (
-            self.errors
-        ):  # rows refer to rows in other files, so errors in one would cause false ones in others
-            return None
+    def build(self) -> InterfaceDefinition:
+        """Build what is valid of the definition."""
         for file, model in self._files:
             for name, table in (
                 ("unit", model.unit),
@@ -145,20 +211,23 @@ class _Builder:
                 if table is not None:
                     self._attempt(self._add_table, name, file, table)
             for item in model.class_:
-                self._attempt(self._add_class, file, item)
+                if not self._attempt(self._add_class, file, item):
+                    self._broken |= {CLASS, item.name}
             for enum in model.enum:
                 self._attempt(self._add_enum, file, enum)
             for section in model.section:
                 self._attempt(self._add_section, file, section)
         if "unit" not in self._tables:
-            self.errors.append(f"{self._path}: no [unit] with name, version and doc")
-            return None
+            if not self._unread:
+                self.errors.append(f"{self._path}: no [unit] with name, version and doc")
+            self._tables["unit"] = (self._path, schema.UnitModel.model_validate(UNKNOWN_UNIT))
+            self._plugin = Plugin(skipped="")
+        self._attempt(self._load_plugin)
         conventions = Conventions()
         try:
-            self._load_plugin()
             conventions = self._conventions()
         except IcdError as error:
-            self.errors.append(str(error))
+            self._record(error)
         self.byte_order = conventions.byte_order
         self._add_parameters()
         rows: dict[str, Row] = {}
@@ -180,8 +249,16 @@ class _Builder:
                     raise IcdError(f"{where}: link.serial with framing cubespace has no echoes")
                 if link.can is not None:
                     raise IcdError(f"{where}: link.can has no echoes")
-        if link.serial is None:
+        custom = link.serial is not None and "custom" in (link.serial.framing.kind, link.serial.check.kind)
+        if link.serial is None or (custom and definition.plugin.skipped is not None):
             return
+        if isinstance(link.serial.framing, CubeSpaceFraming):
+            for name in link.serial.framing.unanswered:
+                if name not in definition.telecommands:
+                    raise IcdError(
+                        f"{self._tables['link'][0]}: link.serial.framing.unanswered: no telecommand named {name!r}"
+                        f"{did_you_mean(name, definition.telecommands)}"
+                    )
         try:
             build_serial_stack(definition)
         except IcdError as error:
@@ -238,8 +315,15 @@ class _Builder:
         return unit
 
     def _load_plugin(self) -> None:
-        if self._unit.plugin is not None:
-            self._plugin = load_plugin(self._tables["unit"][0].parent / self._unit.plugin)
+        file, name = self._tables["unit"][0], self._unit.plugin
+        if name is None:
+            return
+        self._plugin = Plugin(skipped=name)  # also if it fails: its names are unknown, not wrong
+        if self._run_plugin:
+            try:
+                self._plugin = load_plugin(file.parent, name)
+            except IcdError as error:
+                raise IcdError(f"{file}: {error}") from error
 
     def _conventions(self) -> Conventions:
         file, table = self._tables.get("conventions", (self._path, schema.ConventionsModel()))
@@ -248,7 +332,12 @@ class _Builder:
         one, two, three = table.axes
         try:
             return Conventions(
-                table.quaternion, table.scalar_sign, (one, two, three), table.epoch, table.byte_order
+                table.quaternion,
+                table.scalar_sign,
+                (one, two, three),
+                table.epoch,
+                table.byte_order,
+                table.telecommand_crc,
             )
         except IcdError as error:
             raise IcdError(f"{file}: {error}") from None
@@ -304,8 +393,9 @@ class _Builder:
             self._used_enums.add(name)
             return self._model.enums[name]
         known = sorted({*self._enums, *self._model.enums})
-        raise IcdError(
-            f"{where}: no enumeration named {name!r}{did_you_mean(name, known)} (known: {', '.join(known)})"
+        raise MissingNameError(
+            f"{where}: no enumeration named {name!r}{did_you_mean(name, known)} (known: {', '.join(known)})",
+            name,
         )
 
     # --- parameters ---
@@ -396,26 +486,36 @@ class _Builder:
     def _add_rows(
         self, kind: RowKind, file: Path, model: schema.RowModel, rows: dict[str, Row], done: list[Row]
     ) -> None:
-        for row in self._expand_row(kind, file, model, rows):
-            self._check_unique(file, row, rows)
-            check_row(row, self._model, self._plugin, f"{file}: {kind} {row.name}")
-            rows[row.name] = row
-            done.append(row)
+        try:
+            built = list(self._expand_row(kind, file, model, rows))
+        except IcdError:
+            self._broken.add(model.name)
+            raise
+        for row in built:
+            where = f"{file}: {kind} {row.name}"
+            whole = model.name not in self._broken
+            self.errors += check_row(row, self._model, self._plugin, where, complete=whole)
+            if self._attempt(self._check_unique, file, row, rows):
+                rows[row.name] = row
+                done.append(row)
 
     def _class_of(self, kind: RowKind, model: schema.RowModel, where: str) -> str:
-        if model.class_ is not None:
-            found = self._classes.get(model.class_)
-            if found is None:
-                raise IcdError(
-                    f"{where}: no class named {model.class_!r}{did_you_mean(model.class_, self._classes)}"
+        """Return the class of a row; record an error and return none if it is wrong."""
+        of_kind = [item.name for item in self._classes.values() if item.kind.value == kind]
+        if model.class_ is None:
+            if (len(of_kind) > 1 or (self._classes and not of_kind)) and CLASS not in self._broken:
+                self._record(
+                    IcdError(f"{where}: needs `class`, one of {', '.join(of_kind or self._classes)}")
                 )
-            if found.kind.value != kind:
-                raise IcdError(f"{where}: class {model.class_} is for {found.kind.value}, not for {kind}")
-            return model.class_
-        names = [item.name for item in self._classes.values() if item.kind.value == kind]
-        if len(names) > 1 or (self._classes and not names):
-            raise IcdError(f"{where}: needs `class`, one of {', '.join(names or self._classes)}")
-        return names[0] if names else ""
+            return of_kind[0] if of_kind else ""
+        found = self._classes.get(model.class_)
+        if found is None:
+            text = f"{where}: no class named {model.class_!r}{did_you_mean(model.class_, self._classes)}"
+            self._record(MissingNameError(text, model.class_))
+            return ""
+        if found.kind.value != kind:
+            self._record(IcdError(f"{where}: class {model.class_} is for {found.kind.value}, not for {kind}"))
+        return model.class_
 
     def _check_unique(self, file: Path, row: Row, rows: Mapping[str, Row]) -> None:
         where = f"{file}: {row.kind} {row.name}"
@@ -453,18 +553,14 @@ class _Builder:
         self, kind: RowKind, file: Path, model: schema.RowModel, rows: Mapping[str, Row]
     ) -> Iterator[Row]:
         where = f"{file}: {kind} {model.name}"
-        if model.fields is None and model.include is None:
-            raise IcdError(f"{where}: needs `fields` or `include`")
         provenance = model.provenance or self._unit.provenance
         if provenance is None:
             raise IcdError(f"{where}: needs `provenance`, here or in [unit]")
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
             raise IcdError(f"{where}: last_id {last} is below ID {model.id}")
-        if kind == "telemetry" and (
-            model.action is not None or model.arguments or model.readback is not None
-        ):
-            raise IcdError(f"{where}: only telecommands have an action or a readback")
+        if kind == "telemetry" and model.readback is not None:
+            raise IcdError(f"{where}: only telecommands have a readback")
         if model.readback is not None and not model.name.startswith(SETS):
             raise IcdError(f"{where}: the name of a telecommand with a readback must begin with {SETS}")
         klass = self._class_of(kind, model, where)
@@ -473,11 +569,17 @@ class _Builder:
             layout = Layout(self, where, kind, provenance, None if single else number)
             for name in model.include or ():
                 if name not in rows:
-                    raise IcdError(f"{where}: include: no row named {name!r}{did_you_mean(name, rows)}")
+                    self._broken.add(model.name)
+                    raise MissingNameError(
+                        f"{where}: include: no row named {name!r}{did_you_mean(name, rows)}", name
+                    )
                 layout.include(rows[name])
-            for item in model.fields or ():
-                layout.add(item)
-            if model.size is not None and layout.size != model.size:
+                if name in self._broken:
+                    self._broken.add(model.name)
+            for item in model.fields:
+                if not self._attempt(layout.add, item):
+                    self._broken.add(model.name)
+            if model.size is not None and layout.size != model.size and model.name not in self._broken:
                 raise IcdError(f"{where}: size is {model.size} but the fields add up to {layout.size} bytes")
             yield Row(
                 kind=kind,
@@ -507,7 +609,8 @@ class _Builder:
             if kind not in ("echo", "reply", "row") or (kind == "row") != bool(name):
                 raise IcdError(f"{where}: must be echo, reply or row:NAME")
             if kind == "row" and (name not in rows or rows[name].kind != "telemetry"):
-                raise IcdError(f"{where}: no telemetry row with this name{did_you_mean(name, rows)}")
+                text = f"{where}: no telemetry row with this name{did_you_mean(name, rows)}"
+                raise MissingNameError(text, name)
 
 
 def _readbacks(telecommands: list[schema.RowModel]) -> Iterator[schema.RowModel]:

@@ -61,7 +61,19 @@ class Layout:
             self._append(field)
 
     def add(self, model: FieldModel) -> None:
-        """Append a field, a series of numbered fields, a repeated group, or the bits of a bit field."""
+        """Append a field, a series of numbered fields, a repeated group, or the bits of a bit field.
+
+        Raises IcdError, after which the layout is as before.
+        """
+        fields, slots, size = len(self.fields), len(self.slots), self.size
+        try:
+            self._add(model)
+        except IcdError:
+            del self.fields[fields:], self.slots[slots:]
+            self.size = size
+            raise
+
+    def _add(self, model: FieldModel) -> None:
         where = f"{self._where}: field {model.name or 'unused'}"
         if model.text is not None:
             for item in self._of_text(model):

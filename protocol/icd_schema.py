@@ -41,7 +41,8 @@ class UnitModel(_Model):
     provenance: Provenance | None = None
     """Default provenance of rows."""
     plugin: str | None = None
-    """Python file beside the definition, with custom quantities, actions, framings or checks."""
+    """Name of a Python file beside the definition, with custom quantities, actions, framings or checks. Reading the
+    definition runs this file."""
 
 
 class ConventionsModel(_Model):
@@ -59,6 +60,9 @@ class ConventionsModel(_Model):
     `2000-01-01`."""
     byte_order: Order = "little"
     """Default byte order of fields."""
+    telecommand_crc: bool = False
+    """Whether the CRC-8 of its data may follow the data of a telecommand: reflected polynomial 12h, initial value
+    0, but FFh without data (CubeSpace). If it is wrong, the telecommand is refused with `crc`."""
 
 
 class ClassModel(_Model):
@@ -192,7 +196,7 @@ class RowModel(_Model):
     """Public source of the row."""
     size: Annotated[int, Field(ge=0, le=4096)] | None = None
     """Expected size of the data in bytes; the fields are checked against it."""
-    fields: list[FieldModel] | None = None
+    fields: list[FieldModel] = []
     """Fields in wire order, after the fields of `include`; each is a table or a string (`text`)."""
     include: list[str] | None = None
     """Rows whose fields this row concatenates, in order."""
@@ -202,7 +206,7 @@ class RowModel(_Model):
     """ID of a telemetry row that reports the last accepted values of this telecommand. If the
     telecommand is `set_NAME`, the telemetry row is `NAME`."""
     action: str | None = None
-    """Action that a telecommand performs."""
+    """Action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
     answer: list[str] | None = None

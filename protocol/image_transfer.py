@@ -1,7 +1,7 @@
 """Transfer of images and files, for both ends: image frames with a checksum, burst packets and the hole map.
 
-Image frames follow the CubeSense node, bursts the CubeComputer. The checksum algorithms are not public; both
-are our own choice.
+Image frames follow the CubeSense node, bursts the CubeComputer. The checksum of a frame is our own choice. That of
+files and blocks is a CRC-16 that begins with 0 (EnduroSat cubeadcs); its polynomial is not public and our own choice.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ def frame_checksum(frame: bytes) -> int:
     return sum(frame) % 256
 
 
-def block_checksum(block: bytes) -> int:
-    """Return the CRC-16/CCITT-FALSE of a block.
+def file_checksum(data: bytes) -> int:
+    """Return the CRC-16/XMODEM of a file or block.
 
-    Polynomial 0x1021, initial value 0xFFFF; "123456789" gives 0x29B1.
+    Polynomial 0x1021, initial value 0; "123456789" gives 0x31C3.
     """
-    return binascii.crc_hqx(block, 0xFFFF)
+    return binascii.crc_hqx(data, 0)
 
 
 def packet_count(size: int) -> int:

@@ -38,6 +38,8 @@ class CubeSpaceFraming(_Model):
     """Selects this framing."""
     dialect: Literal["a", "b", "c"] | None = None
     """Dialect of the unit; default: selected by the parameter `serial_dialect`."""
+    unanswered: list[str] = []
+    """Telecommands that are neither acknowledged nor refused on the serial line."""
 
 
 class EscapedFraming(_Model):

@@ -15,7 +15,8 @@ Example of `unit.py` beside the TOML files of a unit with `plugin = "unit.py"` i
 The function of a quantity is called with a `starhil.emulator.device.snapshot.Snapshot` of the device. The
 function of an action is called with the device and the arguments by name; it returns nothing, messages that
 follow the answer, or `bytes`, which are the data of the answer; a list of `bytes` makes several answers.
-Framings and checks are used by `starhil.protocol.composed_stack`.
+A framing is a class derived from `starhil.protocol.framings.Framing`, whose constructor takes no arguments; a
+check is a function that returns the check of the covered bytes. docs/your-unit.md has an example of each.
 """
 
 from __future__ import annotations
@@ -24,12 +25,17 @@ import runpy
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.user_file import read_user_file
 from starhil.protocol.values import IcdError
 
 Function = TypeVar("Function")
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,8 @@ class Plugin:
     actions: dict[str, Callable[[Any, Mapping[str, Any]], Any]] = field(default_factory=dict)
     framings: dict[str, Any] = field(default_factory=dict)
     checks: dict[str, Any] = field(default_factory=dict)
+    skipped: str | None = None
+    """Name of the plugin's file if it was not run, so that any unknown name may be the plugin's."""
 
 
 _loading: ContextVar[Plugin | None] = ContextVar("plugin that is being loaded", default=None)
@@ -81,28 +89,52 @@ def action(name: str) -> Callable[[Function], Function]:
 
 def framing(name: str) -> Callable[[Function], Function]:
     """Register a class as a framing."""
-    return _registering("framings", name)
+    return _registering("framings", name, partial(guarded, f"framing {name}"))
 
 
 def check(name: str) -> Callable[[Function], Function]:
     """Register a function of bytes as a check."""
-    return _registering("checks", name)
+    return _registering("checks", name, partial(guarded, f"check {name}"))
 
 
-def load_plugin(file: Path) -> Plugin:
+def guarded(what: str, function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """Return a function of a plugin whose failures, an exit included, are raised as an IcdError of one line."""
+
+    def call(*arguments: Arguments.args, **named: Arguments.kwargs) -> Result:
+        try:
+            return function(*arguments, **named)
+        except (ProtocolError, KeyboardInterrupt):
+            raise
+        except BaseException as error:
+            text = " ".join(f"{type(error).__name__}: {error}".split()).removesuffix(":")
+            raise IcdError(f"the plugin fails in {what}: {text}") from error
+
+    return call
+
+
+def load_plugin(folder: Path, name: str) -> Plugin:
     """Run the plugin of a unit and return the functions that it defines.
 
-    Raises IcdError with the error of the plugin in one line.
+    Raises IcdError, with one line, for a name that is not that of a file in the folder, also if this is a link to
+    another folder; for a file that cannot be read; and for an error of the plugin.
     """
+    file = folder / name
+    try:
+        beside = file.name == name and file.resolve().parent == folder.resolve()
+    except (OSError, RuntimeError, ValueError):  # a loop of links, or no file name
+        beside = False
+    if not beside:
+        raise IcdError(f"unit.plugin: {name!r} must be the name of a file beside the definition")
+    try:
+        read_user_file(file)  # rejects a pipe, on which running it would wait
+    except FileNotFoundError:
+        raise IcdError(f"unit.plugin: {name!r}: no such plugin; it is a file beside the definition") from None
+    except OSError as error:
+        raise IcdError(f"unit.plugin: {file}: cannot be read: {error.strerror}") from None
     plugin = Plugin()
     token = _loading.set(plugin)
     try:
-        runpy.run_path(str(file))
-    except FileNotFoundError:
-        raise IcdError(f"{file}: no such plugin; unit.plugin names a file beside the definition") from None
-    except Exception as error:
-        text = " ".join(str(error).split())
-        raise IcdError(f"{file}: the plugin fails: {type(error).__name__}: {text}") from error
+        guarded(name, runpy.run_path)(str(file))
     finally:
         _loading.reset(token)
     return plugin

@@ -6,15 +6,22 @@ other unit is composed of parts from `framings`, `checks` and `envelope` (`compo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from starhil.protocol.checks import CheckFunction
+from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
-from starhil.protocol.framings import Framing
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import CubeSpaceFraming, Order, SerialLinkModel
-from starhil.protocol.messages import DEFAULT_MAX_SIZE, MessageClass, Reply, Request, RequestKind
+from starhil.protocol.messages import (
+    DEFAULT_MAX_SIZE,
+    MessageClass,
+    Reply,
+    ReplyKind,
+    Request,
+    RequestKind,
+)
 from starhil.protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver
 from starhil.protocol.serial_framing import encode_reply as encode_cubespace_reply
 from starhil.protocol.serial_framing import encode_request as encode_cubespace_request
@@ -31,12 +38,13 @@ class CubeSpaceStack(SerialStack):
         The only dialect of the unit, used for any style; None if it has all three.
     """
 
-    def __init__(self, link: SerialLinkModel) -> None:
+    def __init__(self, link: SerialLinkModel, rows: Sequence[RowShape] = ()) -> None:
         self.baud = link.baud
         self._timeout_s = link.timeout
         self._max_size = link.max_size or DEFAULT_MAX_SIZE
         given = link.framing.dialect if isinstance(link.framing, CubeSpaceFraming) else None
         self.dialect: Final = None if given is None else Dialect(given)
+        self._silent = frozenset(row.id for row in rows if not row.answers)
 
     def device(self) -> DeviceReceiver:
         """Return a receiver for the device's end."""
@@ -55,7 +63,9 @@ class CubeSpaceStack(SerialStack):
         return encode_cubespace_request(request)
 
     def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:
-        """Return a reply as bytes on the line, in a dialect."""
+        """Return a reply as bytes on the line, in a dialect; empty if the row has no answer."""
+        if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) and reply.id in self._silent:
+            return b""
         return encode_cubespace_reply(reply, self._style(style))
 
     def _style(self, style: Dialect | None) -> Dialect:
@@ -68,7 +78,7 @@ def build_stack(
     rows: Sequence[RowShape] = (),
     byte_order: Order = "little",
     *,
-    framings: Mapping[str, Framing] | None = None,
+    framings: Mapping[str, Callable[[], object]] | None = None,
     checks: Mapping[str, CheckFunction] | None = None,
 ) -> SerialStack:
     """Return the serial link of a unit.
@@ -79,7 +89,7 @@ def build_stack(
         Parts of the link are incompatible.
     """
     if isinstance(link.framing, CubeSpaceFraming):
-        return CubeSpaceStack(link)
+        return CubeSpaceStack(link, rows)
     return ComposedStack(link, classes, rows, byte_order, framings=framings, checks=checks)
 
 
@@ -108,6 +118,13 @@ def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | No
     return Dialect(framing.dialect or wanted or Dialect.B)
 
 
+def serial_answers(icd: InterfaceDefinition, row: Row) -> tuple[str, ...]:
+    """Return the answers of a row on the serial line, of which there may be fewer than on other links."""
+    framing = None if icd.link.serial is None else icd.link.serial.framing
+    silent = isinstance(framing, CubeSpaceFraming) and row.name in framing.unanswered
+    return () if silent else row.answers
+
+
 def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
     """Return the serial link of a definition.
 
@@ -126,7 +143,7 @@ def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
             RequestKind(row.kind),
             row.size if row.kind == "telecommand" else 0,
             row.size if row.kind == "telemetry" else 0,
-            row.answers,
+            serial_answers(icd, row),
         )
         for row in icd.rows
     ]

@@ -38,6 +38,14 @@ class IcdError(ProtocolError):
     """An invalid interface definition; the text names file, row and field."""
 
 
+class MissingNameError(IcdError):
+    """A name that the definition uses but does not define."""
+
+    def __init__(self, text: str, name: str) -> None:
+        super().__init__(text)
+        self.name = name
+
+
 class MessageError(ProtocolError):
     """A message or value that violates the interface definition.
 

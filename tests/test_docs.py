@@ -11,7 +11,7 @@ import re
 import shlex
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sky.view import Sky
+from starhil.emulator.truth.file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
 from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
@@ -221,14 +222,20 @@ def test_every_link_between_documents_leads_somewhere():
                 assert anchor in anchors, f"{file.name}: {target}"
 
 
-def test_files_and_caches_has_every_column_and_status_of_the_truth_log():
+def columns_of_files_and_caches(title: str) -> list[str]:
+    """Return the names in the first column of the tables of a section."""
     text = (DOCS / "files-and-caches.md").read_text(encoding="utf-8")
-    (section,) = re.findall(r"^## Truth log\n(.*?)^## ", text, re.MULTILINE | re.DOTALL)
-    names = [
-        name
-        for cell in re.findall(r"^\|([^|]*)", section, re.MULTILINE)
-        for name in re.findall(r"`(\w+)`", cell)
-    ]
+    (section,) = re.findall(rf"^## {title}\n(.*?)^## ", text, re.MULTILINE | re.DOTALL)
+    cells = re.findall(r"^\|([^|]*)", section, re.MULTILINE)
+    return [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
+
+
+def test_files_and_caches_has_every_column_of_a_truth_file():
+    assert columns_of_files_and_caches("Truth file") == list(BOUNDS)
+
+
+def test_files_and_caches_has_every_column_and_status_of_the_truth_log():
+    names = columns_of_files_and_caches("Truth log")
     assert names == [*COLUMNS, *(status for status in names if status in set(TruthStatus))]
     assert set(TruthStatus) <= set(names)
 
@@ -329,18 +336,12 @@ def program_under(heading: str) -> tuple[Block, str]:
 
 
 def check_program(heading: str, ready: dict[str, str], folder: Path) -> None:
-    """Run a program of the walk-through as a process, and compare the words that it prints."""
+    """Run a program of the walk-through, and compare the words that it prints."""
     block, shown = program_under(heading)
     (folder / "starhil.eds").write_text(export(load_unit(), "eds"), encoding="ascii")
-    done = subprocess.run(
-        [sys.executable, "-c", here(block.text, ready)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr
-    assert without_numbers(done.stdout) == without_numbers(shown)
+    with contextlib.chdir(folder):
+        printed = run(replace(block, text=here(block.text, ready)), {})
+    assert without_numbers(printed) == without_numbers(shown)
 
 
 def test_walkthrough_decodes_the_attitude():

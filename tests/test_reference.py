@@ -6,8 +6,6 @@ import importlib.util
 import json
 import re
 import socket
-import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -19,6 +17,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.script import load_script
 from starhil.protocol.icd import load_unit
+from tests.emulator.cli.command_line import run_command_line
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -186,12 +185,9 @@ def test_the_example_of_a_scenario_is_accepted(tmp_path):
 def test_the_example_of_a_session_passes(tmp_path):
     path = tmp_path / "quick_check.toml"
     path.write_text(example("sessions.md", 'title = "Quick check"'), encoding="utf-8")
-    done = subprocess.run(
-        [Path(sys.executable).parent / "starhil", "session", path, "--start", "--serial", "auto",
-         "--log", tmp_path / "log"],
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
-    assert done.returncode == 0, done.stdout + done.stderr
+    words = ["session", str(path), "--start", "--serial", "auto", "--log", str(tmp_path / "log")]
+    status, out, said = run_command_line(*words)
+    assert status == 0, out + said
 
 
 @pytest.mark.process

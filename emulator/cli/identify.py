@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,6 +25,8 @@ _NUMBERED_TO_MAGNITUDE = 3.0
 _SHOWN_STARS = 12
 _ANY_FIELD = "auto"
 _TOLERANCE = 0.1
+_TIME_LIMIT_S = 15.0
+_PROGRESS_EVERY_S = 2.0
 _MODELS: dict[str, Model] = {"pinhole": "pinhole", "equidistant": "equidistant"}
 
 
@@ -46,6 +50,15 @@ def command(
         typer.Option(min=0.0, max=0.3, help="Relative uncertainty of --fov; default 0.1. Not with auto."),
     ] = None,
     model: Annotated[str, typer.Option(help="With --fov: pinhole or equidistant.")] = "pinhole",
+    time_limit: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="With --fov: give up after this time; 0 for no limit. Building an index, which is done once, does not "
+            "count.",
+        ),
+    ] = _TIME_LIMIT_S,
     epoch: Annotated[float | None, typer.Option(help="Julian year of the image; default 2026.")] = None,
     date: Annotated[
         str | None,
@@ -106,8 +119,8 @@ def command(
         epoch = DEFAULT_EPOCH if unix_s is None else float(round(julian_year(unix_s)))
     catalog = load_catalog(epoch=epoch)
     velocity = _velocity(unix_s, observer_velocity)
-    result = _solve(pixels, catalog, profile, fov, fov_tolerance, model, velocity)
-    report = _report(image, result, _advice(result, fov, model))
+    result = _solve(pixels, catalog, profile, fov, fov_tolerance, model, velocity, time_limit or math.inf)
+    report = _report(image, result, _advice(result, fov, model, time_limit))
     if annotate is not None:
         write_image(annotate, _marked(pixels, result))
     if as_json:
@@ -126,6 +139,7 @@ def _solve(
     fov_tolerance: float | None,
     model: str,
     observer_velocity: NDArray[np.float64] | None,
+    time_limit_s: float,
 ) -> ImageSolution:
     """Solve an image with the camera that the options select."""
     from starhil.emulator.errors import EmulatorError
@@ -145,7 +159,14 @@ def _solve(
             raise EmulatorError(
                 "identify: --fov-tolerance has no effect with --fov auto; omit it, or give --fov in degrees"
             )
-        return solve_any_field(pixels, catalog, model=_MODELS[model], observer_velocity=observer_velocity)
+        return solve_any_field(
+            pixels,
+            catalog,
+            model=_MODELS[model],
+            observer_velocity=observer_velocity,
+            time_limit_s=time_limit_s,
+            progress=_Progress(),
+        )
     try:
         width_deg = read_number(fov)
     except ValueError:
@@ -157,7 +178,22 @@ def _solve(
         catalog,
         fov_tolerance=_TOLERANCE if fov_tolerance is None else fov_tolerance,
         observer_velocity=observer_velocity,
+        time_limit_s=time_limit_s,
+        progress=_Progress(),
     )
+
+
+class _Progress:
+    """Reports the progress of a search on stderr every two seconds."""
+
+    def __init__(self) -> None:
+        self._begin = self._reported = time.monotonic()
+
+    def __call__(self, attempt: str) -> None:
+        now = time.monotonic()
+        if now - self._reported >= _PROGRESS_EVERY_S:
+            self._reported = now
+            typer.echo(f"searching for {now - self._begin:.0f} s: {attempt}", err=True)
 
 
 def _unix_time(date: str) -> float:
@@ -206,7 +242,7 @@ def _camera(profile: str | None) -> Camera:
     return Camera.from_dict(load_profile(profile).camera.values())
 
 
-def _advice(result: ImageSolution, fov: str | None, model: str) -> str:
+def _advice(result: ImageSolution, fov: str | None, model: str, time_limit_s: float) -> str:
     """Return a suggestion for an image that was not identified; empty if it was identified."""
     solution, found = result.solution, result.detections
     if solution.valid:
@@ -214,6 +250,12 @@ def _advice(result: ImageSolution, fov: str | None, model: str) -> str:
     if solution.reason == "too_few_stars":
         seen = found.reason or f"only {len(found)} stars detected"
         return f"{seen}; expose longer, or crop the image to the sky"
+    advice = _advice_on_camera(fov, model)
+    return advice if result.complete else f"given up after {time_limit_s:g} s (--time-limit); {advice}"
+
+
+def _advice_on_camera(fov: str | None, model: str) -> str:
+    """Return a suggestion about the camera of an image with stars."""
     if fov is None:
         return "give the camera's profile with --profile, or its rough field of view in degrees with --fov"
     if fov == _ANY_FIELD:

@@ -13,18 +13,37 @@ from starhil.emulator.cli.options import AsJson
 
 def command(
     folder: Annotated[Path, typer.Argument(help="Folder written by `starhil run --record`.")],
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            help="Device profile, a name or a TOML file, instead of the one in the recording; `[links]` and `[run]`, except its "
+            "algorithm, stay as recorded."
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="SECTION.KEY=VALUE", help="Override a key of that profile. Repeatable."
+        ),
+    ] = None,
     as_json: AsJson = False,
 ) -> int:
     """Replay a recorded run on the stepped clock and compare everything that the device sends and measures.
 
-    The exit status is 0 if all bytes are identical, otherwise 1.
+    A recording contains its profile. The exit status is 0 if all bytes are identical, 1 if anything differs or is missing,
+    and 2 if the recording cannot be played.
     """
     import asyncio
     import json
 
+    from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.profile import load_profile
     from starhil.emulator.replay import replay
 
-    report = asyncio.run(replay(folder))
+    if overrides and profile is None:
+        raise EmulatorError("--set: changes the profile given by --profile; give both")
+    changed = None if profile is None else load_profile(profile, overrides or ())
+    report = asyncio.run(replay(folder, changed))
     if as_json:
         print(json.dumps(dataclasses.asdict(report)))
     else:

@@ -77,31 +77,37 @@ def new(
 
 
 @group.command("check")
-def check(unit: UnitArgument, as_json: AsJson = False) -> None:
+def check(
+    unit: UnitArgument,
+    no_plugin: Annotated[
+        bool,
+        typer.Option(
+            "--no-plugin",
+            help="Do not run the Python file that the unit names as its plugin; what it defines is then not checked.",
+        ),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
     """Check a unit: list all errors, or show an example exchange of each row in hexadecimal.
 
-    The exit status is 0 if there are no errors, otherwise 1.
+    This runs the unit's plugin, a Python file, if it has one: check the unit of a stranger with --no-plugin. The exit
+    status is 0 if there are no errors, otherwise 1.
     """
-    from starhil.protocol.errors import ProtocolError
-    from starhil.protocol.icd import check_unit, load_unit
-    from starhil.protocol.unit_examples import Exchange, exchanges
+    from starhil.protocol.unit_examples import examine
 
-    errors = check_unit(unit)
-    examples: list[Exchange] = []
-    if not errors:
-        try:
-            examples = list(exchanges(load_unit(unit)))
-        except ProtocolError as error:
-            errors = [f"unit {unit}: {error}"]
+    definition, errors, examples = examine(unit, run_plugin=not no_plugin)
+    skipped = definition.plugin.skipped if no_plugin else None
     if as_json:
         shown = [
             {"row": item.row.name, "link": item.link, "request": item.request, "answers": item.answers}
             for item in examples
         ]
-        print(json.dumps({"unit": unit, "errors": errors, "examples": shown}))
+        print(json.dumps({"unit": unit, "errors": errors, "examples": shown, "skipped_plugin": skipped}))
     else:
         for text in errors:
             print_text(text + "\n")
+        if skipped:
+            print_text(f"{skipped} was not run: its names, and examples on its link, are not checked\n")
         for item in examples:
             print(
                 f"{item.row.kind} {item.row.name}, ID 0x{item.row.id:02X}, {item.row.size} B, on {item.link}"

@@ -258,6 +258,7 @@ class ControlServer:
                 "accepted": feed.accepted,
                 "refused": feed.refused,
                 "last_fault": feed.last_fault,
+                "speed": feed.speed.ratio,
                 "address": emulation.leader.ready_fields.get("truth", ""),
             }
         return answer
@@ -291,9 +292,11 @@ class ControlServer:
 
     async def _set_truth(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
         _check_keys(request, "truth")
-        if not isinstance(request.get("truth"), dict):
-            raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
-        config = _parse(_TRUTH, _Truth, request["truth"], "truth")
+        config = target.emulation.leader.profile.truth
+        if "truth" in request:
+            if not isinstance(request["truth"], dict):
+                raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
+            config = _parse(_TRUTH, _Truth, request["truth"], "truth")
         async with self._opening:  # reading a file takes time, so the last request wins
             await target.emulation.change_truth(config)
         return {"kind": config.kind, "address": target.emulation.leader.ready_fields.get("truth", "")}

@@ -178,6 +178,29 @@ def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Ackno
     device.parameters.set({"unsolicited_selection": row_id, "unsolicited_rate": arguments["rate"]})
 
 
+def rewind_file_list(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+    """Go to the first file of the list."""
+    device.files.rewind()
+
+
+def advance_file_list(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+    """Go to the next file of the list."""
+    device.files.advance()
+
+
+def erase_file(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+    """Erase one file or all."""
+    if arguments["all"]:
+        device.files.erase_all(formatting=False)
+    elif not device.files.erase(str(arguments["file_type"]), int(arguments["file_counter"])):
+        raise Refused(ErrorCode.INVALID_PARAMETER, argument="file_counter")
+
+
+def format_card(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+    """Erase all files."""
+    device.files.erase_all(formatting=True)
+
+
 def load_file_block(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
     """Load a block of a file."""
     offset, length = int(arguments["offset"]), int(arguments["length"])
@@ -190,6 +213,11 @@ def start_burst(device: Device, arguments: Arguments, _acknowledge: Acknowledge)
     if not device.files.ready:
         raise Refused(ErrorCode.SEQUENCE)
     return device.files.burst(ignore_hole_map=bool(arguments["ignore_hole_map"]))
+
+
+def next_packet(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+    """Go to the next packet of the last burst."""
+    device.files.next_packet()
 
 
 def set_hole_map(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
@@ -216,8 +244,13 @@ ACTIONS: Final[dict[str, Action]] = {
         save_image,
         open_image,
         load_image_chunk,
+        rewind_file_list,
+        advance_file_list,
+        erase_file,
+        format_card,
         load_file_block,
         start_burst,
+        next_packet,
         set_hole_map,
     )
 }

@@ -11,12 +11,13 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.quantities import Getter, getter_of
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.snapshot import Snapshot
+from starhil.protocol.checks import crc
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.device_model import PARAMETER
+from starhil.protocol.device_model import HEALTH, HEALTH_DEFAULTS, PARAMETER
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd_bindings import quantity_of
 from starhil.protocol.icd_layout import text_of
-from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import Value
 
@@ -26,6 +27,7 @@ class TelemetryBinding:
 
     def __init__(self, row: Row, icd: InterfaceDefinition) -> None:
         self.row = row
+        self._after = None if row.action is None else _action_of(row.action, icd)
         self._getters = [
             (field.name, getter)
             for field in row.named_fields.values()
@@ -43,7 +45,10 @@ class TelemetryBinding:
             value = getter(snapshot)
             if value is not None:
                 values[name] = value
-        return self.row.encode(values, saturate=True)
+        data = self.row.encode(values, saturate=True)
+        if self._after is not None:
+            self._after(device, self.row.arguments, device.acknowledge)
+        return data
 
 
 def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
@@ -55,11 +60,26 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
         return None
     own = icd.plugin.quantities.get(name)
     getter: Getter = getter_of(name) if own is None else own.function
+    if own is None and name.startswith(HEALTH):
+        return _health(getter, field, icd)
     declared = quantity_of(name, icd.model, icd.plugin)
     scale = None if declared is None else factor(declared.unit, field.unit)
     if scale not in (None, 1.0):
         getter = _scaled(getter, float(scale or 1.0))
     return getter if field.enum is None else _named(getter, field)
+
+
+def _health(given: Getter, field: Field, icd: InterfaceDefinition) -> Getter:
+    """Return a getter for a number of the profile's `[health]`.
+
+    If the profile has none, the value is the field's default, otherwise the modelled quantity of its unit.
+    """
+    for name in HEALTH_DEFAULTS if field.default is None else ():
+        scale = factor(icd.model.quantities[name].unit, field.unit)
+        if scale is not None:
+            modelled = _scaled(getter_of(name), scale)
+            return lambda shot: modelled(shot) if (value := given(shot)) is None else value
+    return given
 
 
 def _accepted(telecommand: str, name: str) -> Getter:
@@ -99,8 +119,8 @@ class TelecommandBinding:
     def __init__(self, row: Row, icd: InterfaceDefinition) -> None:
         self.row = row
         name = row.action or "nothing"
-        own = icd.plugin.actions.get(name)
-        self._action: Action = ACTIONS[name] if own is None else _plugin_action(own)
+        self._action = _action_of(name, icd)
+        self._may_have_crc = icd.conventions.telecommand_crc
         self.answered_when_done = name in ANSWERED_WHEN_DONE
         self._reported = any(
             field.telecommand == row.name for other in icd.telemetry.values() for field in other.fields
@@ -132,7 +152,7 @@ class TelecommandBinding:
 
         Raises Refused or MessageError with the index of the invalid field.
         """
-        values = self.row.decode(data)
+        values = self.row.decode(self._without_crc(data))
         arguments = dict(self._fixed)
         for name, argument, convert in self._arguments:
             arguments[argument] = convert(values[name])
@@ -147,6 +167,19 @@ class TelecommandBinding:
             device.accepted[self.row.name] = values
         return replies or []
 
+    def _without_crc(self, data: bytes) -> bytes:
+        """Return the data without the CRC-8 that may follow them. Raises Refused if it is wrong."""
+        if not self._may_have_crc or len(data) != self.row.size + 1:
+            return data
+        if telecommand_crc(data[:-1]) != data[-1]:
+            raise Refused(ErrorCode.CRC)
+        return data[:-1]
+
+
+def telecommand_crc(data: bytes) -> int:
+    """Return CubeSpace's CRC-8 of a telecommand's data; that of no data is FFh."""
+    return crc(data, width=1, poly=0x12, reflect=True) if data else 0xFF
+
 
 def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any], Any]:
     scale = factor(field.unit, unit) if unit else 1.0
@@ -155,6 +188,12 @@ def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any
     if scale in (None, 1.0):
         return lambda value: value
     return lambda value: value * scale
+
+
+def _action_of(name: str, icd: InterfaceDefinition) -> Action:
+    """Return the action of a name, of the unit's plugin or of the device."""
+    own = icd.plugin.actions.get(name)
+    return ACTIONS[name] if own is None else _plugin_action(own)
 
 
 def _plugin_action(function: Callable[[Any, Mapping[str, Any]], Any]) -> Action:

@@ -140,10 +140,11 @@ class Device:
             imager,
             self.cycle,
             clock.now_ns,
+            self.time.unix_ns,
             self._request_single_frame,
             lambda: float(self.parameters["exposure"]) / 1000.0,
         )
-        self.files = FileDownload(self.images)
+        self.files = FileDownload(self.images, clock.now_ns)
         self.subscriptions = Subscriptions(self.scheduler, clock.now_ns)
         self.latest: Measurement | None = None
         self.reported_quaternion: Quaternion = IDENTITY

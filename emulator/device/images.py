@@ -1,6 +1,6 @@
 """Images for download: capture, storage and transfer.
 
-A stored image is kept until the next one is complete, and a download keeps the image that it opened.
+Stored images are files, of which the oldest gives way to a new one. A download keeps the image that it opened.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -18,10 +19,13 @@ from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.pipeline.binning import mean_over_squares
 from starhil.emulator.pipeline.imager import Imager, PipelineReply
 from starhil.emulator.pipeline.messages import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
-from starhil.protocol.image_transfer import FRAME_SIZE
+from starhil.protocol.image_transfer import FRAME_SIZE, file_checksum
 
 STORE_S: Final = 0.1
 """Modelled time to store an image, seconds."""
+
+MAX_FILES: Final = 16
+"""Number of images that are kept."""
 
 PALETTE: Final = b"".join(bytes((n, n, n, 0)) for n in range(256))
 BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
@@ -29,13 +33,25 @@ BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A square 8-bit image: edge in pixels, pixels row by row from the top, index of its exposure."""
+    """A square 8-bit image, which is also a file.
+
+    Attributes
+    ----------
+    edge, pixels
+        Edge in pixels, and the pixels row by row from the top.
+    frame
+        Index of its exposure.
+    number
+        Number of the image since start-up, from 1 to 255 and again from 1; the counter of its file.
+    unix_ns
+        Time on the device's clock when it was stored.
+    """
 
     edge: int
     pixels: bytes
     frame: int
     number: int
-    """Number of the image since start-up, modulo 256; the counter of its file."""
+    unix_ns: int = 0
 
     def binned(self, edge: int) -> StoredImage:
         """Return the image reduced to `edge` by averaging squares of pixels."""
@@ -43,23 +59,34 @@ class StoredImage:
             return self
         image = np.frombuffer(self.pixels, dtype=np.uint8).reshape(self.edge, self.edge)
         small = mean_over_squares(image, self.edge // edge)
-        return StoredImage(edge, small.tobytes(), self.frame, self.number)
+        return StoredImage(edge, small.tobytes(), self.frame, self.number, self.unix_ns)
+
+    @property
+    def file_size(self) -> int:
+        """Size of the file, bytes."""
+        return BMP_HEAD.size + len(PALETTE) + len(self.pixels)
+
+    @cached_property
+    def file_crc(self) -> int:
+        """Checksum of the file."""
+        return file_checksum(self.bmp())
 
     def bmp(self) -> bytes:
         """Return the image as a grey BMP file."""
         offset = BMP_HEAD.size + len(PALETTE)
-        size = offset + len(self.pixels)
         planes, bits, compression, per_metre, colours = 1, 8, 0, 2835, 256
         layout = (planes, bits, compression, len(self.pixels), per_metre, per_metre, colours, 0)
-        head = BMP_HEAD.pack(b"BM", size, 0, 0, offset, 40, self.edge, -self.edge, *layout)
+        head = BMP_HEAD.pack(b"BM", self.file_size, 0, 0, offset, 40, self.edge, -self.edge, *layout)
         return head + PALETTE + self.pixels
 
 
 class ImageStore:
-    """Captures images, stores one and serves one for download.
+    """Captures images, stores them and serves one for download.
 
     Parameters
     ----------
+    unix_ns
+        Returns the time of the device's clock.
     single_frame
         Returns the request for an unsolved exposure with a given simulation time of mid-exposure.
     """
@@ -70,6 +97,7 @@ class ImageStore:
         imager: Imager,
         cycle: FrameCycle,
         now_ns: Callable[[], int],
+        unix_ns: Callable[[], int],
         single_frame: Callable[[int], FrameRequest],
         exposure_s: Callable[[], float],
     ) -> None:
@@ -77,6 +105,7 @@ class ImageStore:
         self._imager = imager
         self._cycle = cycle
         self._now_ns = now_ns
+        self._unix_ns = unix_ns
         self._single_frame = single_frame
         self._exposure_s = exposure_s
         self._generation = 0
@@ -87,12 +116,18 @@ class ImageStore:
         self._generation += 1
         self._count = 0
         self._cycle.after_exposure = None
-        self.stored: StoredImage | None = None
+        self.files: dict[int, StoredImage] = {}
+        """The stored images by number, oldest first."""
         self.percent = 0
         self.status = "ok"
         self.busy = False
         self.download: StoredImage | None = None
         self.frame = 0
+
+    @property
+    def stored(self) -> StoredImage | None:
+        """The newest stored image, or None."""
+        return next(reversed(self.files.values()), None)
 
     def save(self, edge: int) -> None:
         """Capture and store the next exposure; in standby, take one."""
@@ -108,7 +143,7 @@ class ImageStore:
             if answer is None:
                 self.percent, self.status = 0, "storage_error"
                 return
-            self.stored = self._stored_image(answer)
+            self._store(answer)
             self.percent, self.status = 100, "ok"
 
         self._capture(fetch)
@@ -144,9 +179,13 @@ class ImageStore:
         if then is not None:
             self._capture(then)
 
-    def _stored_image(self, answer: ImageResult) -> StoredImage:
-        self._count = (self._count + 1) % 256
-        return StoredImage(answer.width, answer.pixels, answer.frame, self._count)
+    def _store(self, answer: ImageResult) -> None:
+        """Store an image as the newest file; the oldest one is deleted if there are too many."""
+        number = self._count = self._count % 255 + 1
+        self.files.pop(number, None)
+        self.files[number] = StoredImage(answer.width, answer.pixels, answer.frame, number, self._unix_ns())
+        if len(self.files) > MAX_FILES:
+            del self.files[next(iter(self.files))]
 
     def open_stored(self, edge: int) -> bool:
         """Open the stored image for download, reduced to `edge`; return False if it is too small."""

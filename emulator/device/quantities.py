@@ -268,6 +268,14 @@ QUANTITIES["file.ready"] = lambda shot: shot.device.files.ready
 QUANTITIES["file.parameter_error"] = lambda shot: shot.device.files.parameter_error
 QUANTITIES["file.checksum"] = lambda shot: shot.device.files.checksum
 QUANTITIES["file.length"] = lambda shot: len(shot.device.files.data)
+QUANTITIES["file.updating"] = lambda shot: shot.device.files.updating
+for _name in ("type", "counter", "size", "time"):
+    QUANTITIES[f"file.{_name}"] = lambda shot, name=_name: int(getattr(shot.device.files.info, name))
+QUANTITIES["file.crc"] = lambda shot: shot.device.files.info.checksum
+QUANTITIES["file.packet_number"] = lambda shot: shot.device.files.packet[0]
+QUANTITIES["file.packet"] = lambda shot: shot.device.files.packet[1]
+QUANTITIES["card.formatting"] = lambda shot: shot.device.files.erasing and shot.device.files.formatting
+QUANTITIES["card.erasing"] = lambda shot: shot.device.files.erasing and not shot.device.files.formatting
 QUANTITIES["file.hole_map[n]"] = lambda shot, number: shot.device.files.arrived.part(number)
 
 

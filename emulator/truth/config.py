@@ -273,7 +273,7 @@ class FileConfig(Strict):
     kind: Literal["file"]
     """Selects this truth source."""
     path: str
-    """CSV file of times and attitudes."""
+    """CSV file of times and attitudes; its columns are in files-and-caches.md."""
     start: Literal["run", "now"] = "run"
     """Time zero of the file: the start of the run, or the time at which the truth is set."""
     repeat: bool = False

@@ -123,7 +123,10 @@ class LiveFeed:
             except (OSError, ValueError) as error:
                 if not reported:  # once, not at every attempt
                     log.warning(
-                        "truth feed tcp:%s:%d: no connection (%s); still trying", host, port, reason(error)
+                        "truth feed tcp:%s:%d: no connection (%s); still trying; the simulator must listen there",
+                        host,
+                        port,
+                        reason(error),
                     )
                 reported = True
             else:

@@ -6,7 +6,8 @@ Messages are JSON lines (`starhil.emulator.truth.feed_message`) or the blocks of
 
 The first message (or the last one before time starts) sets the offset between the sender's clock and simulation time; drift is tracked
 (`starhil.emulator.truth.sender_clock`) and rates are scaled accordingly. With ``timeline = "run"`` in the profile,
-``t`` is simulation time.
+``t`` is simulation time. A sender that runs at another speed than the clock is reported, and flagged ``wrong_speed``;
+each of its messages then holds from its receipt.
 
 Between two messages the attitude is interpolated. After the last one it is propagated at the last rate for at most
 ``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the last ``t`` is
@@ -26,10 +27,11 @@ from typing import Final, Literal
 
 import numpy as np
 
+from starhil.emulator.clock import MAX_SCALE
 from starhil.emulator.truth.feed_message import FeedFormat, FeedMessage, JsonFormat
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
 from starhil.emulator.truth.orbit import interpolate_orbit
-from starhil.emulator.truth.sender_clock import SenderClock
+from starhil.emulator.truth.sender_clock import SenderClock, SenderSpeed
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
 from starid.attitude import Attitude, interpolate, propagate
 
@@ -37,6 +39,9 @@ log = logging.getLogger("starhil.truth")
 
 HISTORY: Final = 512
 """Number of messages kept for exposures whose midpoint is in the past."""
+
+NEAR: Final = 0.05
+"""Error of a measured speed that the tracking of drift follows anyway."""
 
 RESTART_S: Final = 1.0
 """Jump back of the sender's time that starts a new timeline, seconds."""
@@ -77,7 +82,8 @@ class LiveTruth:
         self.refused = 0
         self.last_fault = ""
         self._start = attitude
-        self._clock = SenderClock()
+        self._clock_speed = 1.0
+        self._clock = SenderClock(self._clock_speed)
         self._rates = FeedRates(timed=True)
         self._last_t: float | None = None
         """Sender's time in the last message with a time."""
@@ -85,6 +91,11 @@ class LiveTruth:
         """Simulation time at which the last message was accepted."""
         self._times: deque[float] = deque(maxlen=HISTORY)
         self._states: deque[TruthState] = deque(maxlen=HISTORY)
+
+    def set_clock_speed(self, clock_speed: float) -> None:
+        """Set the simulation time per wall time, by default 1; 0 if time passes only on request."""
+        self._clock_speed = clock_speed
+        self.begin_timeline()
 
     def receive(self, data: bytes | str, received_s: float) -> bool:
         """Process data received at a simulation time in seconds; return whether the message was accepted."""
@@ -125,12 +136,33 @@ class LiveTruth:
         rate = self._rates.body_rate(at_s, message.attitude, message.rate_rad_s)
         t = at_s
         if timed and self.timeline == "anchor":
+            differed = self.speed.differs
             t = self._clock.simulation_time(at_s, received_s, self.stale_s)
+            if self.speed.differs != differed:
+                self._speed_changed()
             rate = rate * (1.0 - self._clock.slope)
         self._drop_superseded(t, timed=timed)
         self._received_s = received_s
         self._times.append(t)
         self._states.append(TruthState(message.attitude, rate, orbit=message.orbit, unix_s=message.unix_s))
+
+    @property
+    def speed(self) -> SenderSpeed:
+        """Speed of the sender relative to the clock."""
+        return self._clock.speed
+
+    def _speed_changed(self) -> None:
+        """Report a speed that differs from the clock's, and discard the states, whose times no longer hold."""
+        self._times.clear()
+        self._states.clear()
+        if self.speed.differs:
+            wall = rounded_speed(self.speed.ratio * self._clock_speed)
+            scaled = f"--clock scaled:{wall:g}, or " if wall <= MAX_SCALE else ""
+            log.warning(
+                "truth feed: the sender runs at %g × the clock; use %slock-step with --clock stepped",
+                rounded_speed(self.speed.ratio),
+                scaled,
+            )
 
     def _repeats_the_last(self, message: FeedMessage) -> bool:
         """Return whether a message repeats the last one, as simulators do at their start."""
@@ -153,7 +185,7 @@ class LiveTruth:
         self._last_t = None
         self._times.clear()
         self._states.clear()
-        self._clock, self._rates = SenderClock(), FeedRates(timed=True)
+        self._clock, self._rates = SenderClock(self._clock_speed), FeedRates(timed=True)
 
     def _drop_superseded(self, t: float, *, timed: bool) -> None:
         """Drop messages replaced by a new one: one received at the same time, or an abandoned timeline."""
@@ -170,6 +202,12 @@ class LiveTruth:
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
+        state = self._state(t_s)
+        if self.speed.differs and state.status not in (TruthStatus.WAITING, TruthStatus.STALE):
+            return replace(state, status=TruthStatus.WRONG_SPEED)
+        return state
+
+    def _state(self, t_s: float) -> TruthState:
         if not self._times:
             return TruthState(self._start, ZERO_RATE, TruthStatus.WAITING)
         age = t_s - self._times[-1]
@@ -185,6 +223,12 @@ class LiveTruth:
         low = upper - 1
         span_s = self._times[upper] - self._times[low]
         return _between(self._states[low], self._states[upper], (t_s - self._times[low]) / span_s, span_s)
+
+
+def rounded_speed(speed: float) -> float:
+    """Return a whole speed, or a whole fraction, if one is near; otherwise, round to two significant digits."""
+    whole = max(round(speed), 1) / max(round(1.0 / speed), 1)
+    return whole if abs(speed / whole - 1.0) < NEAR else float(f"{speed:.2g}")
 
 
 def _moved_on(last: TruthState, seconds: float) -> TruthState:

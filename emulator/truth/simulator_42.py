@@ -11,12 +11,14 @@ A message is a block of text lines that ends with ``[ENDMSG]``::
 
 ``qn`` is an attitude quaternion J2000 → body, scalar last, the conjugate of the quaternion used here. ``wn`` is the
 body rate in the body frame, rad/s. ``PosN`` and ``VelN`` describe the reference orbit, to which ``SC[0].PosR`` and
-``VelR`` are added. Older versions of 42 write no brackets, and only ``SC[0].B[0].qn``. If blocking is enabled, 42
+``VelR`` are added. 42 sends its first block after its first step, so its time is one step later than in the first row of
+42's own files. Older versions of 42 write no brackets, and only ``SC[0].B[0].qn``. If blocking is enabled, 42
 waits for four bytes, ``Ack`` and a zero, after each message.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from datetime import date
 from typing import Final
@@ -27,6 +29,8 @@ from starhil.emulator.truth.feed_message import FeedMessage, checked_attitude, c
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import Vector
+
+log = logging.getLogger("starhil.truth")
 
 ACKNOWLEDGE: Final = b"Ack\0"
 
@@ -57,6 +61,7 @@ class Format42:
         self._spacecraft = f"SC[{spacecraft}]"
         self._orbit = f"Orb[{orbit}]"
         self._first_ns: int | None = None
+        self._lacks_orbit = False
 
     def decode(self, data: bytes | str) -> FeedMessage:
         """Decode one block; `t` is relative to the first block."""
@@ -69,11 +74,14 @@ class Format42:
         quaternion = _vector(values, 4, f"{body}.qn", f"{body}.B[0].qn")
         rate = _vector(values, 3, f"{body}.B[0].wn", f"{body}.wn")
         if quaternion is None or rate is None:
-            raise FeedError(f"no {body}.{'qn' if quaternion is None else 'B[0].wn'}; {_PREFIXES}")
+            missing = f"{body}.{'qn' if quaternion is None else 'B[0].wn'}"
+            raise FeedError(f"no {missing}; {_others(values, body, 'truth.spacecraft') or _PREFIXES}")
         if self._first_ns is None:
             self._first_ns = time_ns
         position = _sum(_vector(values, 3, f"{self._orbit}.PosN"), _vector(values, 3, f"{body}.PosR"))
         velocity = _sum(_vector(values, 3, f"{self._orbit}.VelN"), _vector(values, 3, f"{body}.VelR"))
+        if position is None or velocity is None:
+            self._orbit_is_missing(values)
         return FeedMessage(
             (time_ns - self._first_ns) / 1e9,
             checked_attitude(f"{body}.qn", quaternion, "attitude"),
@@ -81,6 +89,17 @@ class Format42:
             None if position is None or velocity is None else OrbitState(position, velocity),
             time_ns / 1e9,
         )
+
+    def _orbit_is_missing(self, values: dict[str, str]) -> None:
+        """Reject a block with other orbits; report once that 42 sends none."""
+        others = _others(values, self._orbit, "truth.orbit")
+        if others:
+            raise FeedError(f"no {self._orbit}.PosN; {others}")
+        if not self._lacks_orbit:
+            self._lacks_orbit = True
+            log.warning(
+                "truth feed: 42 sends no orbit, so there is neither Earth nor aberration: %s", _PREFIXES
+            )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)
         """Return the answer expected by 42."""
@@ -99,6 +118,13 @@ def _unix_ns(text: str) -> int:
     except ValueError:
         raise FeedError(f"TIME has no valid year: {year}") from None
     return days * DAY_NS + (hour * 3600 + minute * 60 + second) * 1_000_000_000 + nanoseconds
+
+
+def _others(values: dict[str, str], missing: str, key: str) -> str:
+    """Return which objects a block has instead, and the key that selects one; an empty text if it has none."""
+    prefix = missing.partition("[")[0] + "["
+    found = sorted({name.partition(".")[0] for name in values if name.startswith(prefix)})
+    return f"the block has {', '.join(found)}: set {key}" if found and missing not in found else ""
 
 
 def _vector(values: dict[str, str], count: int, *names: str) -> Vector | None:

@@ -42,6 +42,8 @@ class TruthStatus(StrEnum):
     """After the last message of a live feed: propagated at its last rate."""
     STALE = "stale"
     """The live feed has been silent for too long: the attitude is held."""
+    WRONG_SPEED = "wrong_speed"
+    """The live feed runs at another speed than the clock: its messages hold from their receipt."""
     BEFORE_START = "before_start"
     """Before the first row of a file: its first attitude, at rest."""
     AFTER_END = "after_end"

@@ -8,7 +8,13 @@ from functools import partial
 from typing import Final
 
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal, rule
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_PARAMETER, SEQUENCE, LinkProbe
+from starhil.hil_tests.conformance.link_probe import (
+    INVALID_CRC,
+    INVALID_ID,
+    INVALID_PARAMETER,
+    SEQUENCE,
+    LinkProbe,
+)
 from starhil.hil_tests.conformance.unit_settings import save_parameters
 from starhil.protocol.values import Value
 
@@ -76,6 +82,19 @@ def acknowledge_forgets(probe: LinkProbe) -> None:
     probe.command("clear_counters")
     seen = probe.telemetry("acknowledge")
     check_equal((seen["error"], seen["parameter_index"]), ("ok", 0), "error and index")
+
+
+@ACKNOWLEDGE.case(
+    "crc",
+    "a CRC-8 may follow a telecommand, and is checked",
+    "firmware reference manual 5.5: CRC-8 of the data (CTS adcs_internal_drivers.c, EnduroSat cubeadcs_driver.c)",
+)
+def acknowledge_crc(probe: LinkProbe) -> None:
+    """The bytes are examples of the source's table: FF for no data, 72 for 5A."""
+    card, counters = (probe.icd.telecommands[name].id for name in ("format_card", "clear_counters"))
+    for row_id, data, code in ((counters, b"", 0xFF), (card, b"\x5a", 0x72)):
+        probe.expect_ack(row_id, data + bytes((code,)))
+        probe.expect_refusal(row_id, data + bytes((code ^ 1,)), INVALID_CRC)
 
 
 # --- counters ---
@@ -322,7 +341,10 @@ def reset_magic(probe: LinkProbe) -> None:
     check_equal(probe.telemetry("boot_status")["boot_count"], before, "boot count")
 
 
-@RESET.case("acknowledged", "reset is acknowledged, then the device restarts with the cause command")
+@RESET.case(
+    "acknowledged",
+    "reset is acknowledged, but not on a serial line, then the device restarts with the cause command",
+)
 def reset_acknowledged(probe: LinkProbe) -> None:
     before = probe.telemetry("boot_status")
     began = probe.now()

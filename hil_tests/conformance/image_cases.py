@@ -7,20 +7,25 @@ from typing import Final
 
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
-from starhil.hil_tests.images import bmp_file_size, decode_bmp
+from starhil.hil_tests.images import decode_bmp
 from starhil.protocol.values import Value
 
 EDGE: Final = 64
 FRAME: Final = 128
 PACKET: Final = 20
-CRC_START: Final = 0xFFFF
-"""Initial value of CRC-16/CCITT-FALSE."""
+BLOCK: Final = 20480
+CRC_START: Final = 0
+"""Initial value of CRC-16/XMODEM."""
+MAX_FILES: Final = 300
 
 IMAGES: Final = CaseArea[LinkProbe](
     "images", "CubeSense node TC 64, 65 and TLM 64, 65 (RADSAT-SK)", intrusive=True
 )
 BURSTS: Final = CaseArea[LinkProbe](
-    "bursts", "CubeComputer TC 112, 119 to 127 and TLM 242 (AlbertaSat, CTS)", intrusive=True
+    "bursts", "CubeComputer TC 112, 119 to 127 and TLM 241, 242 (AlbertaSat, CTS, EnduroSat)", intrusive=True
+)
+FILES: Final = CaseArea[LinkProbe](
+    "files", "CubeComputer TC 33, 108, 113, 118 and TLM 234, 243 (AlbertaSat, CTS, EnduroSat)", intrusive=True
 )
 
 
@@ -106,7 +111,6 @@ def block(probe: LinkProbe) -> None:
     check_equal([number for number, _ in packets], list(range(50)), "numbers")
     data = b"".join(part for _, part in packets)
     check_equal(crc_hqx(data[:990], CRC_START), wanted, "checksum")
-    check(bmp_file_size(data) > EDGE * EDGE, "a file larger than its pixels", bmp_file_size(data))
 
 
 @BURSTS.case("holes", "with a hole map, only missing packets are sent")
@@ -121,15 +125,88 @@ def holes(probe: LinkProbe) -> None:
     check_equal(again, {number: whole[number] for number in (0, 7, 49)}, "the same packets")
 
 
-@BURSTS.case("file", "the whole file is an image of the requested size")
+@BURSTS.case("file", "a block ends with the file, which is an image of the requested size")
 def whole_file(probe: LinkProbe) -> None:
     _save(probe)
-    _load(probe, 0, 54)
-    size = bmp_file_size(b"".join(part for _, part in _burst(probe, 3, everything=True)))
-    _load(probe, 0, size)
+    file = _files(probe)[-1]
+    size = int(file["size"])
+    for length in (BLOCK, BLOCK // PACKET):  # in bytes, and in packets
+        probe.command("load_file_block", file_type="bmp", file_counter=file["counter"], length=length)
+        seen = probe.wait_for("file_block", {"ready": True}, probe.times.image_s)
+        check_equal(seen["length"], size, "length of the block")
     data = b"".join(part for _, part in _burst(probe, -(-size // PACKET), everything=True))[:size]
+    check_equal(crc_hqx(data, CRC_START), file["crc"], "checksum of the file")
     _pixels, width, height = decode_bmp(data)
     check_equal((width, height), (EDGE, EDGE), "width and height")
+
+
+@BURSTS.case("one-by-one", "the packets of a burst can be read one by one, and the last one stays")
+def one_by_one(probe: LinkProbe) -> None:
+    _save(probe)
+    _load(probe, 0, 990)
+    sent = _burst(probe, 50, everything=True)
+    row = probe.icd.telemetry["file_packet"]
+    for number, data in (*sent, sent[-1]):
+        check_equal(probe.data_of(row), number.to_bytes(2, "little") + data, f"packet {number}")
+
+
+def _files(probe: LinkProbe) -> list[dict[str, Value]]:
+    """Return the list of files."""
+    probe.command("reset_file_list")
+    files: list[dict[str, Value]] = []
+    while len(files) < MAX_FILES:
+        info = probe.wait_for("file_info", {"updating": False}, probe.times.image_s)
+        if not any(info.values()):
+            return files
+        files.append(info)
+        probe.command("advance_file_list")
+    raise CaseFailed("an end of the list of files", f"{MAX_FILES} files")
+
+
+@FILES.case("list", "a saved image is a new file at the end of the list, and the list can be read again")
+def listed(probe: LinkProbe) -> None:
+    _save(probe)
+    before = _files(probe)
+    _save(probe)
+    after = _files(probe)
+    check(after[-1] not in before, "a new last file", after[-1])
+    check_equal((after[-1]["type"], after[-1]["updating"]), (4, False), "type and updating")
+    check(int(after[-1]["size"]) > EDGE * EDGE, "a file larger than its pixels", after[-1]["size"])
+    check_equal(_files(probe), after, "the same list")
+
+
+@FILES.case("end", "beyond the end of the list, the information stays zero")
+def end_of_list(probe: LinkProbe) -> None:
+    _save(probe)
+    _files(probe)
+    for _ in range(3):
+        probe.command("advance_file_list")
+        seen = probe.wait_for("file_info", {"updating": False}, probe.times.image_s)
+        check(not any(seen.values()), "zeros", seen)
+
+
+@FILES.case("erase", "an erased file is no longer in the list and cannot be loaded")
+def erased(probe: LinkProbe) -> None:
+    for _ in range(2):
+        _save(probe)
+    files = _files(probe)
+    gone = files[-2]["counter"]
+    probe.command("erase_file", file_type="bmp", file_counter=gone)
+    check_equal(_files(probe), [*files[:-2], files[-1]], "list of files")
+    probe.expect_refused("erase_file", INVALID_PARAMETER, file_type="bmp", file_counter=gone)
+    probe.expect_refused(
+        "load_file_block", INVALID_PARAMETER, file_type="bmp", file_counter=gone, length=BLOCK
+    )
+
+
+@FILES.case("erase-all", "all files can be erased, by either telecommand")
+def erased_all(probe: LinkProbe) -> None:
+    for name, values in (("erase_file", {"all": True}), ("format_card", {})):
+        _save(probe)
+        probe.command(name, **values)
+        probe.wait_for("card_progress", {"formatting": False, "erasing": False}, probe.times.image_s)
+        check_equal(_files(probe), [], "list of files")
+        check(not probe.telemetry("device_status")["image_stored"], "no stored image", "one")
 
 
 @BURSTS.case("range", "a block outside the file is refused with code 3 and flagged")

@@ -77,7 +77,8 @@ def unknown_telecommands(probe: LinkProbe) -> None:
 @IDENTIFIERS.case("telemetry-with-data", "a telemetry request with data is refused for its length", rule(5))
 def telemetry_with_data(probe: LinkProbe) -> None:
     for row in probe.icd.telemetry.values():
-        probe.expect_refusal(row.id, b"\x00", INVALID_LENGTH)
+        if probe.tells_refusal(row):
+            probe.expect_refusal(row.id, b"\x00", INVALID_LENGTH)
 
 
 # --- telemetry ---
@@ -110,7 +111,7 @@ def _length_cases(row: Row) -> Iterator[Case[LinkProbe]]:
             f"lengths.{row.name}.{why}", "lengths", title, f"{CODES}; {clause_of(row)}", run, intrusive=True
         )
 
-    yield refused(whole + b"\0", "long")
+    yield refused(whole + b"\0\0", "long")
     if row.size > 0:
         yield refused(whole[:-1], "short")
     if row.size > 1:

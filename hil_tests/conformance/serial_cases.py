@@ -130,9 +130,9 @@ def unstuffed(probe: SerialProbe) -> None:
 
 @STUFFING.case("not-a-mark", "1F 1F FF within data is a byte 1F and a byte FF, not an end")
 def not_a_mark(probe: SerialProbe) -> None:
-    """The device refuses the length: two bytes instead of one for select_parameter."""
+    """The device refuses the length: three bytes instead of one for select_parameter."""
     row = probe.icd.telecommands["select_parameter"]
-    _expect_refusal_of(probe, row.id, f"1F 7F {row.id:02X} 1F 1F FF 1F FF", INVALID_LENGTH)
+    _expect_refusal_of(probe, row.id, f"1F 7F {row.id:02X} 1F 1F FF 00 1F FF", INVALID_LENGTH)
 
 
 # --- errors are flagged ---

@@ -14,6 +14,7 @@ from starhil.hil_tests.conformance.link_probe import (
     SerialWire,
 )
 from starhil.hil_tests.conformance.ports import Port
+from starhil.protocol.codec import Row
 from starhil.protocol.icd import InterfaceDefinition
 
 BURST_BODY: Final = 23
@@ -57,9 +58,21 @@ class SerialProbe(SerialWire, LinkProbe):
         self._buffer = bytearray()
         self._asked: list[int] = []
 
+    def answers(self, row_id: int) -> bool:
+        """Return whether the definition has an answer to a request on the serial line."""
+        row = self.icd.row_by_id(row_id)
+        serial = self.icd.link.serial
+        framing = None if serial is None else serial.framing
+        return row is None or row.name not in getattr(framing, "unanswered", ())
+
+    def tells_refusal(self, row: Row) -> bool:
+        """Return whether a refusal differs from the data, which in dialects a and b may be one byte as well."""
+        return self.dialect == "c" or row.size != 1
+
     def post(self, row_id: int, data: bytes = b"") -> None:
         """Send a request without waiting."""
-        self.expecting(row_id)
+        if self.answers(row_id):
+            self.expecting(row_id)
         self.send(framed(row_id, data))
 
     def expecting(self, *answers: str | int) -> None:

@@ -21,7 +21,7 @@ from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import build_serial_stack, serial_answers
 from starhil.protocol.values import Value
 
 PAUSE: Final = 1.6
@@ -55,6 +55,10 @@ class UnitProbe(PortProbe):
     @abstractmethod
     def unsolicited_replies(self, seconds: float) -> list[Reply]:
         """Return the messages of unsolicited telemetry that arrive within a time."""
+
+    def answers(self, row: Row) -> tuple[str, ...]:
+        """Return the answers of a row on this link."""
+        return row.answers
 
     def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- for links on which it depends
         """Return whether replies of a class can express a refusal."""
@@ -99,7 +103,11 @@ class UnitProbe(PortProbe):
         return checked_values(row, self.telemetry(row).data)
 
     def command(self, row: Row, data: bytes) -> None:
-        """Send a telecommand that must be accepted."""
+        """Send a telecommand that must be accepted, or not answered if the row has no answer on this link."""
+        if not self.answers(row):
+            self.post(self.request(row, data), answered=False)
+            self.expect_silence(f"{row.name} is not answered on this link")
+            return
         answer = self.ask(self.request(row, data))
         accepted = isinstance(answer, Reply) and answer.kind is ReplyKind.ACK and answer.id == row.id
         check(accepted, f"acknowledge of {row.name}", describe(answer))
@@ -107,7 +115,8 @@ class UnitProbe(PortProbe):
     def expect_refusal(self, request: Request, code: ErrorCode) -> None:
         """Send a request that must be refused, or not answered if replies cannot express a refusal."""
         what = f"{request.klass} {request.id}".strip()
-        if not self.can_refuse(request.klass):
+        row = self.icd.rows_by_key.get((request.klass, request.id))
+        if not self.can_refuse(request.klass) or (row is not None and not self.answers(row)):
             self.post(request, answered=False)
             self.expect_silence(f"no reply can express the refusal of {what}")
             return
@@ -185,6 +194,10 @@ class SerialUnitProbe(SerialWire, UnitProbe):
         self.drain()
 
     # --- the line ---
+
+    def answers(self, row: Row) -> tuple[str, ...]:
+        """Return the answers of a row on the serial line."""
+        return serial_answers(self.icd, row)
 
     def sleep_past_timeout(self) -> None:
         """Wait until an incomplete message has timed out."""

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd import InterfaceDefinition, RawTable
 from starhil.protocol.link_schema import HEX
 from starhil.protocol.values import IcdError
 
@@ -172,6 +172,20 @@ def read_layout(icd: InterfaceDefinition) -> CanopenModel:
     try:
         return CanopenModel.model_validate(table.document)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(step) for step in ("canopen", *first["loc"]))
-        raise IcdError(f"{table.file}: {key}: {first['msg']}") from None
+        raise IcdError(_errors(table, error)[0]) from None
+
+
+def layout_errors(table: RawTable) -> list[str]:
+    """Return all errors in the keys of the layout."""
+    try:
+        CanopenModel.model_validate(table.document)
+    except ValidationError as error:
+        return _errors(table, error)
+    return []
+
+
+def _errors(table: RawTable, error: ValidationError) -> list[str]:
+    return [
+        f"{table.file}: {'.'.join(str(step) for step in ('canopen', *item['loc']))}: {item['msg']}"
+        for item in error.errors()
+    ]

@@ -13,6 +13,7 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
+from starhil.protocol.serial_stack import serial_answers
 from starhil.protocol.values import Section
 
 _TELEMETRY: Final = 0x80
@@ -32,7 +33,7 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     found: list[Section] = []
     if icd.link.serial is not None:
         cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
-        found.append(_serial() if cubespace else _composed(icd.link.serial))
+        found.append(_serial(icd) if cubespace else _composed(icd.link.serial))
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
@@ -99,7 +100,7 @@ def _fixed_value(const: int | None, default: int | None) -> str:
     return "" if default is None else f"default {default:X}h"
 
 
-def _serial() -> Section:
+def _serial(icd: InterfaceDefinition) -> Section:
     data = bytes((_DATA,))
     refusal = ErrorCode.INVALID_PARAMETER
     kinds = (
@@ -120,9 +121,12 @@ def _serial() -> Section:
         "generation 2. The dialect cannot be recognised from a message: with b instead of a, each value is shifted by one byte and "
         "telecommands seem unanswered."
     )
+    rows = sorted(icd.telecommands_by_id.values(), key=lambda row: row.id)
+    silent = [f"`{row.name}` ({row.id})" for row in rows if not serial_answers(icd, row)]
+    silence = f"On this line, {' or '.join(silent)} is neither acknowledged nor refused."
     return Section(
         "Serial line",
-        (text, choice),
+        (text, choice, silence) if silent else (text, choice),
         ("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
         tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
     )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
-import time
+import math
 from typing import Final
 
 from numpy.typing import ArrayLike
@@ -11,13 +10,11 @@ from numpy.typing import ArrayLike
 from starid.arrays import GreyImage
 from starid.camera import Camera, Model
 from starid.catalog import StarCatalog
-from starid.errors import StaridError
 from starid.imaging.detection import DetectionSettings
-from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
-from starid.photograph.solver import ImageSolution, refine_solution
+from starid.photograph.rough_search import RoughSearch
+from starid.photograph.solver import ImageSolution, Progress, search_views
 from starid.photograph.typical_camera import FIELD_STEP
 from starid.photograph.views import views
-from starid.solution import Reason
 
 FIELDS_DEG: Final = tuple(
     FIELD_STEP**step for step in (13, 12, 14, 15, 11, 16, 17, 10, 18, 9, 19, 20, 21, 22, 23)
@@ -57,6 +54,8 @@ class FieldSweep:
         image: GreyImage,
         settings: DetectionSettings | None = None,
         observer_velocity: ArrayLike | None = None,
+        time_limit_s: float = math.inf,
+        progress: Progress | None = None,
     ) -> ImageSolution:
         """Find the stars in an image, and the attitude and field of view of its camera.
 
@@ -68,32 +67,17 @@ class FieldSweep:
             Settings of the detection.
         observer_velocity : array (3,), optional
             See `starid.interface.StarIdentifier.identify`.
+        time_limit_s, progress
+            See `starid.photograph.solver.search_views`.
 
         Raises
         ------
         StaridError
             The image is not valid for detection.
         """
-        begin = time.perf_counter()
-        first: ImageSolution | None = None
-        for view in views(image, settings):
-            if view.mirrored:
-                break
-            found = view.detections
-            for number in ALL_ROUNDS[:-1]:
-                for camera in self._cameras:
-                    search = self._search(camera)
-                    solution = search.identify(found.xy_px, found.flux, rounds=[number])
-                    if solution.valid:
-                        return refine_solution(solution, view, camera, search, begin, observer_velocity)
-                    if first is None:
-                        first = ImageSolution(solution, found, camera, search.identifier.stars)
-                    if solution.reason is Reason.TOO_FEW_STARS:
-                        break
-        if first is None:
-            raise StaridError("image: no view of it is available")
-        failed = dataclasses.replace(first.solution, elapsed=time.perf_counter() - begin)
-        return dataclasses.replace(first, solution=failed)
+        return search_views(
+            views(image, settings), self._cameras, self._search, observer_velocity, time_limit_s, progress
+        )
 
 
 def solve_any_field(
@@ -103,10 +87,13 @@ def solve_any_field(
     model: Model = "pinhole",
     settings: DetectionSettings | None = None,
     observer_velocity: ArrayLike | None = None,
+    time_limit_s: float = math.inf,
+    progress: Progress | None = None,
 ) -> ImageSolution:
     """Solve one image with a `FieldSweep`.
 
     The parameters are those of `FieldSweep` and of its `solve`.
     """
     height, width = image.shape
-    return FieldSweep(width, height, catalog, model=model).solve(image, settings, observer_velocity)
+    sweep = FieldSweep(width, height, catalog, model=model)
+    return sweep.solve(image, settings, observer_velocity, time_limit_s, progress)

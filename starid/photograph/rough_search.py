@@ -24,14 +24,6 @@ from starid.geometric.identifier import Effort, Identifier, scaled_camera
 from starid.photograph.typical_camera import typical_camera
 from starid.solution import Reason, Solution
 
-DISTORTIONS: Final = (0.0, -0.05, 0.05, -0.12)
-"""Relative displacement of the corner of the image, for each lens tried."""
-
-TRIANGLES: Final = (100, 100, 1000, 5000)
-"""Triangles looked up in each round; the first has narrow windows, the first and last no distortion."""
-
-ALL_ROUNDS: Final = range(len(TRIANGLES))
-
 SIZE_PX: Final = 1000.0
 """Side of the image for which the windows are defined; they scale with the side."""
 
@@ -58,6 +50,38 @@ _LENIENT: Final = Effort(
     magnitude_gate=2.5,
     max_false_probability=MAX_FALSE,
 )
+
+
+class _Round(NamedTuple):
+    """Attempts of similar effort: one for each selection of detections and each distortion.
+
+    Attributes
+    ----------
+    effort : Effort
+        Windows, for an image of `SIZE_PX`, and number of triangles.
+    depths : tuple of int
+        Detections per cell of the image, brightest first; 0 for the brightest of the whole image.
+    distortions : tuple of float
+        Relative displacement of the corner of the image.
+    """
+
+    effort: Effort
+    depths: tuple[int, ...]
+    distortions: tuple[float, ...]
+
+
+_THOROUGH: Final = dataclasses.replace(_LENIENT, max_triangles=1000)
+
+ROUNDS: Final = (
+    _Round(dataclasses.replace(_STRICT, max_triangles=100), (0, 1, 4), (0.0,)),
+    _Round(_THOROUGH, (0,), (0.0, -0.05)),
+    _Round(_THOROUGH, (1, 4), (0.0, -0.05)),
+    _Round(_THOROUGH, (0, 1, 4), (0.05, -0.12)),
+    _Round(dataclasses.replace(_LENIENT, max_triangles=5000), (0, 1, 4), (0.0,)),
+)
+"""Rounds of the search, quick ones first. Few photographs need more than the first."""
+
+ALL_ROUNDS: Final = range(len(ROUNDS))
 
 
 class _Attempt(NamedTuple):
@@ -106,7 +130,14 @@ class RoughSearch:
         """Identifier for the nominal camera that shares the index of the search."""
         return self._first
 
-    def identify(self, xy_px: ArrayLike, flux: ArrayLike, *, rounds: Sequence[int] = ALL_ROUNDS) -> Solution:
+    def identify(
+        self,
+        xy_px: ArrayLike,
+        flux: ArrayLike,
+        *,
+        rounds: Sequence[int] = ALL_ROUNDS,
+        time_limit_s: float = math.inf,
+    ) -> Solution:
         """Find the attitude and the camera; invalid, with the reason, if every attempt fails.
 
         Parameters
@@ -114,7 +145,9 @@ class RoughSearch:
         xy_px, flux
             See `Identifier.identify`.
         rounds : sequence of int
-            Rounds to run, as indices of `TRIANGLES`.
+            Rounds to run, as indices of `ROUNDS`.
+        time_limit_s : float
+            Time after which no further attempt is made.
         """
         begin = time.perf_counter()
         xy, brightness = (
@@ -139,23 +172,24 @@ class RoughSearch:
                     detection_index=rows[solution.detection_index].astype(np.int64),
                     camera=scaled_camera(lens, found.focal_px[0] / plain.focal_px[0]),
                 )
-            if solution.valid or solution.reason is Reason.TOO_FEW_STARS:
+            late = time.perf_counter() - begin > time_limit_s
+            if solution.valid or solution.reason is Reason.TOO_FEW_STARS or late:
                 break
         return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
 
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
-        """Yield all attempts, cheap ones first."""
+        """Yield the attempts of some rounds."""
         brightest = np.argsort(-flux, kind="stable")
-        choices = [brightest[:MAX_AT_ONCE]]
-        choices += [even_selection(xy, brightest, self._first.camera, depth) for depth in (1, 4)]
         known_lens = any(self._first.camera.distortion)
         for number in rounds:
-            plain = known_lens or number in (ALL_ROUNDS[0], ALL_ROUNDS[-1])
-            windows = _STRICT if number == ALL_ROUNDS[0] else _LENIENT
-            effort = self._scaled(dataclasses.replace(windows, max_triangles=TRIANGLES[number]))
-            for rows in choices:
-                for distortion in DISTORTIONS[:1] if plain else DISTORTIONS:
-                    yield _Attempt(rows, distortion, effort)
+            effort = self._scaled(ROUNDS[number].effort)
+            for depth in ROUNDS[number].depths:
+                rows = brightest[:MAX_AT_ONCE]
+                if depth > 0:
+                    rows = even_selection(xy, brightest, self._first.camera, depth)
+                for distortion in ROUNDS[number].distortions:
+                    if distortion == 0.0 or not known_lens:
+                        yield _Attempt(rows, distortion, effort)
 
     def _scaled(self, effort: Effort) -> Effort:
         """Scale the windows of an effort to the size of the image."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
+import math
 import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,9 +18,10 @@ from starid.arrays import Array, GreyImage
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
 from starid.errors import StaridError
+from starid.geometric.answer import MIN_MATCHED
 from starid.geometric.identifier import Identifier
 from starid.imaging.detection import Detections, DetectionSettings, detect
-from starid.photograph.rough_search import ALL_ROUNDS, RoughSearch
+from starid.photograph.rough_search import RoughSearch
 from starid.photograph.self_calibration import IMAGE_MODELS, Stars, calibrate_identified
 from starid.photograph.views import View, views
 from starid.solution import Reason, Solution
@@ -27,8 +31,11 @@ _log = logging.getLogger(__name__)
 _FEW: Final = 8
 """Smallest number of matched stars for estimating the lens."""
 
-_ROUNDS: Final = ((ALL_ROUNDS[:2], None), (ALL_ROUNDS[2:3], 4), (ALL_ROUNDS[3:], 1))
-"""Rounds of the search, and the number of views for each; None for all views, made by the first entry."""
+SCHEDULE: Final[tuple[tuple[int, int | None], ...]] = ((0, None), (1, None), (2, None), (3, None), (4, 1))
+"""Rounds of the search, and in how many views; None for all."""
+
+Progress = Callable[[str], None]
+"""Called with a description of the attempt that follows."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +54,8 @@ class ImageSolution:
         Catalogue stars as the camera resolves them, aberrated if aberration was corrected.
     mirrored : bool
         The image is a mirror image; attitude, camera and detections refer to the image flipped left to right.
+    complete : bool
+        Whether the search ended by itself, not because of the time limit.
     """
 
     solution: Solution
@@ -54,6 +63,7 @@ class ImageSolution:
     camera: Camera
     stars: StarCatalog
     mirrored: bool = False
+    complete: bool = True
 
     def on_image(self, xy_px: Array) -> Array:
         """Convert positions (n, 2) of the solution to positions on the original image."""
@@ -68,6 +78,8 @@ def solve_image(
     fov_tolerance: float = 0.0,
     settings: DetectionSettings | None = None,
     observer_velocity: ArrayLike | None = None,
+    time_limit_s: float = math.inf,
+    progress: Progress | None = None,
 ) -> ImageSolution:
     """Find the stars in an image and the attitude of the camera.
 
@@ -87,6 +99,8 @@ def solve_image(
         Settings of the detection.
     observer_velocity : array (3,), optional
         See `starid.interface.StarIdentifier.identify`.
+    time_limit_s, progress
+        With a `fov_tolerance`, see `search_views`.
 
     Raises
     ------
@@ -102,7 +116,13 @@ def solve_image(
         )
     sky = load_catalog() if catalog is None else catalog
     if fov_tolerance > 0.0:
-        return _solve_roughly(image, nominal, sky, fov_tolerance, settings, observer_velocity)
+
+        def search_for(camera: Camera) -> RoughSearch:
+            return RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
+
+        return search_views(
+            views(image, settings), [nominal], search_for, observer_velocity, time_limit_s, progress
+        )
     found = detect(image, settings or DetectionSettings())
     identifier = Identifier(nominal, sky)
     solution = identifier.identify(
@@ -112,30 +132,73 @@ def solve_image(
     return ImageSolution(solution, found, solution.camera or nominal, stars)
 
 
-def _solve_roughly(
-    image: GreyImage,
-    camera: Camera,
-    sky: StarCatalog,
-    fov_tolerance: float,
-    settings: DetectionSettings | None,
-    observer_velocity: ArrayLike | None,
+def search_views(
+    waiting: Iterator[View],
+    cameras: Sequence[Camera],
+    search_for: Callable[[Camera], RoughSearch],
+    observer_velocity: ArrayLike | None = None,
+    time_limit_s: float = math.inf,
+    progress: Progress | None = None,
 ) -> ImageSolution:
-    """Try one view of the image after another until one is identified."""
+    """Try views of an image with one camera after another, quick rounds first, until one is identified.
+
+    Parameters
+    ----------
+    waiting : iterator of View
+        The views, plain one first; each is made when first needed.
+    cameras : sequence of Camera
+        Approximate cameras, common ones first.
+    search_for : callable
+        Returns the search for a camera; it is called again for each round and view.
+    observer_velocity : array (3,), optional
+        See `starid.interface.StarIdentifier.identify`.
+    time_limit_s : float
+        Time after which the search is given up. Compiling kernels and building indices, which is done once, does
+        not count.
+    progress : callable, optional
+        See `Progress`.
+    """
     begin = time.perf_counter()
-    search = RoughSearch(camera, sky, fov_tolerance=fov_tolerance)
-    made: list[View] = []
-    answer = Solution.invalid(Reason.NO_MATCH)
-    for rounds, source in _ROUNDS:
-        for view in views(image, settings) if source is None else made[:source]:
-            if source is None:
+    plain = next(waiting)
+    first = search_for(cameras[0])
+    first.identifier.warm_up()
+    started = time.perf_counter()
+    complete = True
+    for number, view, camera, attempt in _attempts(plain, waiting, cameras):
+        if progress is not None:
+            progress(attempt)
+        before = time.perf_counter()
+        search = first if camera is first.identifier.camera else search_for(camera)
+        started += time.perf_counter() - before
+        found = view.detections
+        xy = flipped(found.xy_px, camera.width) if view.mirrored else found.xy_px
+        left = started + time_limit_s - time.perf_counter()
+        answer = search.identify(xy, found.flux, rounds=[number], time_limit_s=left)
+        if answer.valid:
+            return refine_solution(answer, view, camera, search, begin, observer_velocity)
+        complete = time.perf_counter() - started < time_limit_s
+        if not complete:
+            break
+    reason = Reason.TOO_FEW_STARS if len(plain.detections) < MIN_MATCHED else Reason.NO_MATCH
+    answer = Solution.invalid(reason, elapsed=time.perf_counter() - begin)
+    return ImageSolution(answer, plain.detections, cameras[0], first.identifier.stars, complete=complete)
+
+
+def _attempts(
+    plain: View, waiting: Iterator[View], cameras: Sequence[Camera]
+) -> Iterator[tuple[int, View, Camera, str]]:
+    """Yield round, view, camera and their description, for views with enough stars."""
+    made = [plain]
+    for number, count in SCHEDULE:
+        chosen = itertools.chain(made, waiting) if number == 0 else made[:count]
+        for place, view in enumerate(chosen):
+            if place >= len(made):
                 made.append(view)
-            found = view.detections
-            xy = flipped(found.xy_px, camera.width) if view.mirrored else found.xy_px
-            answer = search.identify(xy, found.flux, rounds=rounds)
-            if answer.valid:
-                return refine_solution(answer, view, camera, search, begin, observer_velocity)
-    answer = Solution.invalid(answer.reason, elapsed=time.perf_counter() - begin)
-    return ImageSolution(answer, made[0].detections, camera, search.identifier.stars)
+            if len(view.detections) < MIN_MATCHED:
+                continue
+            for camera in cameras:
+                attempt = f"round {number + 1} of {len(SCHEDULE)}, view {place + 1}, field {camera.fov_deg:.0f}° wide"
+                yield number, view, camera, attempt
 
 
 def refine_solution(

@@ -59,6 +59,17 @@ def _telemetry_bytes(name: str, field: str, change: Callable[[bytes], bytes]) ->
     return damage
 
 
+def _of_files(name: str, change: Callable[..., object]) -> Damage:
+    """Replace a method of the device's files; `change` gets the files, the method and its arguments."""
+
+    def damage(unit: SimulatedUnit) -> None:
+        files = unit.device.files
+        original = getattr(files, name)
+        setattr(files, name, lambda *arguments: change(files, original, *arguments))
+
+    return damage
+
+
 def _number(size: int, change: Callable[[int], int]) -> Callable[[bytes], bytes]:
     return lambda raw: (change(int.from_bytes(raw, "little")) % (1 << 8 * size)).to_bytes(size, "little")
 
@@ -120,6 +131,53 @@ enter(
             dataclasses.replace(r, data=b"\x14\x01") if r.id == 119 and len(r.data) == 2 else r
         )
     ),
+)
+for _name, _case, _row in (
+    ("the file list does not begin again", "files.list", 118),
+    ("the file list stays at its first file", "files.list", 113),
+    ("a file is not erased", "files.erase", 108),
+    ("the card is not formatted", "files.erase-all", 33),
+):
+    enter(_name, "both", _case, only_acknowledged(_row))
+enter(
+    "the file list goes round",
+    "both",
+    "files.end",
+    _of_files(
+        "advance", lambda files, _h: files._go_to((files._position + 1) % (len(files._images.files) + 1))
+    ),
+)
+enter(
+    "the packets of a burst stay at the first",
+    "both",
+    "bursts.one-by-one",
+    _of_files("next_packet", lambda _f, _h: None),
+)
+enter(
+    "a block beyond the end of the file is refused",
+    "both",
+    "bursts.file",
+    _of_files(
+        "load",
+        lambda files, h, kind, counter, offset, length: h(
+            kind, counter, offset, length if offset + length <= len(files._file(kind, counter)) else 0
+        ),
+    ),
+)
+enter(
+    "a length in packets is taken as one in bytes",
+    "both",
+    "bursts.file",
+    _of_files(
+        "load",
+        lambda _f, h, kind, counter, offset, length: h(kind, counter, offset, length - (length == 1024)),
+    ),
+)
+enter(
+    "the checksum of a file is wrong",
+    "both",
+    "bursts.file",
+    _telemetry_bytes("file_info", "crc", _number(2, lambda v: v ^ 1)),
 )
 enter(
     "burst packets are in reverse order",

@@ -259,7 +259,7 @@ enter(
     "restore_parameters does nothing",
     "both",
     "store.restore",
-    only_acknowledged(101),
+    only_acknowledged(107),
 )
 enter(
     "reset needs no magic number",
@@ -269,9 +269,23 @@ enter(
 )
 enter(
     "reset is not acknowledged",
-    "both",
+    "can",
     "reset.acknowledged",
     handling(lambda _d, r, h: (h(r), [])[1] if r.id == 1 and r.data == b"\x5a" else h(r)),
+)
+enter(
+    "a wrong CRC of a telecommand is not noticed",
+    "both",
+    "acknowledge.crc",
+    handling(
+        lambda _d, r, h: h(Request.of(33, r.data[:-1], r.source) if r.id == 33 and len(r.data) == 2 else r)
+    ),
+)
+enter(
+    "a telecommand with a CRC is refused",
+    "both",
+    "acknowledge.crc",
+    handling(lambda _d, r, h: h(Request.of(103, b"\0\0", r.source) if r.id == 103 and r.data else r)),
 )
 enter(
     "reset does nothing",

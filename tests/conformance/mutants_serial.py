@@ -123,6 +123,19 @@ def talkative(unit: SimulatedUnit) -> None:
     unit.requests.unsolicited_receivers[:] = [say]
 
 
+def _answering(row_id: int):
+    def change(unit: SimulatedUnit) -> None:
+        unit.link._stack._silent -= {row_id}
+
+    return change
+
+
+enter("reset is acknowledged on a serial line", "serial", "reset.acknowledged", _answering(1))
+enter("a refused reset is answered on a serial line", "serial", "reset.magic", _answering(1))
+enter("the start of a program is refused aloud", "serial", "lengths.run_program.long", _answering(101))
+enter("the start of a burst is acknowledged on a serial line", "serial", "bursts.block", _answering(119))
+
+
 @mutant("replies leave faster than the line", "serial", "timing.pace")
 def unpaced(unit: SimulatedUnit) -> None:
     unit.transport._paced = False

@@ -197,7 +197,7 @@ def run(monkeypatch, make_bench):
     pipeline = make_bench().pipeline
     monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(pipeline.handle))
 
-    def run(scenario, *, clock="stepped", options=None, others=(), **overrides):
+    def run(scenario, *, clock="stepped", options=None, others=(), ready_within_s=60.0, **overrides):
         def profile(keys):
             links = {"serial": {"port": "auto"}, "can": {"channel": "off"}}
             return Profile.model_validate({"run": {"clock": clock}, "links": links, **keys})
@@ -210,7 +210,7 @@ def run(monkeypatch, make_bench):
             )
             try:
                 await run.launched.start()
-                line = await run.launched.ready()
+                line = await asyncio.wait_for(run.launched.ready(), ready_within_s)
                 return await scenario(run.launched.emulation, line)
             finally:
                 await run.launched.close()

@@ -16,6 +16,7 @@ from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FI
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 
@@ -152,7 +153,10 @@ def test_a_changed_device_is_found(record):
     assert difference.startswith("serial: differs")
 
 
-def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_is_played_to_there(record):
+@pytest.mark.parametrize("rest", [0, 8])
+def test_a_truncated_recording_is_played_to_its_end_and_called_truncated(record, rest):
+    """Cut after an entry that is followed by output, or within the next line."""
+
     async def scenario(emulation, _line):
         await talk(emulation, 3)
 
@@ -160,13 +164,43 @@ def test_a_recording_that_was_cut_off_in_the_middle_of_a_line_is_played_to_there
     events = folder / EVENTS_FILE
     text = events.read_text()
     cut = text.index("\n", len(text) // 2)
-    while '"do": "out"' not in text[:cut].rpartition("\n")[2]:
+    while '"do": "in"' not in text[:cut].rpartition("\n")[2]:
         cut = text.index("\n", cut + 1)
-    events.write_text(text[: cut + 1] + text[cut + 1 : cut + 9])
-    (folder / "truth.csv").unlink()
+    events.write_text(text[: cut + 1 + rest])
     report = report_of(folder)
     assert 0 < report.entries < text.count("\n")
-    assert report.differences == []
+    (difference,) = report.differences
+    assert difference.startswith(f"{events}: truncated at ")
+
+
+def test_a_missing_truth_log_is_a_difference(record):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    (folder / "truth.csv").unlink()
+    assert report_of(folder).differences == [f"{folder / 'truth.csv'}: missing"]
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("device.firmware_minor=0", "identical"),
+        ("device.firmware_minor=9", "serial: differs from byte"),
+        ("truth={kind='fixed', attitude={ra_deg=10.0, dec_deg=0.0}}", "truth log: row 1 differs"),
+        ("parameters.update_rate=0.5", "the device behaves differently"),
+    ],
+)
+def test_another_profile_is_compared_with_the_recording(record, tmp_path, override, said):
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+
+    folder = record(scenario)
+    mine = tmp_path / "mine.toml"
+    mine.write_text('[parameters]\nstart_mode = "lost_in_space"\nupdate_rate = 5.0\n')
+    status, out, err = run_command_line("replay", str(folder), "--profile", str(mine), "--set", override)
+    assert (status, err) == (0 if said == "identical" else 1, "")
+    assert said in out
 
 
 @pytest.mark.parametrize("content", [None, "{}", '{"profile": {"x": 1}, "folder": "."}'])
@@ -210,7 +244,6 @@ DAMAGED_LINES = {
     "a kind that is no text": '{"ns": 0, "do": {}}',
     "input without link": '{"ns": 0, "do": "in", "data": "00"}',
     "input of an unknown link": '{"ns": 0, "do": "in", "link": "radio", "data": "00"}',
-    "input of a link that is off": '{"ns": 0, "do": "in", "link": "can", "data": [1, "00", true, false]}',
     "input without data": '{"ns": 0, "do": "in", "link": "serial"}',
     "half a byte": '{"ns": 0, "do": "in", "link": "serial", "data": "0"}',
     "no hexadecimal": '{"ns": 0, "do": "out", "link": "serial", "data": "xy"}',
@@ -219,7 +252,6 @@ DAMAGED_LINES = {
     "bytes on a CAN bus": '{"ns": 0, "do": "out", "link": "can", "data": "00"}',
     "part of a CAN frame": '{"ns": 0, "do": "out", "link": "can", "data": [1, "00"]}',
     "a CAN frame that cannot exist": '{"ns": 0, "do": "out", "link": "can", "data": [1, "00112233445566778899", true, false]}',
-    "no feed": '{"ns": 0, "do": "feed", "data": "{}"}',
     "a feed without data": '{"ns": 0, "do": "feed"}',
     "a feed that is not bytes": '{"ns": 0, "do": "feed", "data": "\u2192"}',
     "no truth": '{"ns": 0, "do": "truth"}',
@@ -228,10 +260,17 @@ DAMAGED_LINES = {
     "no fault": '{"ns": 0, "do": "fault"}',
     "an unknown fault": '{"ns": 0, "do": "fault", "request": {"weather": 1}}',
     "a fault of a link that is off": '{"ns": 0, "do": "fault", "request": {"can": {"drop": 1.0}}}',
-    "a reply to nothing": '{"ns": 0, "do": "reply"}',
-    "the end of no write": '{"ns": 0, "do": "stored"}',
     "no UTF-8": b"\xff",
 }
+
+
+IMPOSSIBLE_LINES = {
+    "input of a link that is off": '{"ns": 0, "do": "in", "link": "can", "data": [1, "00", true, false]}',
+    "no feed": '{"ns": 0, "do": "feed", "data": "{}"}',
+    "a reply to nothing": '{"ns": 0, "do": "reply"}',
+    "the end of no write": '{"ns": 0, "do": "stored"}',
+}
+"""Entries that cannot happen to the device."""
 
 
 @pytest.fixture
@@ -244,15 +283,27 @@ def recorded(record):
     return record(scenario)
 
 
-@pytest.mark.parametrize("line", DAMAGED_LINES.values(), ids=DAMAGED_LINES)
-def test_a_damaged_line_is_named(recorded, line):
+def with_line(recorded, line):
+    """Insert a line into the tape; return its place."""
     events = recorded / EVENTS_FILE
     lines = events.read_bytes().splitlines(keepends=True)
     lines.insert(3, (line if isinstance(line, bytes) else line.encode()) + b"\n")
     events.write_bytes(b"".join(lines))
+    return f"{events}: line 4: "
+
+
+@pytest.mark.parametrize("line", IMPOSSIBLE_LINES.values(), ids=IMPOSSIBLE_LINES)
+def test_a_line_that_cannot_be_played_is_a_difference(recorded, line):
+    where = with_line(recorded, line)
+    assert report_of(recorded).differences[0].startswith(where)
+
+
+@pytest.mark.parametrize("line", DAMAGED_LINES.values(), ids=DAMAGED_LINES)
+def test_a_damaged_line_is_named(recorded, line):
+    where = with_line(recorded, line)
     with pytest.raises(EmulatorError) as caught:
         report_of(recorded)
-    assert f"{events}: line 4: " in str(caught.value)
+    assert where in str(caught.value)
     assert "\n" not in str(caught.value)
 
 

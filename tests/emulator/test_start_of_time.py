@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starid.attitude import Attitude
 from tests.emulator.runs import Control, FakeImager
@@ -96,6 +97,27 @@ def test_time_waits_for_the_slowest_head(run, slow_start, monkeypatch, clock):
     links = {"serial": {"port": "auto"}, "can": {"channel": "off"}}
     assert run(scenario, clock=clock, others=[{"links": links}]) < SLOW_START_S / 10
     assert len(made) == 2
+
+
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_a_pipeline_that_does_not_start_ends_the_start_of_all_heads(run, monkeypatch, clock):
+    starts = []
+    make_ready = FakeImager.start
+
+    async def second_fails(imager):
+        starts.append(imager)
+        if len(starts) == 2:
+            raise EmulatorError("no catalogue")
+        return await make_ready(imager)
+
+    monkeypatch.setattr(FakeImager, "start", second_fails)
+
+    async def scenario(emulation, _line):
+        pytest.fail("ready")
+
+    links = {"serial": {"port": "auto"}, "can": {"channel": "off"}}
+    with pytest.raises(EmulatorError, match="no catalogue"):
+        run(scenario, clock=clock, others=[{"links": links}], ready_within_s=5.0)
 
 
 def test_a_step_requested_before_the_pipeline_is_ready_waits_for_it(run, slow_start):

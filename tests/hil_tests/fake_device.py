@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.image_transfer import block_checksum
+from starhil.protocol.image_transfer import file_checksum
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports import open_can, open_serial
 
 ICD = load_unit()
@@ -47,13 +48,15 @@ class FakeDevice:
         default_factory=lambda: {p.id: p.to_number(p.default) for p in ICD.parameters.values()}
     )
     frame: int = 0
+    position: int = 0
     holes: dict[str, bytes] = field(default_factory=dict)
     block: bytes = b""
 
     def __post_init__(self):
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
-        self._receiver = DeviceReceiver()
+        self._stack = build_serial_stack(ICD)
+        self._receiver = self._stack.device()
         self._can_receiver = CanDeviceReceiver(4)
         self._file = bmp_file()
 
@@ -97,7 +100,9 @@ class FakeDevice:
     def _on_bytes(self, data: bytes) -> None:
         for event in self._receiver.feed(data, self._loop.time()):
             if not isinstance(event, LinkFault):
-                self._answer(event, lambda reply: self._serial.send(encode_reply(reply, self.dialect)))
+                self._answer(
+                    event, lambda reply: self._serial.send(self._stack.encode_reply(reply, self.dialect))
+                )
 
     def _on_frame(self, frame: CanFrame) -> None:
         for event in self._can_receiver.feed(frame, self._loop.time()):
@@ -148,10 +153,20 @@ class FakeDevice:
                 "frame": self.frame,
                 "checksum": (sum(self.pixels[self.frame * 128 : self.frame * 128 + 128]) + wrong) % 256,
             }
+        if name == "file_info":
+            if self.position:
+                return {}
+            return {
+                "type": 4,
+                "counter": 1,
+                "size": len(self._file),
+                "time": 1,
+                "crc": file_checksum(self._file),
+            }
         if name == "file_block":
             return {
                 "ready": bool(self.block),
-                "checksum": block_checksum(self.block),
+                "checksum": file_checksum(self.block),
                 "length": len(self.block),
             }
         return self.telemetry.get(name, {})
@@ -167,6 +182,10 @@ class FakeDevice:
             self.frame = values["next_frame"]
         elif name == "load_file_block":
             self.block = self._file[values["offset"] : values["offset"] + values["length"]]
+        elif name == "reset_file_list":
+            self.position = 0
+        elif name == "advance_file_list":
+            self.position += 1
         elif name.startswith("set_hole_map"):
             self.holes[name] = values["map"]
         elif name == "start_burst":

@@ -9,12 +9,13 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
+from starhil.hil_tests.images import list_files
 from starhil.hil_tests.raw_traffic import send_and_listen
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.values import FieldError
-from tests.hil_tests.fake_device import EDGE, FakeDevice
+from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
 
 PATIENCE_S = 5.0
 TIMEOUT_S = 0.15
@@ -184,6 +185,39 @@ def test_an_image_is_downloaded_by_bursts_and_lost_packets_are_asked_for_again(p
     image = client.download_image("size_64", method="burst")
     assert (image.width, image.height, image.repeats) == (EDGE, EDGE, 1)
     assert image.pixels == device.pixels
+
+
+def test_the_files_of_the_device_are_listed(pair):
+    _device, client = pair
+    (file,) = client.run(list_files(client.core, within_s=1.0))
+    assert (file["type"], file["counter"], file["size"]) == (4, 1, len(bmp_file()))
+
+
+def test_a_wrong_file_checksum_ends_the_download(pair, monkeypatch):
+    device, client = pair
+    canned = device._telemetry
+
+    def telemetry(name):
+        values = canned(name)
+        return values | {"crc": values["crc"] ^ 1} if name == "file_info" and values else values
+
+    monkeypatch.setattr(device, "_telemetry", telemetry)
+    with pytest.raises(BadReplyError, match="the downloaded file has checksum"):
+        client.download_image("size_64", method="burst")
+
+
+def test_a_telecommand_that_the_serial_line_does_not_answer_is_not_waited_for(hub):
+    with FakeDevice() as device:
+        with ObcClient.open(serial=device.open_serial(), timeout_s=0.2) as client:
+            client.command("reset")
+            client.command("reset", magic=0, checked=False)
+            client.read("identification")
+            assert not client.stray_replies
+        with ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
+            client.command("reset")
+            with pytest.raises(NackError, match="invalid_parameter"):
+                client.command("reset", magic=0, checked=False)
+        assert [name for name, _ in device.received] == ["reset", "reset"]
 
 
 def test_unsolicited_telemetry_is_a_separate_stream(hub):

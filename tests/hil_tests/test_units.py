@@ -55,6 +55,9 @@ class FakeLink:
         self.requests = []
         self.on_reply = self.on_fault = None
 
+    def answers(self, row):
+        return row.answers
+
     def request(self, request, _reply_size):
         self.requests.append(request)
         for reply in self.replies:

@@ -17,15 +17,15 @@ needs_vcan0 = pytest.mark.skipif(
 )
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def bus():
-    """A CAN bus of the module's own: vcan0 or a hub."""
+    """A CAN bus: vcan0 or a hub."""
     with private_can_bus() as channel:
         yield channel
 
 
-@pytest.fixture(scope="module")
-def emulator(bus, tmp_path_factory):
+@pytest.fixture(scope="session")
+def running_emulator(bus, tmp_path_factory):
     """An emulator of an accurate sensor on a pty at 921600 baud and on the bus."""
     folder = tmp_path_factory.mktemp("emulator")
     command = emulator_command(
@@ -42,6 +42,17 @@ def emulator(bus, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
+def emulator(running_emulator):
+    """The emulator after a reset with the parameters of its profile, whatever other modules have set and saved."""
+    with ObcClient.open(can=running_emulator.ready["can"], timeout_s=5.0) as client:
+        for command in ("default_parameters", "save_parameters", "reset"):
+            client.command(command)
+        client.wait_for("device_status", lambda reading: reading["reset_cause"] == "command", within_s=60.0)
+        client.wait_for("device_status", lambda reading: reading["mode"] == "standby", within_s=60.0)
+    return running_emulator
+
+
+@pytest.fixture(scope="session")
 def sagitta(tmp_path_factory):
     """An emulated Sagitta on a pty."""
     command = emulator_command(

@@ -16,6 +16,8 @@ STATE_CHANGING = frozenset(
     {"reset", "set_parameter", "set_unsolicited", "set_mode", "set_update_rate", "set_star_config", "clear_counters",
      "save_image", "default_parameters", "restore_parameters"}
 )  # fmt: skip
+UNANSWERED = frozenset({1, 101, 119})
+"""Telecommands that are not answered on a serial line."""
 """Telecommands that, if they were accepted, would change how the device answers.
 
 The fuzzers leave them out.
@@ -50,6 +52,10 @@ def answer_to(identifier: int, data: bytes, source: int = 0) -> Expected:
     row = ICD.telecommands_by_id.get(identifier)
     if row is None:
         return Expected(identifier, frozenset({1}), source=source)
+    if len(data) == row.size + 1:
+        if crc8(data[:-1]) != data[-1]:
+            return Expected(identifier, frozenset({4}), source=source)
+        data = data[:-1]
     if len(data) != row.size:
         return Expected(identifier, frozenset({2}), source=source)
     try:
@@ -57,6 +63,16 @@ def answer_to(identifier: int, data: bytes, source: int = 0) -> Expected:
     except MessageError:
         return Expected(identifier, frozenset({3}), source=source)
     return Expected(identifier, OK_OR_STATE | {3}, source=source)
+
+
+def crc8(data: bytes) -> int:
+    """The CRC-8 that may follow a telecommand: reflected, polynomial 12h; FFh for no data."""
+    crc = 0
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ 0x48 if crc & 1 else crc >> 1
+    return crc if data else 0xFF
 
 
 def is_dangerous(identifier: int, data: bytes) -> bool:

@@ -14,6 +14,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.export.cosmos import _state
 from starhil.protocol.icd import load_unit
+from starhil.protocol.serial_stack import serial_answers
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import same
 
@@ -129,6 +130,8 @@ def test_every_command_is_sent_and_answered(cosmos: Cosmos, can_obc: ObcClient) 
             for name, value in row.example().items()
         }
         cosmos.send(row.name.upper(), **values)
+        if not serial_answers(ICD, row):
+            continue  # the next command does not wait for a reply
         name, packet = cosmos.receive()
         while name == "FILE_BURST":
             name, packet = cosmos.receive()
@@ -147,8 +150,11 @@ def test_after_a_command_that_changes_the_dialect_cosmos_reconnects_with_the_new
     can_obc.set_parameter("serial_dialect", dialect)
     with connect(dialect) as before:
         before.send(name.upper())
-        answer, packet = before.receive()
-        assert (answer, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", name.upper(), "OK")
+        if serial_answers(ICD, ICD.telecommands[name]):
+            answer, packet = before.receive()
+            assert (answer, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", name.upper(), "OK")
+        else:
+            time.sleep(0.2)  # the device restarts
     with connect(DEFAULT if name == "default_parameters" else stored) as after:
         after.send("REQUEST_IDENTIFICATION")
         answer, packet = after.receive()

@@ -15,6 +15,7 @@ from starhil.protocol.export.packets import key_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_stack import serial_answers
 from tests.protocol.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
 from tests.protocol.test_export_c import KINDS
 
@@ -57,7 +58,7 @@ def test_every_telemetry_row_is_asked_for_and_read(line: CDriver, can_obc: ObcCl
 
 def test_every_telecommand_is_made_and_taken(line: CDriver, can_obc: ObcClient) -> None:
     for row in ICD.telecommands.values():
-        if row.name in DISRUPTIVE:
+        if row.name in DISRUPTIVE or not serial_answers(ICD, row):
             continue
         data = b""
         if row.named_fields:
@@ -92,14 +93,15 @@ def test_the_component_of_the_docs_reads_the_attitude(emulator, tmp_path: Path) 
     )
     assert (done.returncode, done.stderr) == (0, "")
     with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
-        obc.command("set_mode", mode="lost_in_space")
-        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=60.0)
+        obc.command("set_mode", mode="standby")  # as after boot
     done = subprocess.run(
         [program, emulator.ready["serial"]], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stderr) == (0, "")
     counts, attitude = done.stdout.splitlines()
-    assert counts == "acknowledges 1, refusals 0, faults 0"
+    assert counts == "acknowledges 2, refusals 0, faults 0"
+    with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
+        truth = obc.wait_for("precise_attitude", lambda reading: bool(reading["valid"]), within_s=60.0)
     seen = [float(word) for word in attitude.removeprefix("valid 1, q ").split()]
     assert seen == pytest.approx([truth[name] for name in ("q_x", "q_y", "q_z", "q_w")], abs=1e-4)
 

@@ -54,15 +54,15 @@ def _install(wheel: Path, environment: Path) -> None:
 
     To unpack them all again takes minutes on a busy machine.
     """
-    venv.create(environment, with_pip=True)
+    venv.create(environment)
     (packages,) = environment.glob("lib/python*/site-packages")
     for installed in Path(sysconfig.get_path("purelib")).iterdir():
         ours = installed.name.lstrip("_").startswith(("starhil", "starid"))
         if not ours and not (packages / installed.name).exists():
             (packages / installed.name).symlink_to(installed)
-    python = str(environment / "bin/python")
-    _run([python, "-m", "pip", "install", "--quiet", "--no-deps", str(wheel)])
-    _run([python, "-m", "pip", "check"])
+    pip = [sys.executable, "-m", "pip", "--python", str(environment / "bin/python")]
+    _run([*pip, "install", "--quiet", "--no-deps", str(wheel)])
+    _run([*pip, "check"])
 
 
 def _run(command: list[str], folder: Path | None = None) -> str:

@@ -20,7 +20,6 @@ pytestmark = pytest.mark.process
 
 PATIENCE_S = 240.0
 SESSION = "[[step]]\nread = 'identification'\n[[step]]\nwait_s = 600\n[[step]]\nread = 'device_status'\n"
-SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL, signal.SIGINT)
 
 
 @pytest.fixture(autouse=True)
@@ -85,8 +84,17 @@ def interrupt(words: list, number: signal.Signals, folder: Path) -> int:
     return process.returncode
 
 
-@pytest.mark.parametrize("number", SIGNALS, ids=lambda number: number.name)
-@pytest.mark.parametrize("name", ["session", "conformance"])
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("session", signal.SIGTERM),
+        ("session", signal.SIGKILL),
+        ("conformance", signal.SIGHUP),
+        ("conformance", signal.SIGINT),
+        ("conformance", signal.SIGKILL),
+    ],
+    ids=str,
+)
 def test_a_signal_leaves_no_process_and_no_folder_behind(name, number, tmp_path):
     script, junit, html, scratch = (tmp_path / each for each in ("s.toml", "j.xml", "c.html", "scratch"))
     scratch.mkdir()

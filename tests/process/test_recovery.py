@@ -62,7 +62,7 @@ def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp
     rng = random.Random(5)
     emulator = own(settings=["device.boot_s=0", "parameters.update_rate=0.2"])
     allowed = {300}
-    for turn in range(5):
+    for turn in range(3):
         with ObcClient.open(serial=emulator.ready["serial"], timeout_s=5.0) as obc:
             kept = obc.get_parameter("exposure")
             assert kept in allowed, f"after cut {turn}"
@@ -109,7 +109,7 @@ def test_power_cuts_while_canopen_settings_are_being_stored_lose_none_of_them(ow
     with HubThread() as hub:
         emulator = own(serial="off", can=hub.channel, extra=["--canopen", str(NODE)])
         allowed = {1000}
-        for turn in range(4):
+        for turn in range(3):
             with canopen_master(hub.channel) as (network, sdo):
                 assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed, f"after cut {turn}"
                 kept, last = 2000 + turn, 3000 + turn

@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from starhil.protocol.candump import read_candump
-from tests.emulator.cli.command_line import run_command_line
+from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.protocol.dissection import dissect
 
 pytestmark = pytest.mark.process
@@ -17,7 +17,8 @@ pytestmark = pytest.mark.process
 
 def starhil(*words: object) -> subprocess.CompletedProcess[str]:
     """Run `starhil` in this process; what it starts are processes."""
-    return subprocess.CompletedProcess(words, *run_command_line(*map(str, words)))
+    status, out, errors = run_command_line(*map(str, words))
+    return subprocess.CompletedProcess(words, status, out, "\n".join(log_lines(errors)))
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, installed_command
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import private_can_bus
+from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.truth.simulators import blocks_of_42
 
 pytestmark = pytest.mark.process
@@ -150,10 +151,9 @@ def test_42_in_lock_step_and_its_recording(tmp_path):
     assert figures["largest error of the attitude"][0] < 20.0
     assert figures["largest error of the rate"][0] < 0.01
     assert (tmp_path / "obc.png").read_bytes().startswith(PNG)
-    replay = [installed_command(), "replay", str(tmp_path / "recorded")]
-    done = subprocess.run(replay, capture_output=True, text=True, timeout=WITHIN_S)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert "entries played: identical" in done.stdout
+    status, out, said = run_command_line("replay", str(tmp_path / "recorded"))
+    assert (status, said) == (0, "")
+    assert "entries played: identical" in out
 
 
 def test_two_heads_on_one_bus(tmp_path):

@@ -435,7 +435,6 @@ BAD_DEFINITIONS = [
     ("limits that do not fit", HEAD + _row(fields='[{ name = "a", type = "u8", max = 300 }]'), "max 300 does not fit"),
     ("min above max", HEAD + _row(fields='[{ name = "a", type = "u8", min = 3, max = 2 }]'), "min 3 is above max 2"),
     ("unknown include", HEAD + '[[telemetry]]\nid = 200\nname = "r"\ndoc = ""\nprovenance = "ours"\nsize = 0\ninclude = ["x"]', "no row named 'x'"),
-    ("no fields", HEAD + '[[telemetry]]\nid = 200\nname = "r"\ndoc = ""\nprovenance = "ours"\nsize = 0', "needs `fields` or `include`"),
     ("bytes without size", HEAD + _row(fields='[{ name = "a", type = "bytes" }]'), "needs a size"),
     ("unit unlike the parameter's", HEAD + _row(fields='[{ name = "a", type = "u8", unit = "s", parameter = "exposure" }]'), "they must agree"),
     ("default outside", HEAD + '[[parameter]]\nid = 1\nname = "window_width"\ndefault = 2\n', "default: window_width: 2 is outside"),

@@ -166,7 +166,7 @@ INVALID = [
     ("bits across bytes in a text", telemetry('"bits a:5 b:4"'), "field 'bits a:5 b:4': b: 4 bits do not fit into the remaining 3 bits of the byte"),
     ("no end of fields in a text", telemetry('"u8 a{0..9999999999}"'), "must be 1 to 256 fields"),
     ("readback of another name", telecommand("", more="readback = 1"), "command: the name of a telecommand with a readback must begin with set_"),
-    ("readback of telemetry", telemetry("", more="readback = 1"), "row: only telecommands have an action or a readback"),
+    ("readback of telemetry", telemetry("", more="readback = 1"), "row: only telecommands have a readback"),
     ("no provenance", telemetry("").replace('provenance = "ours"', ""), "row: needs `provenance`, here or in \\[unit\\]"),
     ("no plugin", 'plugin = "unit.py"\n', "no such plugin"),
 ]  # fmt: skip
@@ -277,7 +277,7 @@ def test_units_of_measure_are_converted_within_a_kind():
 def test_a_plugin_that_fails_is_reported_in_one_line(tmp_path):
     (tmp_path / "unit.toml").write_text(HEAD + 'plugin = "unit.py"\n', encoding="utf-8")
     (tmp_path / "unit.py").write_text("1 / 0\n", encoding="utf-8")
-    with pytest.raises(IcdError, match=r"unit\.py: the plugin fails: ZeroDivisionError"):
+    with pytest.raises(IcdError, match=r"the plugin fails in unit\.py: ZeroDivisionError"):
         load_unit(tmp_path)
 
 

@@ -19,6 +19,9 @@ def test_a_process_with_another_home_uses_the_kernels_of_this_run(tmp_path):
     assert done.stdout.strip() == str(cache_dir())
 
 
-def test_a_process_without_the_folder_of_the_kernels_is_not_started():
+def test_a_process_without_the_folder_of_the_kernels_is_not_started(monkeypatch):
     with pytest.raises(AssertionError, match="STARHIL_CACHE_DIR"):
         subprocess.run(SHOW, env={"PATH": os.environ["PATH"]}, check=True)
+    monkeypatch.delenv("STARHIL_CACHE_DIR")
+    with pytest.raises(AssertionError, match="STARHIL_CACHE_DIR"):
+        subprocess.run(SHOW, check=True)

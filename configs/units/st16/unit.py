@@ -23,21 +23,26 @@ RESULT_SIZE = 0x80 + 172
 ANALOG_ADDRESS = 0x04
 LENGTH_ADDRESS = 0x4C
 EDAC_SIZE = 0x50
+ANALOG = {
+    "mcu_current": 0.1, "bus_voltage": 5.0, "core_voltage": 1.2, "mcu_voltage": 3.3, "io_voltage": 3.3, "mcu_temperature": 20.0,
+    "supervisor_voltage": 3.3, "detector_voltage": 3.3,
+}  # fmt: skip
+"""Analog values, A, V and °C, in the order of the memory, with their defaults (ours); numbers of `[health]` replace them."""
 MAX_MESSAGE_SIZE = 256
 """Bytes of the result in one message (ours)."""
 
 
-def reader(device: Any) -> Callable[[str], float]:
-    """Return a function that reads quantities of the device by name, or 0 if a quantity has no value."""
+def reader(device: Any) -> Callable[..., float]:
+    """Return a function that reads quantities of the device by name, or a default if a quantity has no value."""
     # Imported here because reading the definition must not require the emulator.
     from starhil.emulator.device.quantities import getter_of
     from starhil.emulator.device.snapshot import Snapshot
 
     shot = Snapshot(device)
 
-    def value(name: str) -> float:
+    def value(name: str, default: float = 0.0) -> float:
         found = getter_of(name)(shot)
-        return float(found) if isinstance(found, (int, float)) else 0.0
+        return float(found) if isinstance(found, (int, float)) else default
 
     return value
 
@@ -53,7 +58,7 @@ def result(device: Any) -> bytes:
         *(value(f"rate.{axis}") for axis in "xyz"),
         value("frame.time"),
     )
-    temperature = round(10.0 * value("health.detector_temperature"))
+    temperature = round(10.0 * value("health.detector_temperature", value("temperature.detector")))
     hardware = bytes(12) + struct.pack("<h", temperature) + bytes(42)
     return head + hardware + bytes(172)
 
@@ -61,9 +66,8 @@ def result(device: Any) -> bytes:
 def edac(device: Any) -> bytes:
     """Return the memory that can be read: analog values, and the length of the result."""
     value = reader(device)
-    names = ("mcu_current", "bus_voltage", "core_voltage", "mcu_voltage", "io_voltage", "mcu_temperature",
-             "supervisor_voltage", "detector_voltage")  # fmt: skip
-    analog = struct.pack("<8f", *(value(f"health.{name}") for name in names))
+    defaults = ANALOG | {"mcu_temperature": value("temperature.detector")}
+    analog = struct.pack("<8f", *(value(f"health.{name}", default) for name, default in defaults.items()))
     memory = bytearray(EDAC_SIZE)
     memory[ANALOG_ADDRESS : ANALOG_ADDRESS + len(analog)] = analog
     memory[LENGTH_ADDRESS:] = struct.pack("<I", RESULT_SIZE)

@@ -19,7 +19,7 @@ from starhil.protocol.export.quoting import cosmos_name, cosmos_string, identifi
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import BURST_ID
 from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import build_serial_stack, serial_answers
 
 TARGET: Final = "<%= target_name %>"
 """Name of the target, which COSMOS fills in when the plugin is installed."""
@@ -86,7 +86,11 @@ def _protocol(icd: InterfaceDefinition, stack: SerialStack, name: str) -> str:
         link = link_text(stack)
     else:
         sizes = ", ".join(f"{row.id}: {row.size}" for row in icd.telemetry.values())
-        link = f"# Bytes of data of each telemetry row\nSIZES = {{{sizes}}}\n\n\n{_template('cubespace_link.py.in')}"
+        silent = [row.id for row in icd.telecommands.values() if not serial_answers(icd, row)]
+        link = (
+            f"# Bytes of data of each telemetry row\nSIZES = {{{sizes}}}\n\n"
+            f"# Telecommands without an answer\nUNANSWERED = {tuple(silent)}\n\n\n{_template('cubespace_link.py.in')}"
+        )
     return f"{imports}{constants}{link}\n\nclass " + protocol.replace("@CLASS@", _class_name(name))
 
 

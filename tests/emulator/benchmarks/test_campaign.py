@@ -28,6 +28,7 @@ from starhil.emulator.benchmarks.hard_sky import HARD_SENSOR, hard_sky
 from starhil.emulator.errors import EmulatorError
 from starid.attitude import random_attitude
 from starid.errors import StaridError
+from tests.emulator.cli.command_line import run_command_line
 
 PLAN = CampaignPlan(frames=5, seed=11, chunk=2)
 EXACT = [name for name in RECORD.names or () if not name.endswith("_ms")]
@@ -62,22 +63,16 @@ def test_an_interrupted_campaign_resumes_where_it_stopped(tmp_path):
 
 @pytest.mark.process
 def test_a_killed_campaign_resumes_with_the_same_figures(tmp_path):
-    command = [
-        sys.executable,
-        "-c",
-        "from starhil.emulator.cli.app import main; main()",
-        "campaign",
-        "lost-in-space",
-    ]
-    command += ["--frames", "150", "--seed", "3", "--json"]
+    words = ["campaign", "lost-in-space", "--frames", "150", "--seed", "3", "--json"]
 
     def run(folder: Path, jobs: int) -> dict[str, object]:
-        words = [*command, "--jobs", str(jobs), "-o", str(folder)]
-        done = subprocess.run(words, capture_output=True, check=True, timeout=240)
-        return json.loads(done.stdout)
+        status, out, said = run_command_line(*words, "--jobs", str(jobs), "-o", str(folder))
+        assert status == 0, said
+        return json.loads(out)
 
-    killed = subprocess.Popen([*command, "-o", str(tmp_path / "killed")], stderr=subprocess.DEVNULL,
-                              stdout=subprocess.DEVNULL, start_new_session=True)  # fmt: skip
+    program = "from starhil.emulator.cli.app import main; main()"
+    killed = subprocess.Popen([sys.executable, "-c", program, *words, "-o", str(tmp_path / "killed")],
+                              stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL, start_new_session=True)  # fmt: skip
     deadline = time.monotonic() + 200
     while not list((tmp_path / "killed").glob("chunk-*.npz")) and time.monotonic() < deadline:
         time.sleep(0.05)

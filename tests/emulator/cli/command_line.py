@@ -26,6 +26,11 @@ def run_command_line(*arguments: str, encoding: str = "utf-8") -> tuple[int, str
     return end.value.code, _text(out), _text(err)
 
 
+def log_lines(errors: str) -> list[str]:
+    """Lines on stderr, but for the progress of a slow start."""
+    return [line for line in errors.splitlines() if not line.startswith("starting:")]
+
+
 def _text(stream: io.TextIOWrapper) -> str:
     assert isinstance(stream.buffer, io.BytesIO)
     return stream.buffer.getvalue().decode(stream.encoding)

@@ -1,12 +1,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from starhil.emulator.cli import identify
 from starhil.emulator.cli.app import build_app
 from starid.attitude import Attitude
 from starid.errors import StaridError
@@ -98,6 +100,26 @@ def test_noise_alone_gives_no_attitude(tmp_path):
     assert not found["valid"]
     assert found["reason"] == "too_few_stars"
     assert found["ra_deg"] is None
+
+
+def test_a_hopeless_image_is_given_up_in_time_and_progress_is_shown(tmp_path, monkeypatch):
+    image = tmp_path / "lamps.bmp"
+    random = np.random.default_rng(2)
+    lamps = np.full((480, 640), 20.0)
+    lamps[random.integers(5, 475, 80), random.integers(5, 635, 80)] = 20000.0
+    cv2.imwrite(
+        str(image),
+        (cv2.GaussianBlur(lamps, (0, 0), 1.2) + random.normal(0, 2, lamps.shape))
+        .clip(0, 255)
+        .astype(np.uint8),
+    )
+    monkeypatch.setattr(identify, "_PROGRESS_EVERY_S", 0.0)
+    result = starhil("identify", str(image), "--json", "--fov", "20", "--time-limit", "0.001")
+    found = json.loads(result.stdout)
+    assert result.exit_code == 1
+    assert found["reason"] == "no_match"
+    assert found["advice"].startswith("given up after 0.001 s (--time-limit); check that")
+    assert re.fullmatch(r"searching for \d+ s: round 1 of 5, view 1, field 20° wide\n", result.stderr)
 
 
 def test_an_image_of_another_size_is_rejected(tmp_path):

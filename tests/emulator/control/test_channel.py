@@ -54,7 +54,6 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             by_unix = await control.do("truth", unix_s=truth["unix_s"] + 3.0)
             assert by_unix["roll_deg"] == pytest.approx(6.0, abs=1e-4)
             for wrong, said in (
-                ({}, "truth: must be an object with the keys of [truth] in a profile"),
                 ({"truth": 3}, "truth: must be an object with the keys of [truth] in a profile"),
                 ({"truth": {"kind": "fixed", "x": 1}}, "truth.x: unknown key; known: attitude, kind, mount"),
                 ({"truth": {}}, "truth.kind: must be one of '42', 'file', 'fixed', 'live', 'rate', 'slew'"),
@@ -68,6 +67,8 @@ def test_truth_is_read_back_and_swapped_while_running(run):
             assert bad == {"ok": False, "error": "truth.rate_deg_s: missing"}
             assert not (await control.do("set_truth", truth={"kind": "file", "path": "gone.csv"}))["ok"]
             assert (await control.do("truth"))["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0])
+            assert (await control.do("set_truth"))["kind"] == "fixed"  # the profile's
+            assert (await control.do("truth"))["ra_deg"] == pytest.approx(83.8)
 
     run(scenario)
 

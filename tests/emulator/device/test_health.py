@@ -5,6 +5,7 @@ import math
 import pytest
 
 from starhil.emulator.profile import Profile
+from starhil.protocol.unit_folders import bundled_units
 
 HOT = {
     "thermal": {
@@ -117,3 +118,22 @@ def test_particles_come_with_the_south_atlantic_anomaly(make_bench):
     assert min(rates) == pytest.approx(1.0, abs=1e-3)
     assert 50.0 < max(rates) <= 201.0
     assert 0.01 < sum(rate > 20.0 for rate in rates) / len(rates) < 0.2
+
+
+def test_numbers_left_out_of_health_are_those_of_the_model(make_bench):
+    given = {"mcu_current": 0.25, "fpga_temperature": 0.0}
+    bench = make_bench(Profile.model_validate({"health": given}), unit="sagitta").start()
+    power, temperature = bench.read("power"), bench.read("temperature")
+    assert (power["mcu_current"], power["mcu_voltage"], power["fpga_18_voltage"]) == pytest.approx(
+        (0.25, 3.3, 1.8)
+    )
+    assert temperature == {"mcu": 20.0, "cmos": 20.0, "fpga": 0.0}
+
+
+def test_no_temperature_or_voltage_of_a_bundled_unit_is_zero_by_default(make_bench):
+    for name in bundled_units():
+        bench = make_bench(Profile.model_validate({}), unit=name).start()
+        for row in bench.icd.telemetry.values():
+            bound = [field for field in row.named_fields.values() if str(field.value).startswith("health.")]
+            values = bench.read(row.name) if bound else {}
+            assert [field.name for field in bound if not values[field.name]] == [], (name, row.name)

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
+from starhil.emulator.device.file_download import msdos_time
 from starhil.emulator.device.images import StoredImage
 from starhil.emulator.pipeline.messages import Failure
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
@@ -216,7 +217,7 @@ def test_the_image_comes_as_a_bmp_file_by_bursts_with_holes(bench):
         assert {(p.kind, p.id, len(p.data)) for p in packets} == {(ReplyKind.BURST, 119, 22)}
         parts = dict(struct.unpack("<H20s", p.data) for p in packets)
         data = b"".join(parts[n] for n in range(len(parts)))[:length]
-        assert binascii.crc_hqx(data, 0xFFFF) == block["checksum"]
+        assert binascii.crc_hqx(data, 0) == block["checksum"]
         file += data
     image = cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
     assert image.shape == (64, 64)
@@ -238,10 +239,103 @@ def test_a_burst_sends_only_what_the_hole_map_lacks(bench):
 
 @pytest.mark.parametrize(
     ("file_type", "offset", "length"),
-    [("jpg", 0, 10), ("telemetry", 0, 10), ("bmp", 5100, 200), ("index", 0, 13)],
+    [("jpg", 0, 10), ("telemetry", 0, 10), ("bmp", 5174, 200), ("index", 12, 1), ("bmp", 0, 0)],
 )
 def test_files_that_are_not_there_are_refused(bench, file_type, offset, length):
     save(bench, "size_64")
     assert load(bench, file_type, offset, length) is ErrorCode.INVALID_PARAMETER
     assert bench.read("file_block") == {"ready": False, "parameter_error": True, "checksum": 0, "length": 0}
     assert bench.command("start_burst") is ErrorCode.SEQUENCE
+
+
+@pytest.mark.parametrize(
+    ("offset", "length", "loaded"), [(5100, 200, 74), (0, 20480, 5174), (0, 1024, 5174), (1, 1023, 1023)]
+)
+def test_a_block_ends_with_its_file(bench, offset, length, loaded):
+    save(bench, "size_64")
+    assert load(bench, "bmp", offset, length) is ErrorCode.OK
+    block = bench.read("file_block")
+    assert (block["ready"], block["parameter_error"], block["length"]) == (True, False, loaded)
+    assert len(bench.send("start_burst", ignore_hole_map=True)) == 1 + -(-loaded // 20)
+
+
+def counters(bench):
+    assert bench.command("reset_file_list") is ErrorCode.OK
+    found = []
+    while True:
+        assert bench.read("file_info") == dict.fromkeys(bench.icd.telemetry["file_info"].named_fields, 0) | {
+            "updating": True
+        }
+        bench.step(0.03)
+        info = bench.read("file_info")
+        if not info["type"]:
+            return found
+        found.append(info["counter"])
+        assert bench.command("advance_file_list") is ErrorCode.OK
+
+
+def test_the_oldest_file_gives_way_and_numbers_begin_again_at_1(bench):
+    for _ in range(17):
+        save(bench)
+    assert counters(bench) == list(range(2, 18))
+    bench.device.images._count = 254
+    for _ in range(2):
+        save(bench)
+    assert counters(bench)[-2:] == [255, 1]
+
+
+def test_the_file_list_has_size_checksum_and_time(bench):
+    bench.command("set_unix_time", seconds=1_900_000_001, milliseconds=0)
+    save(bench, "size_128")
+    bench.command("reset_file_list")
+    bench.step(0.03)
+    info = bench.read("file_info")
+    file = bench.device.images.stored.bmp()
+    assert (info["type"], info["counter"], info["size"]) == (4, 1, len(file))
+    assert info["crc"] == binascii.crc_hqx(file, 0)
+    date = info["time"] >> 16
+    assert ((date >> 9) + 1980, date >> 5 & 15, date & 31) == (2030, 3, 17)
+    assert (
+        abs(
+            (info["time"] >> 11 & 31) * 3600 + (info["time"] >> 5 & 63) * 60 + (info["time"] & 31) * 2 - 64001
+        )
+        <= 4
+    )
+
+
+@pytest.mark.parametrize(
+    ("unix_s", "expected"), [(0, 0x00210000), (315532800 + 2, 0x00210001), (2**33, 0xFF9FBF7D)]
+)
+def test_times_outside_of_the_ms_dos_format_are_its_limits(unix_s, expected):
+    assert msdos_time(unix_s * 10**9) == expected
+
+
+def test_erasing_all_files_takes_its_time_and_keeps_an_open_download(bench):
+    save(bench)
+    bench.command("init_image_download", image_size="size_64")
+    before = bench.read("image_frame")
+    for name, values, flags in (
+        ("erase_file", {"all": True}, {"formatting": False, "erasing": True}),
+        ("format_card", {}, {"formatting": True, "erasing": False}),
+    ):
+        assert bench.command(name, **values) is ErrorCode.OK
+        assert bench.read("card_progress") == flags
+        bench.step(0.2)
+        assert bench.read("card_progress") == {"formatting": False, "erasing": False}
+    assert counters(bench) == []
+    assert not bench.read("device_status")["image_stored"]
+    assert bench.read("image_frame") == before
+
+
+def test_packets_of_a_burst_are_read_one_by_one(bench):
+    save(bench)
+    load(bench, "bmp", 0, 60)
+    assert bench.read("file_packet")["number"] == 0
+    bench.send("start_burst", ignore_hole_map=True)
+    bench.read("file_block")
+    file = bench.device.images.stored.bmp()
+    for number in (0, 1, 2, 2):
+        assert bench.read("file_packet") == {"number": number, "data": file[20 * number : 20 * number + 20]}
+    bench.command("set_hole_map_1", map=bytes((0b101,)) + bytes(15))
+    bench.send("start_burst")
+    assert bench.read("file_packet")["number"] == 1

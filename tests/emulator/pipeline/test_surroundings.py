@@ -93,7 +93,7 @@ def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline
 
 
 def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measured_one(pipeline):
-    catalog = load_catalog(epoch=Profile().catalog.epoch)
+    catalog = load_catalog(epoch=Profile().epoch)
     wanted = {int(hip): vector for hip, vector in zip(catalog.hip, catalog.vectors, strict=True)}
     moved = replace(REQUEST, index=30, observer_velocity=(20_000.0, -20_000.0, 5_000.0))
     for request in (replace(REQUEST, index=31), moved):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,6 +73,49 @@ def test_a_bad_block_is_rejected_by_name(old, new, said):
     block = block_of_42(0.0, ORION)
     with pytest.raises(FeedError, match=said):
         Format42().decode(block.replace(old, new))
+
+
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        ({"orbit": 3}, r"no Orb\[3\].PosN; the block has Orb\[0\]: set truth.orbit"),
+        ({"spacecraft": 2}, r"no SC\[2\].qn; the block has SC\[0\]: set truth.spacecraft"),
+    ],
+)
+def test_a_spacecraft_or_orbit_that_42_does_not_have_is_rejected_with_those_that_it_has(number, said):
+    with pytest.raises(FeedError, match=said):
+        Format42(**number).decode(block_of_42(0.0, ORION))
+
+
+def test_blocks_without_an_orbit_are_reported_once(caplog):
+    read = Format42()
+    for t in (0.0, 0.1):
+        block = b"\n".join(line for line in block_of_42(t, ORION).splitlines() if not line.startswith(b"Orb"))
+        assert read.decode(block).orbit is None
+    (said,) = [record.getMessage() for record in caplog.records]
+    assert said == (
+        "truth feed: 42 sends no orbit, so there is neither Earth nor aberration: "
+        'give 42 the prefixes "SC" and "Orb" in Inp_IPC.txt'
+    )
+
+
+def test_42_reads_the_configuration_on_the_page():
+    page = (Path(__file__).resolve().parents[3] / "docs/simulators.md").read_text(encoding="utf-8")
+    (shown,) = re.findall(r"```text\n([^`]*Number of Sockets.*?)```", page, re.DOTALL)
+    lines = iter(shown.splitlines())
+    next(lines)  # 42 skips the first line, and a line before each socket
+    value = [line.split("!")[0].split() for line in lines]
+    assert value[0] == ["1"]
+    assert value[2:9] == [
+        ["TX"],
+        ['"State00.42"'],
+        ["SERVER"],
+        ["localhost", "4242"],
+        ["TRUE"],
+        ["FALSE"],
+        ["2"],
+    ]
+    assert value[9:] == [['"SC"'], ['"Orb"']]
 
 
 def test_a_rate_too_high_for_any_image_is_rejected_by_name():

@@ -1,10 +1,13 @@
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starid.attitude import ARCSEC_PER_RAD
@@ -18,7 +21,7 @@ from starid.photograph.field_sweep import FieldSweep, solve_any_field
 from starid.photograph.rough_search import CELLS, RoughSearch, distorted, even_selection
 from starid.photograph.solver import ImageSolution, solve_image
 from starid.photograph.typical_camera import typical_camera
-from starid.photograph.views import View, has_dark_tail, views
+from starid.photograph.views import View, correlation, has_dark_tail, views
 from tests.starid.photograph.night_sky import FOV_DEG, HEIGHT, WIDTH, photograph
 
 CENTRE_ARCSEC = 10.0
@@ -56,6 +59,85 @@ def test_attitude_field_and_distortion_of_a_photograph_are_found(sky, seed, defe
     assert not found.mirrored
     assert centre_error_arcsec(found, truth, camera) < CENTRE_ARCSEC
     assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
+
+
+WIDE = {"fov_deg": 34.0, "width": 808, "height": 608}
+HOT_WIDE = 2000 / (808 * 608)
+
+
+@pytest.mark.parametrize(
+    ("seed", "defects"),
+    [
+        (24003, {"hot": 2000 / 480000, "quality": 85}),
+        (48003, WIDE | {"hot": HOT_WIDE, "limit": 6.0, "spot_px": 0.8, "clouds": 0.9}),
+        (45000, {"hot": 2000 / 480000, "spot_px": 0.45}),
+        (
+            54001,
+            WIDE
+            | {"distortion": -0.12, "straight": 0.8, "hot": 5000 / (808 * 608), "spot_px": 0.8, "limit": 6.0},
+        ),
+    ],
+    ids=["compressed", "clouds", "sharper than a pixel", "distortion removed"],
+)
+def test_hot_pixels_without_a_dark_frame_neither_hide_the_stars_nor_cost_much(
+    sky, monkeypatch, seed, defects
+) -> None:
+    image, truth, camera = photograph(sky, seed, **defects)
+    monkeypatch.setattr(solver, "SCHEDULE", solver.SCHEDULE[:1])  # the others are there for other defects
+    rough = Camera.from_fov(camera.fov_deg * 0.95, camera.width, camera.height)
+    found = solve_image(image, rough, sky, fov_tolerance=0.1)
+    middle = np.array([[(camera.width - 1) / 2, (camera.height - 1) / 2]])
+    seen = found.solution.attitude.to_icrs(found.camera.back_project(middle))[0]
+    pixel_arcsec = camera.pixel_scale_rad * ARCSEC_PER_RAD
+    assert (
+        np.linalg.norm(seen - truth.to_icrs(camera.back_project(middle))[0]) * ARCSEC_PER_RAD < pixel_arcsec
+    )
+
+
+def grain(seed: int) -> NDArray[np.float64]:
+    return np.random.default_rng(seed).normal(0.0, 4.0, (608, 808))
+
+
+def counts(image: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+DARK = {
+    "independent": counts(10.0 + grain(1)),
+    "demosaiced": counts(cv2.GaussianBlur(10.0 + grain(2), (0, 0), 0.8)),
+    "enlarged": cv2.resize(counts(10.0 + grain(3)), (1600, 1200), interpolation=cv2.INTER_CUBIC),
+    "compressed": cv2.imdecode(
+        cv2.imencode(".jpg", counts(4.0 + grain(4)), [cv2.IMWRITE_JPEG_QUALITY, 80])[1], -1
+    ),
+}
+
+
+@pytest.mark.parametrize("name", DARK)
+def test_a_frame_without_stars_is_reported_as_such_without_a_search(sky, monkeypatch, name) -> None:
+    def search(*_: object, **__: object) -> None:
+        raise AssertionError("no search for stars that are not there")
+
+    monkeypatch.setattr(RoughSearch, "identify", search)
+    found = solve_any_field(DARK[name], sky)
+    assert found.solution.reason == "too_few_stars"
+    assert len(found.detections) < 4
+
+
+def test_the_noise_of_a_resampled_image_is_taken_as_the_detection_smooths_it() -> None:
+    assert correlation(counts(50.0 + grain(5))) == pytest.approx(1.0, abs=0.02)
+    blurred = counts(50.0 + cv2.GaussianBlur(4.0 * grain(6), (0, 0), 1.5))
+    expected = 1.5 / math.hypot(1.5, 0.9) * 2.0 * math.sqrt(math.pi) * 0.9
+    assert correlation(blurred) == pytest.approx(expected, rel=0.1)
+
+
+def test_a_hopeless_search_ends_with_its_time_and_reports_its_progress(sky) -> None:
+    image, _, _ = photograph(sky, 9)
+    mixed = image.reshape(20, 30, 20, 40).swapaxes(0, 2).reshape(image.shape)  # stars, but no constellation
+    attempts: list[str] = []
+    found = solve_image(mixed, NOMINAL, sky, fov_tolerance=0.1, time_limit_s=0.0, progress=attempts.append)
+    assert found.solution.reason == "no_match"
+    assert not found.complete
+    assert attempts == ["round 1 of 5, view 1, field 10° wide"]
 
 
 def test_negative_and_mirrored_photographs_are_recognised(sky) -> None:
@@ -215,5 +297,6 @@ def test_narrow_windows_are_tried_for_all_fields_before_wide_ones(sky, monkeypat
     found = solve_any_field(image, sky)
     assert found.solution.valid
     assert found.camera.fov_deg == pytest.approx(camera.fov_deg, rel=2e-3)
+    del windows[0]  # the warm-up
     sweep = windows[: 1 + next(n for n, (fov, _) in enumerate(windows) if abs(fov / FOV_DEG - 1.0) < 0.1)]
     assert {window for _, window in sweep} == {sweep[0][1]}

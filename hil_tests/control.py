@@ -1,0 +1,121 @@
+"""A client of the emulator's control channel, and through it the truth."""
+
+from __future__ import annotations
+
+import json
+import operator
+import socket
+import time
+from typing import Any, Final, Self
+
+from starhil.hil_tests.attitude import AttitudeError, Quaternion, attitude_error, unit
+from starhil.hil_tests.errors import BenchError
+
+__tracebackhide__ = operator.methodcaller(
+    "errisinstance", BenchError
+)  # pytest shows the caller's line instead
+
+ANSWER_WITHIN_S: Final = 60.0
+"""A step of the stepped clock takes as long as its frames."""
+BOOT_WITHIN_S: Final = 60.0
+POLL_S: Final = 0.02
+
+
+class ControlClient:
+    """A client of the control channel; a context manager.
+
+    Parameters
+    ----------
+    address : str
+        Address from the ready line: unix:/PATH or HOST:PORT.
+    """
+
+    def __init__(self, address: str) -> None:
+        path = address.removeprefix("unix:")
+        try:
+            if path != address:
+                self._socket = socket.socket(socket.AF_UNIX)
+                self._socket.settimeout(ANSWER_WITHIN_S)
+                self._socket.connect(path)
+            else:
+                host, _, port = address.rpartition(":")
+                self._socket = socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+        except OSError as error:
+            raise BenchError(f"control channel {address}: {error.strerror or error}") from None
+        self._lines = self._socket.makefile("rw", encoding="utf-8")
+
+    def do(self, action: str, **keys: Any) -> dict[str, Any]:
+        """Send a request and return the answer.
+
+        Raises
+        ------
+        BenchError
+            The request was rejected, or the channel does not answer.
+        """
+        try:
+            self._lines.write(json.dumps({"do": action, **keys}) + "\n")
+            self._lines.flush()
+            line = self._lines.readline()
+        except OSError as error:
+            raise BenchError(f"control channel: {action}: no answer: {error.strerror or error}") from None
+        if not line:
+            raise BenchError(f"control channel: {action}: closed by the emulator")
+        answer: dict[str, Any] = json.loads(line)
+        if not answer.pop("ok"):
+            raise BenchError(f"control channel: {action}: {answer['error']}")
+        return answer
+
+    def reset(self) -> None:
+        """Clear faults, restore the truth of the profile, and let the device start and boot as at power-on.
+
+        On the stepped clock, it boots when time is advanced.
+        """
+        self.do("clear_faults")
+        self.do("set_truth")
+        self.do("fault", device={"reset": "power_on"})
+        deadline = time.monotonic() + BOOT_WITHIN_S
+        while (status := self.do("status"))["mode"] == "boot" and status["clock"] != "stepped":
+            if time.monotonic() > deadline:
+                raise BenchError(f"control channel: the device has not booted within {BOOT_WITHIN_S:g} s")
+            time.sleep(POLL_S)
+
+    def close(self) -> None:
+        """Close the channel."""
+        self._lines.close()
+        self._socket.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+
+class Truth:
+    """The true attitude of the emulated sensor.
+
+    Parameters
+    ----------
+    control : ControlClient
+        The control channel.
+    """
+
+    def __init__(self, control: ControlClient) -> None:
+        self._control = control
+
+    def set(self, **truth: Any) -> None:
+        """Replace the truth; the keys are those of `[truth]` in a profile, such as `kind`."""
+        self._control.do("set_truth", truth=truth)
+
+    def point(self, ra_deg: float, dec_deg: float, roll_deg: float = 0.0) -> None:
+        """Hold the sensor at an attitude."""
+        self.set(kind="fixed", attitude={"ra_deg": ra_deg, "dec_deg": dec_deg, "roll_deg": roll_deg})
+
+    def attitude(self, unix_s: float | None = None) -> Quaternion:
+        """Return the attitude at a time of the device's clock, default: now."""
+        keys = {} if unix_s is None else {"unix_s": unix_s}
+        return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
+
+    def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeError:
+        """Return the error of an attitude measured at a time of the device's clock."""
+        return attitude_error(unit(quaternion_xyzw), self.attitude(unix_s))

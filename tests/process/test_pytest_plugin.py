@@ -1,0 +1,90 @@
+"""The pytest plugin: fixtures of an emulator or of a unit, but never of the other one."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+
+pytestmark = pytest.mark.process
+
+ROOT = Path(__file__).resolve().parents[2]
+(PAGE_TESTS,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/pytest.md").read_text(), re.DOTALL)
+COUNT = PAGE_TESTS.count("def test_")
+
+
+def run_pytest(folder: Path, program: str, *options: str) -> str:
+    """Run a program of tests in a separate pytest; return its output."""
+    path = folder / "test_it.py"
+    path.write_text(program)
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-rs", "-v", *options, str(path)]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    return done.stdout + done.stderr
+
+
+def test_the_tests_of_the_page_pass_with_an_emulator(tmp_path):
+    assert f"{COUNT} passed" in run_pytest(tmp_path, PAGE_TESTS)
+
+
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory):
+    """Stands in for a real unit on a serial line."""
+    with EmulatorProcess(
+        emulator_command(profile="ideal", state_dir=tmp_path_factory.mktemp("unit"))
+    ) as unit:
+        yield unit
+
+
+def test_what_a_unit_on_a_serial_line_lacks_is_skipped_by_name(unit, tmp_path):
+    out = run_pytest(tmp_path, PAGE_TESTS, "--starhil-serial", unit.ready["serial"])
+    assert "1 passed, 4 skipped" in out
+    assert "test_an_attitude_is_found PASSED" in out
+    assert "--starhil-serial names a unit; give its bus with --starhil-can" in out
+    assert "--starhil-serial names a unit, and this test needs an emulator" in out
+
+
+ISOLATED = """
+import pytest
+
+def test_one(starhil_serial, starhil_control, starhil_truth):
+    starhil_serial.set_parameter("exposure", 150)
+    starhil_serial.command("set_mode", mode="lost_in_space")
+    starhil_control.do("fault", optical={"blocked_share": 1.0})
+    starhil_truth.set(kind="fixed", attitude={"ra_deg": 10.0, "dec_deg": 20.0})
+    assert starhil_control.do("truth")["ra_deg"] == pytest.approx(10.0)
+
+def test_another(starhil_serial, starhil_control):
+    assert starhil_serial.get_parameter("exposure") == 300
+    assert starhil_serial.read("device_status")["mode"] == "standby"
+    assert starhil_control.do("status")["faults"] == {}
+    assert starhil_control.do("truth")["ra_deg"] == pytest.approx(83.8)
+"""
+
+
+def test_each_test_begins_after_a_reset(tmp_path):
+    assert "2 passed" in run_pytest(tmp_path, ISOLATED)
+
+
+FAILS = """
+from starhil.hil_tests.errors import BenchError
+
+def test_refused(starhil_serial):
+    starhil_serial.set_parameter("exposure", 70000, checked=False)
+
+def test_no_such_action(starhil_control):
+    starhil_control.do("dance")
+"""
+
+
+def test_the_traceback_of_a_refused_request_ends_at_the_test(tmp_path):
+    out = run_pytest(tmp_path, FAILS, "--tb=short")
+    assert "2 failed" in out
+    frames = re.findall(r"^(\S+\.py):\d+: in", out, re.MULTILINE)
+    assert frames == ["test_it.py", "test_it.py"]
+    assert "NackError: set_parameter: refused by the device" in out
+    assert "BenchError: control channel: dance: " in out
