@@ -21,7 +21,7 @@ from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import FixedFraming
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect
+from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect, serial_answers
 from starhil.protocol.values import IcdError
 
 TIME_OUT_S: Final = 0.7
@@ -361,7 +361,7 @@ class LifeRun:
         replies = [answer for answer in answers if isinstance(answer, Reply)]
         if len(replies) != len(answers):
             raise Violation(f"{what}: malformed answer: {_text(answers[0])}")
-        expected = row.answers if row is not None else ("reply",)
+        expected = self._expected_answers(link, row)
         sent = f"{what} {request.data.hex()}".rstrip()
         nack = next((reply for reply in replies if reply.kind is ReplyKind.NACK), None)
         silent = all(reply.kind is ReplyKind.ECHO for reply in replies)
@@ -390,6 +390,11 @@ class LifeRun:
         for reply in replies:
             if reply.kind is ReplyKind.TELEMETRY:
                 self._read(what, row, request, reply)
+
+    def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
+        if row is None:
+            return ("reply",)
+        return serial_answers(self._icd, row) if link == "serial" else row.answers
 
     def _judge_refusal(self, sent: str, link: str, nack: Reply, verdict: ErrorCode | None) -> None:
         if verdict is ErrorCode.OK:
