@@ -43,6 +43,10 @@ _MAX_SIDE: Final = 65535
 _DISTORTION_TERMS: Final = 5
 _BORDER_SAMPLES: Final = 65
 _MARGIN: Final = 1.1
+_LARGEST_TERM: Final = 1e12
+"""Distortion term beyond which no image is one-to-one and the arithmetic overflows."""
+_NEVER_TURNS: Final = 1e-300
+"""1/r² below which the distortion does not turn back anywhere."""
 _FOLD_SHARE: Final = 0.9
 _FOV_ITERATIONS: Final = 20
 _FOV_CONVERGED: Final = 1e-12
@@ -354,13 +358,16 @@ def _table(name: str, values: ArrayLike, columns: int) -> Array:
 def _one_to_one_limit(params: Array, border: Array) -> float:
     """Radius, in the plane, of a disc that holds the whole image and on which the distortion is one-to-one.
 
-    The radial part turns back at the smallest positive root of 1 + 3k₁r² + 5k₂r⁴ + 7k₃r⁶. The disc ends
-    before this root, so that no star from outside is folded into the image. On the disc the determinant of
-    the whole distortion, tangential part included, must stay positive.
+    The radial part turns back at the smallest positive root of 1 + 3k₁r² + 5k₂r⁴ + 7k₃r⁶, of which 1/r² is
+    found: its polynomial has the leading coefficient 1, however small the terms are. The disc ends before
+    this root, so that no star from outside is folded into the image. On the disc the determinant of the whole
+    distortion, tangential part included, must stay positive.
     """
     k1, k2, _, _, k3 = params[K1:WIDTH]
-    roots = np.roots([7.0 * k3, 5.0 * k2, 3.0 * k1, 1.0])
-    turns = [float(r.real) for r in roots if abs(r.imag) < 1e-9 * abs(r) and r.real > 0.0]
+    if np.max(np.abs(params[K1:WIDTH])) > _LARGEST_TERM:
+        raise _fold_error(params[K1:WIDTH].tolist())
+    inverse = np.roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3])
+    turns = [1.0 / float(r.real) for r in inverse if abs(r.imag) < 1e-9 * abs(r) and r.real > _NEVER_TURNS]
     fold = math.sqrt(min([*turns, params[LIMIT2]]))
     probe = params.copy()
     probe[LIMIT2] = fold**2

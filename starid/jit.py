@@ -26,6 +26,7 @@ from numba import njit
 from numba.core import caching
 
 from starid.cache import evict, kernel_folder, mark_used
+from starid.kernel_library import InnerCompiler, LoadedKernels, without_literals
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 
@@ -33,7 +34,6 @@ _log = logging.getLogger(__name__)
 
 _NumbaCacheFile: Any = caching.IndexDataCacheFile
 _NumbaCache: Any = caching.FunctionCache
-_NumbaCacheImpl: Any = caching.CompileResultCacheImpl
 
 _IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
 
@@ -79,11 +79,25 @@ def compiled_sums(function: Kernel) -> Kernel:
 def inner(function: Kernel) -> Kernel:
     """Compile a function that only other kernels call, with IEEE 754 division.
 
-    It is cached only as part of the kernels that call it, and has no wrappers for callers in Python and C,
-    which would take longer to compile than the function itself.
+    It is optimised and cached only as part of the kernels that call it, and has no wrappers for callers in
+    Python and C, which would take longer to compile than the function itself.
     """
-    options: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "error_model": "numpy"}
-    return cast("Kernel", njit(nogil=True, **options)(function))
+    return _inner(function, "numpy")
+
+
+def inner_checked(function: Kernel) -> Kernel:
+    """Compile as `inner`, but division by zero raises an exception, as in `compiled`."""
+    return _inner(function, "python")
+
+
+def _inner(function: Kernel, error_model: str) -> Kernel:
+    options: dict[str, Any] = {
+        "no_cpython_wrapper": True,
+        "no_cfunc_wrapper": True,
+        "error_model": error_model,
+    }
+    dispatcher = njit(nogil=True, pipeline_class=InnerCompiler, **options)(function)
+    return cast("Kernel", without_literals(dispatcher))
 
 
 def cached_on_disk(dispatcher: Any) -> Any:
@@ -127,8 +141,8 @@ class KernelLocator:
         """Do nothing: the folder is created when a file is written."""
 
 
-class KernelCacheImpl(_NumbaCacheImpl):  # type: ignore[misc]
-    """numba's storage of machine code, with `KernelLocator` as the only locator."""
+class KernelCacheImpl(LoadedKernels):
+    """The storage of machine code, with `KernelLocator` as the only locator."""
 
     _locator_classes = (KernelLocator,)
 

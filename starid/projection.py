@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Mask
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 
 PINHOLE: Final = 0
 EQUIDISTANT: Final = 1
@@ -48,7 +48,7 @@ _SERIES_BELOW: Final = 1e-4
 _TINY: Final = 1e-150
 
 
-@compiled
+@inner_checked
 def to_plane(model: float, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """Image plane coordinates of a direction before distortion, and whether the model maps it."""
     if model == PINHOLE:
@@ -69,7 +69,7 @@ def to_plane(model: float, x: float, y: float, z: float) -> tuple[float, float, 
     return math.atan2(x, z), math.atan2(y, c), True
 
 
-@compiled
+@inner_checked
 def from_plane(model: float, a: float, b: float) -> tuple[float, float, float, bool]:
     """Return the unit vector for undistorted image plane coordinates, and whether there is one."""
     if model == PINHOLE:
@@ -87,7 +87,7 @@ def from_plane(model: float, a: float, b: float) -> tuple[float, float, float, b
     return c * math.sin(a), math.sin(b), c * math.cos(a), True
 
 
-@compiled
+@inner_checked
 def distort(params: Array, a: float, b: float) -> tuple[float, float]:
     """Apply Brown–Conrady distortion to image plane coordinates."""
     s = a * a + b * b
@@ -153,7 +153,7 @@ def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
     return u, v, residual <= _ACCEPTED * scale
 
 
-@compiled
+@inner_checked
 def project_one(params: Array, x: float, y: float, z: float) -> tuple[float, float, bool]:
     """Project a direction in the sensor frame to pixel (u, v); also return whether it is on the pixel array.
 
@@ -170,7 +170,7 @@ def project_one(params: Array, x: float, y: float, z: float) -> tuple[float, flo
     return u, v, inside
 
 
-@compiled
+@inner_checked
 def back_project_one(params: Array, u: float, v: float) -> tuple[float, float, float, bool]:
     """Return the unit vector (x, y, z) of a pixel position; NaN if there is none."""
     a, b, solved = undistort(params, (u - params[CX]) / params[FX], (v - params[CY]) / params[FY])
@@ -200,7 +200,7 @@ def back_project_kernel(params: Array, xy: Array) -> Array:
     return vectors
 
 
-@compiled
+@inner_checked
 def plane_slopes(
     model: float, x: float, y: float, z: float
 ) -> tuple[float, float, float, float, float, float]:

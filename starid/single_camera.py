@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from numpy.typing import ArrayLike
 
@@ -20,8 +19,7 @@ from starid.solution import Solution
 from starid.solver_input import checked_detections
 
 
-@dataclass(frozen=True, slots=True)
-class CheckedDetections:
+class CheckedDetections(NamedTuple):
     """The checked detections of one image.
 
     Attributes
@@ -99,7 +97,7 @@ class SingleCameraIdentifier(ABC):
         """
         begin = time.perf_counter()
         solution = self._identify(CheckedDetections.of(xy_px, flux, xy_sigma_px, observer_velocity))
-        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+        return solution.timed(begin)
 
     def track(
         self,
@@ -144,4 +142,4 @@ def near(
     if window_px is not None and not 0.0 < window_px < math.inf:
         raise StaridError(f"tracking window_px: must be a positive number of pixels, not {window_px}")
     known = attitude if isinstance(attitude, Attitude) else Attitude.from_quaternion(attitude)
-    return dataclasses.replace(find(measured, known, window_px), elapsed=time.perf_counter() - begin)
+    return find(measured, known, window_px).timed(begin)

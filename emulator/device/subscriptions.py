@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.protocol.codec import Row
+
+LONGEST_PERIOD_NS: Final = 1e18
+"""Period of a row whose rate is hardly above zero, nanoseconds: longer than any run."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Subscriptions:
                     self.send(subscription.row)
 
     def _schedule(self, key: tuple[str, int], row: Row, rate_hz: float, due_ns: int) -> None:
-        period_ns = max(1, round(NANOSECONDS / rate_hz))
+        period_ns = max(1, round(min(NANOSECONDS / rate_hz, LONGEST_PERIOD_NS)))
 
         def due(at_ns: int) -> None:
             missed = max(0, (self._now_ns() - at_ns) // period_ns)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import itertools
 import math
 import time
@@ -149,6 +150,8 @@ class Pipeline:
         )
         attitude = IDENTITY
         helper = start_helper() if kernel_cache_was_cold() else None
+        if helper is not None:
+            gc.disable()  # as in the helper
         request = FrameRequest(
             index=0,
             attitude_xyzw=attitude,
@@ -169,6 +172,7 @@ class Pipeline:
             for earth in (_WARM_UP_BODIES.earth, EarthLimb(180.0, 80.0, radius_deg=5.0)):
                 self._renderer.render(Attitude.identity(), objects=replace(_WARM_UP_BODIES, earth=earth))
         self._last = None
+        gc.enable()
 
     def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
         """Process a request; return a failure if the settings make it impossible."""

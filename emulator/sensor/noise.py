@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.jit import compiled_ieee
+from starid.jit import compiled_ieee, inner
 
 LANES: Final = 512
 """Number of parallel random generators; pixels are processed in blocks of twice this size."""
@@ -73,7 +73,7 @@ def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
     return np.frombuffer(bits.tobytes(), dtype=np.uint32).reshape(4, LANES).copy()
 
 
-@compiled_ieee
+@inner
 def _next_bits(state: npt.NDArray[np.uint32], out: npt.NDArray[np.uint32]) -> None:
     """Advance all lanes by one xoshiro128++ step."""
     for lane in range(LANES):

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.jit import compiled_ieee
+from starid.jit import compiled_ieee, inner
 
 MAX_GAUSS_NODES: Final = 200
 MAX_NODES: Final = 20_000
@@ -56,7 +56,7 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
     )
 
 
-@compiled_ieee
+@inner
 def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -> None:
     """Compute the fractions of a Gaussian around 0 in `count` unit cells; the first cell starts at `edge`."""
     scale = _SQRT_HALF / sigma

@@ -63,7 +63,7 @@ class Backdrop:
     saturated_e: float = math.inf
 
 
-@compiled_ieee
+@inner
 def expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32], first: int, last: int) -> None:
     """Interpolate the cells from `first` to before `last` of a row of the grid at every column."""
     for i in range(first, last):

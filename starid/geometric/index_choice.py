@@ -13,6 +13,7 @@ import numpy as np
 from starid.cache import cache_dir, evict, mark_used
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+from starid.errors import StaridError
 from starid.geometric import index_file
 from starid.geometric.pattern_index import (
     INDEX_VERSION,
@@ -44,6 +45,9 @@ DEEP_SIDES: Final = (0.12, 0.95)
 
 MIDDLE_SIDE: Final = 0.5
 """Below this share the number of deep pattern stars is reduced, not their longest side."""
+
+COARSEST_PX_PER_DEG: Final = 2.0
+"""Coarsest image for which an index is built: below this, stars a degree apart are one, and merging them takes minutes."""
 
 SIDE_BINS: Final = 128
 _STARS_PER_QUOTA: Final = 30.0
@@ -84,10 +88,20 @@ def index_settings(
         Faintest V.
     blend_px, window_px : float
         Distance below which two stars are merged, and the largest matching window, pixels.
+
+    Raises
+    ------
+    StaridError
+        The image is coarser than `COARSEST_PX_PER_DEG`.
     """
+    least = pixels_per_radian(camera)
+    if not math.radians(least) >= COARSEST_PX_PER_DEG:
+        raise StaridError(
+            f"index: {math.radians(least):.3g} pixels per degree are too few to tell stars apart; "
+            f"at least {COARSEST_PX_PER_DEG:g} are needed: use a longer focal length or more pixels"
+        )
     area = field_solid_angle(camera)
     width = math.sqrt(area)
-    least = pixels_per_radian(camera)
     window = window_px / least
     spacing = math.sqrt(4.0 * math.pi / max(len(catalog.brighter_than(limiting_magnitude)), 1))
     cube = MAX_DEEP * area / (_STARS_PER_QUOTA * _TRIANGLES_PER_QUOTA2 * MIDDLE_SIDE**4)

@@ -106,10 +106,15 @@ def _keep_better(candidate: Candidate, bound: float, best: Candidate, bounds: Ar
     if shared < 2:
         bounds[1] = bounds[0]
     bounds[0] = bound
-    best.frames[:] = candidate.frames
-    best.stars[:] = candidate.stars
-    best.normal[:] = candidate.normal
-    best.numbers[:] = candidate.numbers
+    # loops: an assignment of whole arrays would compile the text of its error message too
+    for i in range(candidate.frames.size):
+        best.frames.flat[i] = candidate.frames.flat[i]
+    for i in range(candidate.stars.size):
+        best.stars[i] = candidate.stars[i]
+    for i in range(candidate.normal.size):
+        best.normal.flat[i] = candidate.normal.flat[i]
+    for i in range(candidate.numbers.size):
+        best.numbers[i] = candidate.numbers[i]
 
 
 @inner

@@ -204,8 +204,7 @@ def _log_detections(
     star_table, counts = index.stars, index.counts
     cell = cell_of(rotation[2, 0], rotation[2, 1], rotation[2, 2], COUNT_CELLS)
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
-    zero_points = math.sqrt(2.0 * math.pi) * scatter / ZERO_POINT_RANGE
-    lone = 0.0
+    least_density = math.inf
     totals, products = np.zeros(len(SHARES)), np.ones(len(SHARES))
     for i in range(stars.shape[0]):
         gain = 0.0
@@ -219,8 +218,7 @@ def _log_detections(
             brightness = math.exp(-0.5 * deviation * deviation) / (math.sqrt(2.0 * math.pi) * scatter)
             density = _stars_per_magnitude(counts, cell, magnitude)
             gain = field_px * min(brightness / density, 1.0) * here
-            likeliest = min(1.0 / (math.sqrt(2.0 * math.pi) * scatter * density), 1.0)
-            lone = max(lone, field_px * likeliest * zero_points)
+            least_density = min(least_density, density)
         for k in range(len(SHARES)):
             products[k] *= 1.0 - SHARES[k] + SHARES[k] * gain
             if not _SMALL < products[k] < 1.0 / _SMALL:
@@ -234,7 +232,9 @@ def _log_detections(
     mean = 0.0
     for k in range(len(SHARES)):
         mean += math.exp(totals[k] - best) / len(SHARES)
-    return float(best + math.log(mean)), lone
+    likeliest = min(1.0 / (math.sqrt(2.0 * math.pi) * scatter * least_density), 1.0)
+    zero_points = math.sqrt(2.0 * math.pi) * scatter / ZERO_POINT_RANGE
+    return float(best + math.log(mean)), field_px * likeliest * zero_points
 
 
 @inner

@@ -324,7 +324,8 @@ def measure(
             target = own
             if not alone:
                 target = cleaned[:count]
-                target[:] = own
+                for pixel in range(count):  # as in `starid.imaging.pairs.split_pairs`
+                    target[pixel] = own[pixel]
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)

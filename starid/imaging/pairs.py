@@ -10,6 +10,7 @@ import numpy as np
 from starid.arrays import Array, Array32, Indices, Indices32, Mask
 from starid.imaging.centroid import (
     CHI2,
+    FIT_COLUMNS,
     FLUX,
     GOOD,
     PIXELS,
@@ -22,7 +23,7 @@ from starid.imaging.centroid import (
     Y,
     star_model,
 )
-from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y
+from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y, WINDOW_COLUMNS
 from starid.jit import compiled_ieee
 from starid.photometry import EVEN_PAIR
 
@@ -282,6 +283,18 @@ def _merge(pair: Array, blend_px: float, star: Array) -> None:
     star[CHI2], star[PIXELS] = pair[0, CHI2], pair[0, PIXELS]
 
 
+def warm_up() -> None:
+    """Compile `split_pairs`, without stars."""
+    windows, stars, todo = (
+        np.zeros((1, WINDOW_COLUMNS)),
+        np.zeros((1, FIT_COLUMNS)),
+        np.zeros(1, dtype=np.bool_),
+    )
+    pixels, near = np.empty(0, dtype=np.float32), (np.zeros(2, dtype=np.int32), np.empty(0, dtype=np.int32))
+    partners, none = np.empty((0, FIT_COLUMNS)), np.empty(0, dtype=np.int64)
+    split_pairs(windows, pixels, *near, (1.0, 0.0, 0.0), stars, none, 0.0, partners, none, todo)
+
+
 @compiled_ieee
 def split_pairs(
     windows: Array,
@@ -342,7 +355,8 @@ def split_pairs(
         begin = int(windows[k, OFFSET])
         shape = (sigma, windows[k, TRAIL_X], windows[k, TRAIL_Y])
         target = cleaned[:count]
-        target[:] = pixels[begin : begin + count]
+        for pixel in range(count):  # assigning the slice would compile the text of its error message too
+            target[pixel] = pixels[begin + pixel]
         for entry in range(first[k], first[k + 1]):
             other = stars[neighbours[entry]]
             if other[STATE] == GOOD:

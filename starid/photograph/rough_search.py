@@ -175,7 +175,7 @@ class RoughSearch:
             late = time.perf_counter() - begin > time_limit_s
             if solution.valid or solution.reason is Reason.TOO_FEW_STARS or late:
                 break
-        return dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+        return solution.timed(begin)
 
     def _attempts(self, xy: Array, flux: Array, rounds: Sequence[int]) -> Iterator[_Attempt]:
         """Yield the attempts of some rounds."""

@@ -239,7 +239,7 @@ def refine_solution(
     )
     if again.valid:
         solution = dataclasses.replace(again, mode="lost_in_space", camera=refined)
-    solution = dataclasses.replace(solution, elapsed=time.perf_counter() - begin)
+    solution = solution.timed(begin)
     seen = identifier.stars.aberrated(observer_velocity)
     return ImageSolution(solution, found, solution.camera or camera, seen, view.mirrored)
 

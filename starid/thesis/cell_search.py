@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices, Indices32
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.database import CODE_MAX, FeatureDatabase
 from starid.thesis.features import FEATURE_COUNT
 from starid.thesis.frame_grid import GridArrays, cell_centre
@@ -82,7 +82,7 @@ def _bucket_numbers(
             count[_bucket(codes, cell, rank, depth) + 1] += 1
 
 
-@compiled
+@inner_checked
 def _bucket(codes: NDArray[np.uint8], cell: int, rank: Indices, depth: int) -> int:
     bucket = 0
     for level in range(depth):
@@ -139,7 +139,7 @@ def make_cell_index(database: FeatureDatabase) -> CellIndex:
     return CellIndex(sorted_codes, cells, start, low, high, depth)
 
 
-@compiled
+@inner_checked
 def _box_distance(index: CellIndex, prefix: int, level: int, query: Array, slack: float) -> float:
     """Squared distance, in code steps, from the query to the box of a branch, minus the slack per side."""
     total = 0.0
@@ -159,7 +159,7 @@ def _box_distance(index: CellIndex, prefix: int, level: int, query: Array, slack
     return total
 
 
-@compiled
+@inner_checked
 def _push_children(
     index: CellIndex,
     level: int,
@@ -190,7 +190,7 @@ def _push_children(
     return top
 
 
-@compiled
+@inner_checked
 def _sift_down(distances: Array, cells: Indices, size: int) -> None:
     """Restore the heap (largest distance, then largest cell, on top) after its top was replaced."""
     at = 0
@@ -319,7 +319,7 @@ def exact_nearest(index: CellIndex, arrays: CellArrays, observation: Array, foun
     return best_cell
 
 
-@compiled
+@inner_checked
 def _exact_distance(arrays: CellArrays, cell: int, observation: Array, sums: Array, vector: Array) -> float:
     """Squared distance, in code steps, between the observation and the full-precision features of a cell."""
     exact_vector(arrays, cell, sums, vector)

@@ -13,7 +13,7 @@ from typing import Final, Literal
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.false_stars import FilterError, ObservedFrame
 
 MotionModel = Literal["rigid", "affine"]
@@ -63,7 +63,7 @@ class CameraMotion:
         return np.asarray(positions @ self.matrix[:2, :2].T + self.matrix[:2, 2], dtype=np.float64)
 
 
-@compiled
+@inner_checked
 def _mean_positions(before: Array, now: Array, chosen: Mask, centre: Array) -> int:
     """Fill in the mean positions (x, y before; x, y now) of the chosen stars; return their number."""
     count = 0
@@ -106,7 +106,7 @@ def rigid_fit(before: Array, now: Array, chosen: Mask, motion: Array) -> bool:
     return True
 
 
-@compiled
+@inner_checked
 def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
     """Fit an affine transformation, `matrix` (2, 3), to the chosen stars; False if too few or collinear."""
     centre = np.zeros(4)
@@ -138,7 +138,7 @@ def affine_fit(before: Array, now: Array, chosen: Mask, matrix: Array) -> bool:
     return True
 
 
-@compiled
+@inner_checked
 def fit(before: Array, now: Array, chosen: Mask, affine: bool, matrix: Array) -> bool:
     """Fit a rigid or affine transformation, `matrix` (2, 3), to the chosen stars; False if too few."""
     if affine:
@@ -164,7 +164,7 @@ def transform_distances(before: Array, now: Array, matrix: Array, distances: Arr
         distances[i] = math.sqrt(x * x + y * y)
 
 
-@compiled
+@inner_checked
 def _negative_log_likelihood(distances: Array, sigma: float) -> float:
     """Cost of a hypothesis: a mixture of normal and uniform errors, its share found by EM.
 
@@ -185,7 +185,7 @@ def _negative_log_likelihood(distances: Array, sigma: float) -> float:
     return cost
 
 
-@compiled
+@inner_checked
 def _draw(stars: int, affine: bool, every: bool, trial: int, state: int, chosen: Mask) -> int:
     """Choose the stars of a hypothesis, in order or at random; return the state of the generator."""
     chosen[:] = False

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.frame_sky import SkyArrays, stars_near
 
 MAX_STARS: Final = 256
@@ -26,7 +26,7 @@ _REFITS: Final = 4
 _INNERMOST: Final = 4.0
 
 
-@compiled
+@inner_checked
 def vote_roll(
     observed: Array,
     polar: Array,
@@ -75,7 +75,7 @@ def vote_roll(
     return turn, best
 
 
-@compiled
+@inner_checked
 def pair_stars(
     observed: Array,
     near: Array,

@@ -10,7 +10,7 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.errors import StaridError
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 
 FEATURE_COUNT: Final = 5
 """Number of components of a feature vector; the polar angle is separate."""
@@ -65,14 +65,14 @@ class FeatureVector:
         return np.array([self.n, self.A, self.r, self.sigma_A, self.sigma_r], dtype=np.float64)
 
 
-@compiled
+@inner_checked
 def clear_sums(sums: Array) -> None:
     """Clear the accumulator of one frame, (8,)."""
     for i in range(SUM_COUNT):
         sums[i] = 0.0
 
 
-@compiled
+@inner_checked
 def add_star(sums: Array, brightness: float, x: float, y: float, pivot: float) -> None:
     """Add a star to the accumulator; `pivot`, a brightness near the mean, avoids cancellation."""
     q = x * x + y * y
@@ -87,7 +87,7 @@ def add_star(sums: Array, brightness: float, x: float, y: float, pivot: float) -
     sums[7] += brightness
 
 
-@compiled
+@inner_checked
 def finish_features(sums: Array, pivot: float, out: Array) -> float:
     """Convert an accumulator to the five features in `out`; return the polar angle in radians.
 

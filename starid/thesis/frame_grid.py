@@ -10,7 +10,7 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.errors import StaridError
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 
 Geometry = Literal["planar", "spherical"]
 
@@ -112,7 +112,7 @@ class FrameGrid:
         return cells
 
 
-@compiled
+@inner_checked
 def cell_row(row_start: Indices, cell: int) -> int:
     """Find the row of a cell by bisection."""
     low = 0

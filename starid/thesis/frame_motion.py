@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 
 MAX_VOTERS: Final = 48
 """Largest number of objects per frame whose pairs vote."""
@@ -68,7 +68,7 @@ def nearest_objects(
     return count
 
 
-@compiled
+@inner_checked
 def _pairs(
     positions: Array, brightness: Array, least: float, separation: Array, slope: Array, members: Indices
 ) -> int:
@@ -89,7 +89,7 @@ def _pairs(
     return k
 
 
-@compiled
+@inner_checked
 def _score(
     before: Array,
     brightness_before: Array,
@@ -115,7 +115,7 @@ def _score(
     return total
 
 
-@compiled
+@inner_checked
 def _pair_hypotheses(
     first: tuple[Array, Array, Indices],
     second: tuple[Array, Array, Indices],

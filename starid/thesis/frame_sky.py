@@ -11,7 +11,7 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.errors import StaridError
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.features import (
     SUM_COUNT,
     FeatureVector,
@@ -49,7 +49,7 @@ class SkyArrays(NamedTuple):
     frame: Array
 
 
-@compiled
+@inner_checked
 def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) -> tuple[int, int, int, int]:
     """Bins within reach of a position: first and last band, first bin in α, and number of bins."""
     low = max(math.floor((dec_deg - reach_deg + 90.0) / BIN_DEG), 0)
@@ -65,7 +65,7 @@ def bins_near(ra_deg: float, dec_deg: float, reach_deg: float, spherical: bool) 
     return low, high, first % RA_BINS, count
 
 
-@compiled
+@inner_checked
 def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: int) -> tuple[int, int]:
     """Range of the stars in bins of a band, up to the end of the band (part 0) or wrapped (part 1)."""
     end = min(first + count, RA_BINS)
@@ -76,7 +76,7 @@ def stars_of_bins(bin_start: Indices, band: int, first: int, count: int, part: i
     return bin_start[start], bin_start[stop]
 
 
-@compiled
+@inner_checked
 def position_cosines(ra_deg: float, dec_deg: float) -> tuple[float, float, float, float]:
     """Cosines and sines of α and δ of a position."""
     a, d = math.radians(ra_deg), math.radians(dec_deg)
@@ -97,7 +97,7 @@ def gnomonic(
     return -focal * east / depth, -focal * (cos_d * uz - sin_d * level) / depth
 
 
-@compiled
+@inner_checked
 def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) -> tuple[float, float]:
     """Offset of a star in the flat plane, degrees; right ascension wraps."""
     x = star_ra - ra_deg
@@ -108,7 +108,7 @@ def flat_offset(star_ra: float, star_dec: float, ra_deg: float, dec_deg: float) 
     return x, star_dec - dec_deg
 
 
-@compiled
+@inner_checked
 def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> None:
     """Accumulate the stars of the frame centred at (ra, dec), 0 ≤ ra < 360."""
     stars, bin_start, frame = sky
@@ -131,7 +131,7 @@ def cell_sums(sky: SkyArrays, ra_deg: float, dec_deg: float, sums: Array) -> Non
                     add_star(sums, stars[i, BRIGHTNESS], x, y, frame[PIVOT])
 
 
-@compiled
+@inner_checked
 def stars_near(
     sky: SkyArrays, ra_deg: float, dec_deg: float, margin: float, found: Array, rows: Indices
 ) -> int:

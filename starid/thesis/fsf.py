@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.false_stars import FilterError, FilterResult, ObservedFrame
 
 EPSILON: Final = 0.4
@@ -77,7 +77,7 @@ def disparity_list(before: Array, now: Array, disparities: Array) -> None:
             k += 1
 
 
-@compiled
+@inner_checked
 def _bin_points(points: Array, side: float, order: Indices, shape: Indices) -> tuple[Indices, Indices]:
     """Sort points into square bins in their second and third coordinate.
 
@@ -104,7 +104,7 @@ def _bin_points(points: Array, side: float, order: Indices, shape: Indices) -> t
     return where[order], start
 
 
-@compiled
+@inner_checked
 def _neighbours(
     points: Array, bins: tuple[Indices, Indices, Indices], here: int, epsilon: float, found: Indices
 ) -> int:
@@ -195,7 +195,7 @@ def main_cluster(labels: Indices) -> int:
     return int(np.argmax(count))
 
 
-@compiled
+@inner_checked
 def trace_back(
     labels: Indices, main: int, members_before: Indices, members_now: Indices, votes: Indices
 ) -> None:
@@ -210,7 +210,7 @@ def trace_back(
                     votes[members_before[i, a], members_now[j, b]] += 1
 
 
-@compiled
+@inner_checked
 def _mutual_matches(votes: Indices, matches: Indices) -> int:
     """List the pairs of objects that vote for each other most, at least twice each; return their number."""
     count = 0

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Indices, Mask
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 
 LAMBDAS: Final[Array] = np.arange(1, 101, dtype=np.float64) * np.float64(0.05)
 """The regularisation parameters of the thesis: 0.05, 0.10 … 5.00."""
@@ -31,7 +31,7 @@ _TIE: Final = 1e-10
 _OPTIMALITY: Final = 1e-6
 
 
-@compiled
+@inner_checked
 def _solve_active(
     gram: Array, active: Indices, size: int, right: Array, work: Array, solution: Array
 ) -> bool:
@@ -61,7 +61,7 @@ def _solve_active(
     return True
 
 
-@compiled
+@inner_checked
 def _slope(gram: Array, j: int, active: Indices, size: int, direction: Array) -> float:
     """Rate at which the correlation of column j falls along the path."""
     value = 0.0
@@ -70,7 +70,7 @@ def _slope(gram: Array, j: int, active: Indices, size: int, direction: Array) ->
     return value
 
 
-@compiled
+@inner_checked
 def _next_joining(
     gram: Array,
     rest: Array,
@@ -99,7 +99,7 @@ def _next_joining(
     return joining, length
 
 
-@compiled
+@inner_checked
 def _next_dropping(
     omega: Array, active: Indices, size: int, direction: Array, length: float
 ) -> tuple[int, float]:
@@ -114,7 +114,7 @@ def _next_dropping(
     return dropping, length
 
 
-@compiled
+@inner_checked
 def lars_path(gram: Array, correlation: Array, end: float, breaks: Array, weights: Array) -> int:
     """Follow the LASSO path down to λ = `end`; return the number of breakpoints, or 0 on failure.
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starid.arrays import Array, Indices
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.cell_search import (
     CellArrays,
     CellIndex,
@@ -206,7 +206,7 @@ def fill_dictionary(searched: SearchedCells, cell: int, work: LsiWork) -> None:
                 work.dictionary[f, j] = searched.features[work.cells[j], f] / 2.55
 
 
-@compiled
+@inner_checked
 def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     """Combine boresights and angles in the flat plane, with weights normalised to a sum of one."""
     cos_sum = 0.0
@@ -223,7 +223,7 @@ def _flat_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     result[3] = math.atan2(sin_sum, cos_sum)
 
 
-@compiled
+@inner_checked
 def _sphere_estimate(omega: Array, work: LsiWork, result: Array) -> None:
     """Combine boresights and frame-object directions as vectors, without singularities."""
     boresight = np.zeros(3)
@@ -333,7 +333,7 @@ def lsi_kernel(
     return cell
 
 
-@compiled
+@inner_checked
 def _angle_gap(code: float, other: float, slack: float) -> float:
     """Circular difference of two polar angles in code steps (255 per turn), minus a slack."""
     turn = (code - other) / 255.0

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Mask
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 
 RELATIVE_TOLERANCE: Final = 1e-4
 """`RelTol` of MATLAB's `lasso`: the descent ends when no weight changes by more."""
@@ -25,7 +25,7 @@ MAX_SWEEPS: Final = 100_000
 """`MaxIter` of MATLAB's `lasso`."""
 
 
-@compiled
+@inner_checked
 def standardise(dictionary: Array, columns: Array, deviation: Array) -> None:
     """Standardise the columns to mean 0 and standard deviation 1 (divisor M); also return the deviations.
 
@@ -49,7 +49,7 @@ def standardise(dictionary: Array, columns: Array, deviation: Array) -> None:
             columns[f, j] = columns[f, j] / deviation[j] if high > low else 0.0
 
 
-@compiled
+@inner_checked
 def sweep(columns: Array, rest: Array, weights: Array, active: Mask, penalty: float) -> float:
     """Set each active weight to its minimum in turn; return the largest change relative to one plus its size.
 
@@ -75,7 +75,7 @@ def sweep(columns: Array, rest: Array, weights: Array, active: Mask, penalty: fl
     return change
 
 
-@compiled
+@inner_checked
 def _residual(columns: Array, centred: Array, weights: Array, rest: Array) -> None:
     for f in range(centred.size):
         rest[f] = centred[f]
@@ -83,7 +83,7 @@ def _residual(columns: Array, centred: Array, weights: Array, rest: Array) -> No
             rest[f] -= columns[f, j] * weights[j]
 
 
-@compiled
+@inner_checked
 def _descend(
     columns: Array, centred: Array, weights: Array, active: Mask, usable: Mask, penalty: float
 ) -> None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starid.arrays import Array, Indices
-from starid.jit import compiled
+from starid.jit import compiled, inner_checked
 from starid.thesis.cell_search import CellArrays, CellIndex, exact_nearest, stored_neighbours
 from starid.thesis.database import DatabaseError
 from starid.thesis.features import FeatureVector
@@ -33,7 +33,7 @@ _SEEN = 0.9
 _NO_STARS = np.empty((0, 2))
 
 
-@compiled
+@inner_checked
 def _residual(
     arrays: CellArrays, observation: Array, ra: float, dec: float, sums: Array, vector: Array
 ) -> float:
@@ -46,7 +46,7 @@ def _residual(
     return total
 
 
-@compiled
+@inner_checked
 def newton_from(
     arrays: CellArrays, observation: Array, ra: float, dec: float, reach_deg: float, place: Array
 ) -> float:
@@ -119,7 +119,7 @@ def newton_from(
     return best
 
 
-@compiled
+@inner_checked
 def share_seen(
     arrays: CellArrays, positions: Array, theta: float, ra: float, dec: float, found: Array, rows: Indices
 ) -> float:

@@ -1,11 +1,13 @@
 from itertools import permutations
 
+import numpy as np
 import pytest
 
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
+from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
 from starid.camera import Camera
 
@@ -36,6 +38,18 @@ def test_default_profile_is_of_the_class_of_the_first_cubestar():
     assert profile.parameters["update_rate"] == 1.0
     assert profile.parameters.keys() >= CALIBRATION
     assert profile.links.serial.dialect == "b"
+
+
+def test_cubestar_has_exclusion_angles_wherever_sun_and_earth_come_from():
+    there = {"ra_deg": 10.0, "dec_deg": 20.0}
+    for bodies in ("typed", "ephemeris"):
+        sky = Sky(load_profile("cubestar", [f"sky.bodies={bodies}"]).sky)
+        seen = sky.view(1.8e9, np.array([7e6, 0.0, 0.0]), faults={"sun": there, "earth": there}).objects
+        assert (seen.sun.exclusion_deg, seen.earth.exclusion_deg) == (40.0, 30.0)
+    by_date = sky.view(1.8e9, np.array([7e6, 0.0, 0.0])).objects
+    assert by_date.earth.exclusion_deg == 30.0
+    typed = Sky(load_profile("cubestar", ["sky.sun.ra_deg=10.0", "sky.sun.dec_deg=20.0"]).sky).view()
+    assert typed.objects.sun.exclusion_deg == 40.0
 
 
 def test_a_profile_extends_another_table_by_table(tmp_path):

@@ -111,6 +111,12 @@ def test_the_ready_line_names_the_dialect_that_replies_have(stepped):
     assert stepped.ask(128)[0][:3] == b"\x1f\x7f\x80"
 
 
+def test_the_process_that_answers_the_bus_loads_no_numerical_library_but_numpy(stepped):
+    files = Path(f"/proc/{stepped.process.pid}/maps").read_text()
+    assert "/numpy/" in files
+    assert not [name for name in ("llvmlite", "numba", "scipy", "cv2") if f"/{name}/" in files]
+
+
 def test_a_symlink_leads_to_the_port(stepped):
     assert stepped.ready["serial"] == str(stepped.link)
     assert stepped.link.is_symlink()

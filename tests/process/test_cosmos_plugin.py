@@ -12,7 +12,7 @@ from typing import Any, Self
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.protocol.export.cosmos import _state
+from starhil.protocol.export.quoting import cosmos_state
 from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_stack import serial_answers
 from tests.protocol.cosmos_plugin import Plugin
@@ -201,5 +201,5 @@ def test_a_unit_with_another_link_is_driven_through_its_plugin(sagitta, tmp_path
             assert name == row.name.upper()
             for field, value in row.decode(bytes(packet.buffer)[2:]).items():
                 read = packet.read(field.upper(), "CONVERTED")
-                expected = _state(str(value)) if row.named_fields[field].enum is not None else value
+                expected = cosmos_state(str(value)) if row.named_fields[field].enum is not None else value
                 assert same(read, expected), f"{row.name}.{field}"
