@@ -36,8 +36,8 @@ Step = dict[str, Any]
 SHORTEST_S: Final = 0.001
 LONGEST_S: Final = 40_000.0
 """Waits are log-uniform between these limits."""
-MOST_FRAMES: Final = 60
-"""Waits end early once about this many frames have been taken, or messages sent."""
+MOST_EVENTS: Final = 400
+"""Waits end early after about this many events in the unit: exposures, messages, heartbeats."""
 USUAL_SHARE: Final = 0.75
 """Share of values that are set to their default, so that the unit mostly works."""
 EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
-from starhil.hil_tests.endurance.life import MOST_FRAMES, Life, Step
+from starhil.hil_tests.endurance.life import MOST_EVENTS, Life, Step
 from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort
 from starhil.hil_tests.endurance.truth import Motion
@@ -52,7 +52,7 @@ class Unit(Protocol):
         ...
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
-        """Let time pass, or less once about `most` frames have been taken."""
+        """Let time pass, or less, after about `most` events."""
         ...
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
@@ -211,7 +211,7 @@ class LifeRun:
         self._oracle.time_passed(self._unit.now_s)
 
     async def _wait(self, step: Step) -> None:
-        await self._unit.step(step["s"], most=MOST_FRAMES)
+        await self._unit.step(step["s"], most=MOST_EVENTS)
         self._oracle.time_passed(self._unit.now_s)
         for name in self._unit.links:
             self._discard(name)
