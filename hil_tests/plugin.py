@@ -156,7 +156,7 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
         emulator: EmulatorProcess = request.getfixturevalue("starhil_emulator")
         spec, unit = emulator.ready.get(link), emulator.unit
         if spec is None:
-            pytest.skip(f"unit {unit} has no {link} link")
+            pytest.fail(f"unit {unit} has no {link} link", pytrace=False)
     common = {"unit": unit or "cubestar", "timeout_s": option("--starhil-timeout")}
     if link == "can":
         return ObcClient.open(can=spec, **common)

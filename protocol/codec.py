@@ -185,6 +185,32 @@ class Field:
             case _:
                 return min(max(0, self.raw_limits[0]), self.raw_limits[1]) * self.scale + self.bias
 
+    def sample(self, number: int) -> Value:
+        """Return a value that shows how the field is packed, within its limits; `number` varies it."""
+        if self.const is not None:
+            return self.const
+        match self.kind:
+            case "flag":
+                return number % 2 == 0
+            case "enum" if self.enum is not None:
+                return list(self.enum.values)[(number + 1) % len(self.enum.values)]
+            case "bytes":
+                return bytes((number + index) % 255 + 1 for index in range(self.size))
+            case "text":
+                return "".join(chr(ord("A") + (number + index) % 26) for index in range(self.size))
+            case "float":
+                low, high = self.physical_limits
+                value = (number % 100 + 1.25) * (-1) ** number
+                return value if low <= value <= high else low + (high - low) * 0.625
+            case _:
+                lowest, highest = self.raw_limits
+                counted = bytes((number + index) % 0x70 + 1 for index in range(self.size))
+                raw = int.from_bytes(counted) if not self.width else number % (2**self.width - 1) + 1
+                raw = ~raw if number % 2 and lowest < 0 else raw
+                return self.to_physical(
+                    raw if lowest <= raw <= highest else lowest + (highest - lowest) * 5 // 8
+                )
+
     def clips(self, value: float) -> bool:
         """Return whether telemetry would send the nearest limit instead of this number."""
         if self.wrap:
@@ -459,6 +485,11 @@ class Row:
             for name, item in self.named_fields.items()
             if item.kind in ("integer", "float") and item.clips(float(values.get(name, item.empty)))
         ]
+
+    def sample(self) -> dict[str, Value]:
+        """Return values that show how the row is packed: neighbouring bytes differ, flags alternate."""
+        values = {name: item.sample(index) for index, (name, item) in enumerate(self.named_fields.items())}
+        return self.decode(self.encode(values))
 
     def example(self) -> dict[str, Value]:
         """Return values that are accepted: defaults, otherwise the values nearest zero within the limits."""

@@ -255,9 +255,10 @@ class _Builder:
         if isinstance(link.serial.framing, CubeSpaceFraming):
             for name in link.serial.framing.unanswered:
                 if name not in definition.telecommands:
-                    raise IcdError(
+                    raise MissingNameError(
                         f"{self._tables['link'][0]}: link.serial.framing.unanswered: no telecommand named {name!r}"
-                        f"{did_you_mean(name, definition.telecommands)}"
+                        f"{did_you_mean(name, definition.telecommands)}",
+                        name,
                     )
         try:
             build_serial_stack(definition)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from starhil.protocol.can_framing import encode_reply_frames, encode_request_frames
+from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.layout import layout_errors
 from starhil.protocol.codec import Row
@@ -18,9 +18,10 @@ from starhil.protocol.icd_builder import read_definition
 from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
+from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack, serial_answers
 from starhil.protocol.unit_folders import find_unit
-from starhil.protocol.values import IcdError
+from starhil.protocol.values import IcdError, Value
 
 HOST_ADDRESS, DEVICE_ADDRESS = 1, 4
 """CAN addresses in the examples."""
@@ -34,46 +35,66 @@ class Exchange:
     link: str
     request: tuple[str, ...]
     answers: tuple[str, ...]
+    values: Mapping[str, Value]
+    """Values of the row in the request or, of telemetry, in the answer."""
 
 
 def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
-    """Yield an exchange for each row on each link, with the default values of the fields.
+    """Yield an exchange for each row on each link, with values that show how the row is packed.
 
-    Raises ProtocolError for a row whose defaults contradict its limits.
+    If the framing cannot carry these, they are the default values. Raises ProtocolError for a row whose defaults
+    contradict its limits.
     """
+    stack = None if icd.link.serial is None or _unknown_link(icd) else build_serial_stack(icd)
+    for row in icd.rows:
+        if stack is not None:
+            try:
+                yield _on_serial(icd, stack, row, row.sample())
+            except ProtocolError:
+                yield _on_serial(icd, stack, row, row.example())
+        if icd.link.can is not None:
+            yield _on_can(icd, row, row.sample())
+
+
+def _unknown_link(icd: InterfaceDefinition) -> bool:
+    """Return whether the serial link is of a plugin that was not run."""
     serial = icd.link.serial
     custom = serial is not None and "custom" in (serial.framing.kind, serial.check.kind)
-    unknown = custom and icd.plugin.skipped is not None
-    stack = None if serial is None or unknown else build_serial_stack(icd)
-    for row in icd.rows:
-        data = row.encode(row.example(), saturate=row.kind == "telemetry")
-        request = icd.request(row, data if row.kind == "telecommand" else b"")
-        if stack is not None:
-            if isinstance(stack, ComposedStack):
-                _check_framing(stack, row, request)
-            replies = [_reply(icd, row, answer, request) for answer in serial_answers(icd, row)]
-            link = "serial, dialect b" if isinstance(stack, CubeSpaceStack) else "serial"
-            encoded = [stack.encode_reply(reply) for reply in replies]
-            yield Exchange(
-                row,
-                link,
-                (_hex(stack.encode_request(request)),),
-                tuple(_hex(item) for item in encoded if item),
-            )
-        if icd.link.can is not None and icd.link.can.kind == "cubespace":
-            replies = [_reply(icd, row, answer, request) for answer in row.answers]
-            sent = encode_request_frames(request, HOST_ADDRESS, DEVICE_ADDRESS)
-            came = [
-                frame
-                for reply in replies
-                for frame in encode_reply_frames(replace(reply, destination=HOST_ADDRESS), DEVICE_ADDRESS)
-            ]
-            yield Exchange(
-                row,
-                "CAN",
-                tuple(f"{frame.id:08X}#{_hex(frame.data)}" for frame in sent),
-                tuple(f"{frame.id:08X}#{_hex(frame.data)}" for frame in came),
-            )
+    return custom and icd.plugin.skipped is not None
+
+
+def _on_serial(
+    icd: InterfaceDefinition, stack: SerialStack, row: Row, values: Mapping[str, Value]
+) -> Exchange:
+    request, replies = _messages(icd, row, values, serial_answers(icd, row))
+    if isinstance(stack, ComposedStack):
+        _check_framing(stack, row, request)
+    link = "serial, dialect b" if isinstance(stack, CubeSpaceStack) else "serial"
+    answers = tuple(_hex(data) for reply in replies if (data := stack.encode_reply(reply)))
+    return Exchange(row, link, (_hex(stack.encode_request(request)),), answers, values)
+
+
+def _on_can(icd: InterfaceDefinition, row: Row, values: Mapping[str, Value]) -> Exchange:
+    request, replies = _messages(icd, row, values, row.answers)
+    sent = encode_request_frames(request, HOST_ADDRESS, DEVICE_ADDRESS)
+    received = [
+        frame
+        for reply in replies
+        for frame in encode_reply_frames(replace(reply, destination=HOST_ADDRESS), DEVICE_ADDRESS)
+    ]
+    return Exchange(row, "CAN", _frames(sent), _frames(received), values)
+
+
+def _frames(frames: Iterable[CanFrame]) -> tuple[str, ...]:
+    return tuple(f"{frame.id:08X}#{_hex(frame.data)}" for frame in frames)
+
+
+def _messages(
+    icd: InterfaceDefinition, row: Row, values: Mapping[str, Value], answers: Iterable[str]
+) -> tuple[Request, list[Reply]]:
+    """Return the request for a row and its answers."""
+    request = icd.request(row, row.encode(values) if row.kind == "telecommand" else b"")
+    return request, [_reply(icd, row, answer, request, values) for answer in answers]
 
 
 def examine(
@@ -101,13 +122,15 @@ def examine(
     return definition, errors, examples
 
 
-def _reply(icd: InterfaceDefinition, row: Row, answer: str, request: Request) -> Reply:
+def _reply(
+    icd: InterfaceDefinition, row: Row, answer: str, request: Request, values: Mapping[str, Value]
+) -> Reply:
     if answer == "echo":
         return Reply.echo(request)
     named = icd.telemetry[answer.partition(":")[2]] if answer.startswith("row:") else row
     if named.kind == "telecommand":
         return Reply(ReplyKind.ACK, row.id, klass=row.klass)
-    data = named.encode(named.example(), saturate=True)
+    data = named.encode(values if named is row else named.sample(), saturate=True)
     return Reply(ReplyKind.TELEMETRY, named.id, data, klass=named.klass)
 
 

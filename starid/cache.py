@@ -98,7 +98,7 @@ def cached_files() -> list[CachedFile]:
             try:
                 state = path.stat()
                 size = sum(each.stat().st_size for each in path.iterdir()) if path.is_dir() else state.st_size
-            except FileNotFoundError:  # another process has removed it
+            except OSError:  # another process has removed it, or it is a link to nowhere
                 continue
             found.append(CachedFile(path, size, state.st_mtime))
     return sorted(found, key=lambda each: each.used_s)

@@ -3,24 +3,34 @@
 from __future__ import annotations
 
 import asyncio
+import re
 
+import serial
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.launch import Run, RunOptions
 from starhil.emulator.profile import Profile
+from starhil.protocol.framings import Receiving
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import FaultKind
+from starhil.protocol.serial_stack import build_serial_stack
 from tests.emulator.conftest import FakePipeline
 from tests.emulator.runs import FakeImager
 from tests.test_docs import blocks, programs, run
 
 PAGE = "your-unit.md"
+STREAMING = "A unit that streams by itself"
+PYTHON = "A framing in Python"
 
 
 def written(folder):
     """Write the unit of the page into a folder."""
     folder.mkdir()
-    text = "\n".join(block.text for block in blocks(PAGE) if block.language == "toml")
+    text = "\n".join(
+        block.text for block in blocks(PAGE) if block.language == "toml" and block.heading != STREAMING
+    )
     (folder / "unit.toml").write_text(text, encoding="utf-8")
     return folder
 
@@ -57,3 +67,56 @@ def test_the_client_of_the_page_prints_the_output_shown(tmp_path, monkeypatch):
             await emulator.close()
 
     assert asyncio.run(read()) == printed
+
+
+def test_the_framing_of_the_page_carries_every_message(tmp_path):
+    folder = written(tmp_path / "lynx")
+    file = folder / "unit.toml"
+    text = file.read_text(encoding="utf-8").replace(
+        'framing = { kind = "length", start = [0xEB, 0x90] }', 'framing = { kind = "custom", name = "cobs" }'
+    )
+    file.write_text(text.replace("[unit]", '[unit]\nplugin = "unit.py"'), encoding="utf-8")
+    (source,) = [block.text for block in blocks(PAGE, "python") if block.heading == PYTHON]
+    (folder / "unit.py").write_text(source, encoding="utf-8")
+    result = CliRunner().invoke(build_app(), ["unit", "check", str(folder)])
+    assert result.exit_code == 0, result.output
+    assert "  > 01 02 0B 0B 01 10 01 02 03 04" in result.stdout  # length 11, sequence 0, group 1, ID 16
+    stack = build_serial_stack(load_unit(folder))
+    request = load_unit(folder).request_of(0x10, "command", bytes(6))
+    line = stack.encode_request(request)
+    device = stack.device()
+    assert line.count(0) == 1
+    assert device.feed(b"\x05ab\0" + line[:5], 0.0)[0].kind is FaultKind.UART_PROTOCOL
+    assert [event.data for event in device.feed(line[5:], 0.1)] == [bytes(6)]
+    device.feed(line[:5], 1.0)
+    assert [fault.kind for fault in device.flush(9.0)] == [FaultKind.UART_INCOMPLETE]
+    body = bytes(range(256)) * 4
+    framing = load_unit(folder).plugin.framings["cobs"]()
+    received = framing.deframer(Receiving(lambda data: data, lambda _: None, 2000, 1.0))
+    for size in (*range(3), *range(250, 260), 508, 509, 1024):
+        assert received.feed(framing.encode(body[:size]), 0.0) == [body[:size]], size
+        assert received.feed(framing.encode(b"a" * size), 0.0) == [b"a" * size], size
+
+
+def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
+    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(FakePipeline().handle))
+    folder = written(tmp_path / "lynx")
+    (more,) = [block.text for block in blocks(PAGE, "toml") if block.heading == STREAMING]
+    (folder / "more.toml").write_text(more, encoding="utf-8")
+    profile = Profile.model_validate({"unit": str(folder), "links": {"can": {"channel": "off"}}})
+
+    def listen(port: str) -> bytes:
+        with serial.Serial(port, timeout=10.0) as line:
+            return line.read(200)
+
+    async def read() -> bytes:
+        emulator = Run(profile, RunOptions())
+        try:
+            await emulator.start()
+            await emulator.emulation.ready()
+            return await asyncio.to_thread(listen, emulator.emulation.ready_fields["serial"])
+        finally:
+            await emulator.close()
+
+    found = re.findall(rb"\xeb\x90\x00\x24(.)\xc2\x41\x00", asyncio.run(read()), re.DOTALL)
+    assert len(found) >= 3

@@ -326,6 +326,7 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     the body rate varies, `valid_pct_by_rate` is the percentage of valid frames in bins up to 0.5, 1, 1.5 …
     °/s.
     """
+    rows = rows[np.argsort(rows["frame"], kind="stable")]  # sums in the same order with any number of jobs
     valid = rows[rows["valid"]]
     limit = 3600 * WRONG_DEG
     wrong = valid[(valid["cross_arcsec"] > limit) | (valid["roll_arcsec"] > limit)]

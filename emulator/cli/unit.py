@@ -93,13 +93,23 @@ def check(
     This runs the unit's plugin, a Python file, if it has one: check the unit of a stranger with --no-plugin. The exit
     status is 0 if there are no errors, otherwise 1.
     """
+    from starhil.protocol.export.describe import value_text
     from starhil.protocol.unit_examples import examine
 
     definition, errors, examples = examine(unit, run_plugin=not no_plugin)
     skipped = definition.plugin.skipped if no_plugin else None
     if as_json:
         shown = [
-            {"row": item.row.name, "link": item.link, "request": item.request, "answers": item.answers}
+            {
+                "row": item.row.name,
+                "link": item.link,
+                "request": item.request,
+                "answers": item.answers,
+                "values": {
+                    name: value.hex() if isinstance(value, bytes) else value
+                    for name, value in item.values.items()
+                },
+            }
             for item in examples
         ]
         print(json.dumps({"unit": unit, "errors": errors, "examples": shown, "skipped_plugin": skipped}))
@@ -112,6 +122,8 @@ def check(
             print(
                 f"{item.row.kind} {item.row.name}, ID 0x{item.row.id:02X}, {item.row.size} B, on {item.link}"
             )
+            for name, value in item.values.items():
+                print(f"    {name} = {value_text(value)}")
             for frame in item.request:
                 print(f"  > {frame}")
             for frame in item.answers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections import deque
@@ -242,7 +243,7 @@ def toml(value: Value) -> str:
     if isinstance(value, (int, float)):
         return repr(value)
     text = value.hex() if isinstance(value, bytes) else value
-    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def parse_value(field: Field, value: object) -> Value:

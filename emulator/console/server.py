@@ -105,8 +105,7 @@ class ConsoleServer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject other origins and, except for static files, requests without the token."""
-        origin = request.headers.get("Origin")
-        if origin is not None and urlsplit(origin).netloc != request.host:
+        if not _is_same_origin(request):
             return web.Response(
                 status=403, text="403: the request comes from a page of another origin\n", headers=HEADERS
             )
@@ -143,7 +142,7 @@ class ConsoleServer:
 
     async def _report(self, request: web.Request) -> web.Response:
         try:
-            event = json.loads(await request.text())
+            event = json.loads(await request.read())
         except (ValueError, RecursionError):
             raise EmulatorError("report: not JSON") from None
         self._consoles[0].runs.report(event)
@@ -211,6 +210,15 @@ async def _pump(viewer: Viewer, socket: web.WebSocketResponse) -> None:
 
 async def _page(_request: web.Request) -> web.StreamResponse:
     return web.FileResponse(STATIC / "index.html")
+
+
+def _is_same_origin(request: web.Request) -> bool:
+    """Return whether a request comes from a page of this server, or from no page."""
+    origin = request.headers.get("Origin")
+    try:
+        return origin is None or urlsplit(origin).netloc == request.host
+    except ValueError:
+        return False
 
 
 def _download(text: str, name: str, kind: str) -> web.Response:

@@ -19,8 +19,8 @@ NICE: Final = 5
 def main() -> None:
     """Receive the setup, then requests, until the emulator closes the socket."""
     end_with_parent()  # a closed socket is not noticed during a long compilation
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the emulator ends this process by closing the socket
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
     link = socket.socket(fileno=int(sys.argv[1]))
     from starhil.emulator.pipeline.pipeline import make_pipeline  # imported while the emulator starts

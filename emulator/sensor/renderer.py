@@ -30,6 +30,8 @@ __all__ = ["Frame", "Renderer", "SensorModel", "StarTruth", "render"]
 
 _MAX_RATE_RAD_S: Final = 20.0
 _VISIBLE_SHARE: Final = 0.5
+_COMPANION_RAD: Final = math.radians(1.0)
+"""Largest distance of a companion: with coarser pixels it would take minutes to find them all."""
 _COMPANION_PX: Final = 2.0
 _OBJECT_STREAM: Final = 2
 _FLOOD_WELLS: Final = 10.0
@@ -171,7 +173,7 @@ class Renderer:
         self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
         brightness = self.sensor_magnitudes()
         limit = self.sensor.limiting_magnitude
-        near = companions(catalog, limit, _COMPANION_PX * camera.pixel_scale_rad)
+        near = companions(catalog, limit, min(_COMPANION_PX * camera.pixel_scale_rad, _COMPANION_RAD))
         rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
         self._rows = rows[np.argsort(brightness[rows], kind="stable")]
         self._vectors = np.ascontiguousarray(catalog.vectors[self._rows])

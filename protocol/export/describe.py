@@ -7,9 +7,10 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import EnumDefinition, Parameter, Section
+from starhil.protocol.unit_examples import Exchange, exchanges
+from starhil.protocol.values import EnumDefinition, Parameter, Section, Value
 
-FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning")
+FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning", "Example")
 PARAMETER_COLUMNS: Final = ("ID", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
 
 _BEHAVIOUR: Final = (
@@ -17,6 +18,10 @@ _BEHAVIOUR: Final = (
         "A telecommand with a value outside its range is refused with invalid_parameter and changes nothing. In telemetry, a number "
         "beyond its range is sent as the nearest limit (clipped) or modulo the range (wraps), as the range column states; a "
         "floating-point number without a range is sent unchanged."
+    ),
+    (
+        "Byte 3.5 is bit 5 of byte 3; bit 0 is the least significant. A group of bits is given from its least to its most "
+        "significant bit. The examples are made up to show how the fields are packed."
     ),
     (
         "Source of a row or field: confirmed (by public flight software or a manual, named with the row), proxy (public for "
@@ -35,6 +40,29 @@ def introduction(icd: InterfaceDefinition) -> Iterator[str]:
     )
     yield f"Multi-byte fields are {icd.conventions.byte_order}-endian.{kinds}"
     yield from _BEHAVIOUR
+
+
+def examples(icd: InterfaceDefinition) -> dict[str, list[Exchange]]:
+    """Return the example exchanges of each row, by its name."""
+    found: dict[str, list[Exchange]] = {row.name: [] for row in icd.rows}
+    for exchange in exchanges(icd):
+        found[exchange.row.name].append(exchange)
+    return found
+
+
+def example_text(exchange: Exchange) -> str:
+    """Describe an example exchange in one line."""
+    request, answers = (
+        ", ".join(f"`{frame}`" for frame in frames) for frames in (exchange.request, exchange.answers)
+    )
+    return f"Example on {exchange.link}: request {request}; answer {answers or 'none'}."
+
+
+def value_text(value: Value) -> str:
+    """Format a value of a field for people."""
+    if isinstance(value, bytes):
+        return value.hex(" ").upper()
+    return number(value) if isinstance(value, float) else str(value)
 
 
 def number(value: float) -> str:
@@ -81,21 +109,24 @@ def meaning(row: Row, field: Field) -> str:
             return field.doc
 
 
-def field_cells(row: Row, field: Field) -> tuple[str, ...]:
-    """Cells of a field under FIELD_COLUMNS."""
-    meaning = field.doc
-    if field.parameter is not None:
-        meaning = f"{meaning} Parameter {field.parameter}."
-    return (
-        _position(field),
-        field.name or "unused",
-        _type(field),
-        field.unit,
-        _value(field),
-        _range(row, field),
-        field.provenance if field.name else "",
-        meaning if field.name else "Unused, sent as 0.",
-    )
+def field_cells(row: Row) -> Iterator[tuple[str, ...]]:
+    """Cells of each field of a row under FIELD_COLUMNS."""
+    sample = row.sample()
+    for field in row.fields:
+        about = field.doc
+        if field.parameter is not None:
+            about = f"{about} Parameter {field.parameter}."
+        yield (
+            _position(field),
+            field.name or "unused",
+            _type(field),
+            field.unit,
+            _value(field),
+            _range(row, field),
+            field.provenance if field.name else "",
+            about if field.name else "Unused, sent as 0.",
+            value_text(sample[field.name]) if field.name else "",
+        )
 
 
 def parameter_cells(parameter: Parameter) -> tuple[str, ...]:

@@ -40,6 +40,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
     yield "<nav>" + "".join(f'<a href="#{anchor}">{html_text(text)}</a>' for anchor, text in links) + "</nav>"
     for section in icd.sections:
         yield from _section(anchors[section], section)
+    examples = describe.examples(icd)
     for title, rows in describe.sections(icd):
         yield f'<h2 id="{title.lower()}">{title}</h2>'
         yield "<table><tr><th>Id</th><th>Name</th><th>Bytes</th><th>Source</th><th>Meaning</th></tr>"
@@ -53,10 +54,10 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
             yield f'<h3 id="{describe.anchor(row)}">{html_text(describe.title(row))}</h3>'
             yield f'<p>{html_text(row.doc)}</p><p class="facts">{html_text(describe.facts(row))}.</p>'
             if row.fields:
-                yield from _table(
-                    describe.FIELD_COLUMNS,
-                    ((field.provenance, describe.field_cells(row, field)) for field in row.fields),
-                )
+                kinds = (field.provenance for field in row.fields)
+                cells = zip(kinds, describe.field_cells(row), strict=True)
+                yield from _table(describe.FIELD_COLUMNS, cells)
+            yield from (f"<p>{html_text(describe.example_text(item))}</p>" for item in examples[row.name])
     for section in after:
         yield from _section(anchors[section], section)
     yield "</body></html>"

@@ -27,6 +27,7 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
         yield f"- {_link(heading, heading)}"
     for section in icd.sections:
         yield from _section(section)
+    examples = describe.examples(icd)
     for heading, rows in describe.sections(icd):
         yield from ("", f"## {heading}", "")
         yield from _table(
@@ -53,9 +54,9 @@ def _lines(icd: InterfaceDefinition) -> Iterator[str]:
             )
             if row.fields:
                 yield ""
-                yield from _text_table(
-                    describe.FIELD_COLUMNS, (describe.field_cells(row, field) for field in row.fields)
-                )
+                yield from _text_table(describe.FIELD_COLUMNS, describe.field_cells(row))
+            for example in examples[row.name]:
+                yield from ("", markdown(describe.example_text(example)))
     for section in after:
         yield from _section(section)
 

@@ -9,8 +9,9 @@ from pydantic import BaseModel
 
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
 from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, read_layout
+from starhil.protocol.conventions import EPOCHS
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
+from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, Order, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
 from starhil.protocol.serial_stack import serial_answers
@@ -28,12 +29,34 @@ _PLACEHOLDERS: Final = {
 """Placeholder names for bytes of the example messages."""
 
 
+_MEANINGS: Final = {
+    "address": "address of the unit",
+    "source": "address of the OBC",
+    "destination": "address of the OBC",
+    "class": "code of the class",
+    "id": "ID of the row",
+    "sequence": "any number; a reply repeats that of its request",
+    "length": "number of bytes of data",
+    "status": "error code",
+    "ack": "0 in a refusal, otherwise 1",
+    "final": "1 in the last reply to a request",
+    "flags": "a reply repeats those of its request",
+    "ticks": "time since start",
+    "time": "time of the unit's clock",
+}
+"""Meaning of the header fields, by role."""
+
+
 def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
-    """Return the sections about the links of the unit."""
-    found: list[Section] = []
+    """Return the sections about conventions, classes, error codes and links of the unit."""
+    found = [_conventions(icd)]
+    if icd.classes:
+        found.append(_classes(icd))
+    if _has_error_codes(icd):
+        found.append(_errors(icd))
     if icd.link.serial is not None:
         cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
-        found.append(_serial(icd) if cubespace else _composed(icd.link.serial))
+        found.append(_serial(icd) if cubespace else _composed(icd.link.serial, icd.conventions.byte_order))
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
@@ -42,7 +65,67 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     return tuple(found)
 
 
-def _composed(link: SerialLinkModel) -> Section:
+def _conventions(icd: InterfaceDefinition) -> Section:
+    conventions = icd.conventions
+    turn, conjugate = "v_reported = q ⊗ v_ICRS ⊗ q*", "v_reported = q* ⊗ v_ICRS ⊗ q"
+    quaternion = {
+        "rotation": f"{turn} (Hamilton's product, q* = (-x, -y, -z, w)): q turns vectors from ICRS into the reported frame",
+        "attitude": f"{conjugate} (Hamilton's product, q* = (-x, -y, -z, w)): the q of the attitude matrix A(q)",
+    }
+    sign = {
+        "positive": "the scalar part w is never negative",
+        "any": "of q and -q, the one closer to the last reported quaternion",
+    }
+    epoch = conventions.epoch
+    start = "midnight of the current day" if epoch == "midnight" else EPOCHS.get(epoch, epoch)
+    rows = [
+        ("quaternion", quaternion[conventions.quaternion]),
+        ("sign", sign[conventions.scalar_sign]),
+        (
+            "axes x, y, z of the reported frame",
+            f"{', '.join(conventions.axes)} of the sensor frame (+x right in the image, +y down, +z boresight)",
+        ),
+        ("epoch of all times", f"{start}, UTC without leap seconds"),
+        ("byte order of fields", f"{conventions.byte_order}-endian, unless a type names another"),
+    ]
+    commands = [row.name for row in icd.telecommands.values() if row.action == "set_mode"]
+    if commands and icd.device_parameters["start_mode"].default == "standby":
+        text = "the unit boots to standby, in which no attitude is valid: send a mode that takes images with"
+        rows.append(("first attitude", f"{text} {' or '.join(commands)}"))
+    return Section("Conventions", (), ("Convention", "Value"), tuple(rows))
+
+
+def _classes(icd: InterfaceDefinition) -> Section:
+    def code(number: int | None) -> str:
+        return "" if number is None else f"{number:02X}h"
+
+    rows = []
+    for item in icd.classes:
+        reply = item.code if item.reply is None else item.reply
+        unsolicited = reply if item.unsolicited is None else item.unsolicited
+        rows.append((item.name, item.kind.value, code(item.code), code(reply), code(unsolicited)))
+    columns = ("Class", "Rows", "Code in a request", "In a reply", "In unsolicited telemetry")
+    return Section("Classes", ("Class and ID together select a row.",), columns, tuple(rows))
+
+
+def _has_error_codes(icd: InterfaceDefinition) -> bool:
+    """Return whether a reply can carry an error code."""
+    serial = icd.link.serial
+    if serial is None:
+        return icd.link.can is not None
+    roles = {
+        role for field in serial.reply_header for role in (field.role, *(bit.role for bit in field.bits))
+    }
+    return isinstance(serial.framing, CubeSpaceFraming) or "status" in roles
+
+
+def _errors(icd: InterfaceDefinition) -> Section:
+    numbers = {code.name.lower(): int(icd.error_number(code)) for code in ErrorCode}
+    rows = tuple((f"{number} ({number:02X}h)", name) for name, number in numbers.items())
+    return Section("Error codes", (), ("Code", "Error"), rows)
+
+
+def _composed(link: SerialLinkModel, order: Order) -> Section:
     messages = (("request", link.request_header), ("reply", link.reply_header))
     text = (
         f"{link.baud} bit/s, 8 data bits, no parity, 1 stop bit. A message consists of header, data of the row and check; the framing marks "
@@ -51,12 +134,12 @@ def _composed(link: SerialLinkModel) -> Section:
     return Section(
         "Serial line",
         (text,),
-        ("Message", "Header field", "Type", "Value"),
+        ("Message", "Header field", "Type", "Value", "Meaning"),
         tuple(
             (message, *cells)
             for message, header in messages
             for field in header
-            for cells in _header_cells(field)
+            for cells in _header_cells(field, order)
         ),
     )
 
@@ -80,18 +163,25 @@ def _setting(value: object) -> str:
     return f"{value:X}h" if isinstance(value, int) else str(value)
 
 
-def _header_cells(field: HeaderFieldModel) -> Iterator[tuple[str, str, str]]:
+def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, str, str, str]]:
     only = f"; in {', '.join(field.classes)}" if field.classes else ""
+    type_ = field.type if field.type.endswith("8") else f"{field.type}, {field.order or order}-endian"
     bits = 0
     for bit in field.bits:
         yield (
             bit.role or "constant",
-            f"{field.type}, bits {bits} to {bits + bit.width - 1}",
+            f"{type_}, bits {bits} to {bits + bit.width - 1}",
             _fixed_value(bit.const, bit.default),
+            _MEANINGS.get(bit.role or "", ""),
         )
         bits += bit.width
     if not field.bits:
-        yield field.role or "constant", field.type + only, _fixed_value(field.const, field.default)
+        meaning = _MEANINGS.get(field.role or "", "")
+        if field.role == "length":
+            meaning = f"number of bytes of {', '.join(field.includes) or 'nothing'}"
+        elif field.role in ("ticks", "time"):
+            meaning = f"{meaning}, in units of {field.scale:g} s"
+        yield field.role or "constant", type_ + only, _fixed_value(field.const, field.default), meaning
 
 
 def _fixed_value(const: int | None, default: int | None) -> str:

@@ -251,6 +251,17 @@ def test_a_signal_ends_the_run_in_good_order(tmp_path, number):
     assert not link.is_symlink()
 
 
+def test_a_signal_to_the_worker_too_ends_the_run_quietly():
+    emulator = Emulator()
+    children = Path(f"/proc/{emulator.process.pid}/task/{emulator.process.pid}/children").read_text().split()
+    assert children
+    for child in children:
+        os.kill(int(child), signal.SIGTERM)
+    for _ in range(20):  # a worker that ends now is reported before the emulator gets its own signal
+        emulator.do("status")
+    assert emulator.end() == (0, [])
+
+
 def is_running(pid: str) -> bool:
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"

@@ -23,11 +23,13 @@ from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames,
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
-from starhil.protocol.export.describe import anchor
+from starhil.protocol.export.describe import anchor, example_text, field_cells
 from starhil.protocol.export.packets import key_bits, key_of
 from starhil.protocol.export.quoting import cosmos_state
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.unit_examples import exchanges
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starhil.protocol.values import Value, to_f32
 
@@ -378,6 +380,165 @@ def test_markdown_gives_the_range_of_every_integer_in_telemetry() -> None:
             if field.kind == "integer":
                 (line,) = [line for line in section.splitlines() if f"| {name} |" in line]
                 assert line.split(" | ")[5].endswith((", clipped", ", wraps")), line
+
+
+BITS = """
+[unit]
+name = "x"
+version = "1"
+doc = "x"
+provenance = "ours"
+
+[[telemetry]]
+id = 200
+name = "row"
+doc = "x"
+fields = [
+    "u8 first",
+    { type = "bits16", order = "big", bits = [{ name = "a", width = 3 }, { name = "b", width = 7 }, { width = 5 }, { name = "c" }] },
+    { type = "bits32", order = "big", bits = [{ width = 6 }, { name = "d", width = 20 }, { name = "e", width = 6 }] },
+    { type = "bits16", order = "little", bits = [{ name = "f", width = 3 }, { width = 7 }, { name = "g", width = 6 }] },
+]
+"""
+
+
+def bits_unit(folder: Path, text: str = BITS) -> InterfaceDefinition:
+    """A unit with bit fields of both orders, and groups of bits across bytes."""
+    (folder / "unit.toml").write_text(text)
+    return load_unit(folder)
+
+
+def documented_places(position: str) -> Iterator[tuple[int, int]]:
+    """Yield byte and bit of each bit of a documented position such as `30.6–31.1`, the least significant first."""
+    (byte, bit), *rest = ([int(part) for part in place.split(".")] for place in position.split("–"))
+    last = tuple(rest[0]) if rest else (byte, bit)
+    yield byte, bit
+    while (byte, bit) != last:
+        bit += 1
+        if bit == 8:
+            byte, bit = byte + (1 if last[0] > byte else -1), 0
+        yield byte, bit
+
+
+def check_documented_bits(icd: InterfaceDefinition) -> int:
+    """Set each bit field alone and compare the bytes with its documented position; return the number of fields."""
+    checked = 0
+    for row in icd.rows:
+        others = {**row.sample(), **{name: 0 for name, field in row.named_fields.items() if field.width}}
+        base = row.encode(others, check=False)
+        documented = {cells[1]: cells[0] for cells in field_cells(row)}
+        for name, field in row.named_fields.items():
+            if not field.width:
+                continue
+            places = list(documented_places(documented[name]))
+            assert len(places) == field.width
+            for raw in (1, 2**field.width - 1, 0b0110_1001_1010_0101_1100_0011_0101 % 2**field.width):
+                value = bytearray(base)
+                for number, (byte, bit) in enumerate(places):
+                    value[byte] |= (raw >> number & 1) << bit
+                assert row.encode({**others, name: raw}, check=False) == value, f"{row.name}.{name}"
+            checked += 1
+    return checked
+
+
+def test_documented_positions_of_bits_are_those_on_the_wire(tmp_path: Path) -> None:
+    assert sum(check_documented_bits(load_unit(name)) for name in bundled_units()) > 500
+    assert check_documented_bits(bits_unit(tmp_path)) == 7
+    tutorial = (Path(__file__).parents[2] / "docs" / "your-unit.md").read_text()
+    assert check_documented_bits(
+        bits_unit(tmp_path, "\n".join(re.findall(r"```toml\n(.*?)```", tutorial, re.DOTALL)))
+    )
+
+
+def test_bits_across_bytes_are_read_by_xtce_and_rejected_by_name(tmp_path: Path) -> None:
+    icd = bits_unit(tmp_path)
+    file = tmp_path / "x.xml"
+    file.write_text(export(icd, "xtce"))
+    row = icd.telemetry["row"]
+    definition = definitions.XtcePacketDefinition.from_xtce(file, root_container_name="Packet")
+    for values, data in packets(row):
+        packet = definition.parse_bytes(bytes((200,)) + data)
+        assert {name: packet[f"row_{name}"] for name in values} == values
+    wrong = bits_unit(
+        tmp_path, BITS.replace('{ width = 7 }, { name = "g"', '{ name = "h", width = 7 }, { name = "g"')
+    )
+    for format_, language in (("xtce", "XTCE"), ("cosmos", "COSMOS")):
+        with pytest.raises(
+            ProtocolError, match=f"telemetry row: field h: {language} has no bits across the bytes"
+        ):
+            export(wrong, format_)
+
+
+def test_cosmos_names_fields_without_a_description(tmp_path: Path) -> None:
+    said = export(bits_unit(tmp_path), "cosmos")
+    assert re.search(r'ITEM FIRST 8 8 UINT "first\. Clipped to 0 to 255\."', said)
+    assert re.search(r'ITEM UNUSED_\d+ \d+ \d+ UINT "Unused\."', said)
+
+
+# -- examples ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", bundled_units())
+def test_example_messages_decode_to_the_values_that_are_printed(name: str) -> None:
+    icd = load_unit(name)
+    said = export(icd, "markdown")
+    for exchange in exchanges(icd):
+        row = exchange.row
+        answers = [answer for answer in row.answers if answer != "echo"]
+        assert example_text(exchange) in said
+        if (
+            row.kind == "telecommand"
+            or answers != ["reply"]
+            or row.action is not None
+            or exchange.link == "CAN"
+        ):
+            continue
+        stack = build_serial_stack(icd)
+        request = icd.request(row)
+        receiver = stack.host()
+        receiver.expect(request, row.size)
+        events = receiver.feed(bytes.fromhex("".join(exchange.answers)), 0.0)
+        replies = [
+            event for event in events if isinstance(event, Reply) and event.kind is ReplyKind.TELEMETRY
+        ]
+        assert [row.decode(reply.data) for reply in replies] == [exchange.values], row.name
+
+
+@pytest.mark.parametrize("name", bundled_units())
+def test_example_values_show_the_packing(name: str) -> None:
+    """Neighbouring bytes of an integer differ, and none is zero unless its limits want it."""
+    for row in load_unit(name).rows:
+        values = row.sample()
+        assert row.decode(row.encode(values, saturate=row.kind == "telemetry")) == values
+        for key, field in row.named_fields.items():
+            free = (
+                field.kind == "integer"
+                and field.const is None
+                and field.minimum is None
+                and field.maximum is None
+            )
+            if free and not field.width:
+                data = row.encode(values)[field.offset : field.offset + field.size]
+                assert 0 not in data, f"{row.name}.{key}"
+                assert len(set(data)) == len(data), f"{row.name}.{key}"
+
+
+# -- what a reader needs beside the rows -------------------------------------------------------------------------------
+
+
+def test_the_icd_names_conventions_classes_lengths_and_error_codes(tmp_path: Path) -> None:
+    tutorial = (Path(__file__).parents[2] / "docs" / "your-unit.md").read_text()
+    tables = re.findall(r"```toml\n(.*?)```", tutorial.partition("## A unit that streams")[0], re.DOTALL)
+    icd = bits_unit(tmp_path, "\n".join(tables))
+    for said in (export(icd, "markdown"), export(icd, "html")):
+        plain = re.sub(r"<[^>]+>", " ", said.replace("\\", "").replace("&#x27;", "'"))
+        for words in (
+            "q* ⊗ v_ICRS ⊗ q ", "the q of the attitude matrix A(q)", "+z, +x, +y of the sensor frame", "2000-01-01, UTC",
+            "big-endian", "number of bytes of header, data", "7 (07h)", "boots to standby", "with measure",
+        ):  # fmt: skip
+            assert words in plain, words
+        assert re.search(r"command\W+telecommand\W+01h\W+81h\W+81h", plain)
+        assert re.search(r"request\W+telemetry\W+02h\W+82h\W+C2h", plain)
 
 
 # -- all ---------------------------------------------------------------------------------------------------------------

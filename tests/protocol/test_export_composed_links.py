@@ -193,7 +193,7 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
 )
 def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     model = SerialLinkModel.model_validate({**link, "request_header": [{"role": "id", "type": "u8"}]})
-    custom: Any = {"mine": STACKS["nsp"].framing}
+    custom: Any = {"mine": lambda: STACKS["nsp"].framing}
     stack = build_stack(model, framings=custom, checks={"mine": lambda _data: b""})
     assert isinstance(stack, ComposedStack)
     assert isinstance(model.framing, CustomFraming) or isinstance(model.check, CustomCheck)

@@ -7,10 +7,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from numba.core.caching import NullCache
 
 from starid.arrays import Array
 from starid.jit import compiled_ieee, inner, inner_checked
@@ -43,6 +44,9 @@ def checked_inverse(value: float) -> float:
 @compiled_ieee
 def polynomial(x: Array) -> float:
     return float(power(x[0], 2) + power(x[0], 3) + power(x[0], x.size))
+
+
+cast("Any", polynomial)._cache = NullCache()  # compiled in each process, and with it what it calls
 
 
 @compiled_ieee

@@ -207,3 +207,14 @@ def test_wrong_counts_boresight_and_roll_of_valid_answers_only():
 def test_a_senseless_plan_is_rejected(bad):
     with pytest.raises(EmulatorError, match="campaign"):
         CampaignPlan(**{"frames": 1, "seed": 1, **bad})
+
+
+def test_figures_do_not_depend_on_the_order_in_which_chunks_finish():
+    rng = np.random.default_rng(1)
+    rows = np.zeros(500, RECORD)
+    rows["frame"], rows["valid"] = np.arange(500), True
+    for field in ("cross_arcsec", "roll_arcsec", "normalised_squared_error", "render_ms"):
+        rows[field] = rng.lognormal(0.0, 3.0, 500)
+    expected = summarise(rows, 42.0)
+    for _ in range(20):
+        assert summarise(rng.permutation(rows), 42.0) == expected

@@ -127,3 +127,11 @@ def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel(
 def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, worker: Callable[..., object]) -> None:
     worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome="Failure('no catalogue')"))
     assert run_command_line("cache", "warm") == (2, "", "starhil: no catalogue\n")
+
+
+def test_a_loop_of_links_does_not_stop_the_cache(folder):
+    folder.mkdir()
+    (folder / f"{name(1)}.npz").symlink_to(f"{name(1)}.npz")
+    cache.cached_tables(name(2), lambda: {"a": MEGABYTE})
+    assert run_command_line("cache", "clear")[0] == 0
+    assert not (folder / f"{name(2)}.npz").exists()

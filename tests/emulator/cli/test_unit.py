@@ -32,7 +32,10 @@ def test_a_new_unit_has_no_errors_and_shows_its_exchanges(tmp_path):
     assert 'name = "mine"' in (folder / "unit.toml").read_text(encoding="utf-8")
     checked = unit("check", str(folder))
     assert checked.exit_code == 0
-    assert "telecommand set_mode, ID 0x02, 1 B, on serial\n  > C0 10 01 02 00 CE 35 C0\n" in checked.stdout
+    assert (
+        "telecommand set_mode, ID 0x02, 1 B, on serial\n    mode = lost_in_space\n  > C0 10 01 02 01 DE 14 C0\n"
+        in checked.stdout
+    )
     assert checked.stdout.endswith(f"{folder}: no errors\n")
 
 

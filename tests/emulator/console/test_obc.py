@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from starhil.emulator.console.obc import ConsoleObc, Exchange
+from starhil.emulator.console.obc import ConsoleObc, Exchange, toml
 from starhil.hil_tests.script import load_script
 from starhil.protocol.candump import parse_candump
 from starhil.protocol.icd import load_unit
@@ -193,3 +193,8 @@ def test_a_unit_with_canopen_only_is_commanded_by_sdo(run):
         unit="oresat",
         links={**LINKS_OFF, "can": {"channel": "virtual:console-sdo"}},
     )
+
+
+@pytest.mark.parametrize("text", ['a\nb"\\c\t\r\0\x1f\x7f\x9f', "→ \U0001f6f0", ""])
+def test_a_saved_session_quotes_every_character(text):
+    assert tomllib.loads(f"text = {toml(text)}") == {"text": text}

@@ -55,6 +55,22 @@ def test_reports_of_runs_need_the_token_and_the_files_of_the_page_do_not(run):
     run(scenario, options=OPTIONS)
 
 
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [({"Origin": "http://["}, 403), ({"Content-Type": "application/json; charset=foo"}, 400)],
+    ids=["origin", "charset"],
+)
+def test_a_header_that_cannot_be_read_is_rejected(run, headers, status):
+    async def scenario(_emulation, line):
+        address = line.partition("view=")[2].split()[0]
+        async with aiohttp.ClientSession() as session:
+            reports = address.replace("/?", "/runs?")
+            async with session.post(reports, data=b"{}", headers=headers) as answer:
+                assert answer.status == status
+
+    run(scenario, options=OPTIONS)
+
+
 def test_previews_are_made_only_while_a_page_shows_images(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)

@@ -168,16 +168,14 @@ def test_the_pipeline_survives_an_extreme_parameter(solve, name):
     assert solve().valid
 
 
-@pytest.mark.parametrize(("term", "value"), itertools.product(range(5), (5e-324, -1e-310, 1e-45, 1e6)))
+@pytest.mark.parametrize(("term", "value"), list(itertools.product(range(5), (5e-324, -1e-310, 1e-45, 1e6))))
 def test_an_extreme_distortion_in_a_profile_is_rejected_or_harmless(term, value):
     """The start of a profile with this lens is accepted, or rejected in one line."""
     distortion = [0.0] * 5
     distortion[term] = value
     profile = Profile.model_validate({"camera": {"fov_deg": 42.0, "distortion": distortion}})
-    if value > 1.0:
-        with pytest.raises(StaridError, match="distortion"):
-            Pipeline(pipeline_setup(profile))
-    else:
+    expected = pytest.raises(StaridError, match="distortion") if abs(value) > 1.0 and term in (2, 3) else None
+    with expected or contextlib.nullcontext():
         assert math.isclose(Pipeline(pipeline_setup(profile)).camera.fov_deg, 42.0)
 
 
