@@ -266,7 +266,8 @@ class LifeGenerator:
                 return self._raw_request(row.klass, number, kind, b"")
             case 1:
                 size = row.size if row.kind == "telecommand" else 0
-                wrong = self._random.choice([size + 1, size + 7, max(0, size - 1)])
+                # one byte more may be a CRC
+                wrong = self._random.choice([size + 2, size + 7, max(0, size - 1)])
                 return self._request(row, self._random.randbytes(wrong))
             case _:
                 size = row.size if row.kind == "telecommand" else 0
