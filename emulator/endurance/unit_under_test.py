@@ -22,8 +22,9 @@ from starhil.emulator.pipeline.imager import Imager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import MAX_STEP_S, StepPump
 from starhil.emulator.replay import prepare_recording
-from starhil.emulator.tape import Recorder
+from starhil.emulator.tape import TRUTH_FILE, Recorder
 from starhil.emulator.truth.config import TruthConfig
+from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.transports.base import Transport
@@ -198,6 +199,7 @@ class UnitUnderTest:
         self._folder = folder
         self._record = record
         self._recorder: Recorder | None = None
+        self._truth_log: TruthLog | None = None
         self._emulation: Emulation | None = None
         self._faults: Faults | None = None
         self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
@@ -240,14 +242,22 @@ class UnitUnderTest:
         self._emulation = Emulation(self.profile, tape=tape)
         await self._emulation.open()
         self._faults = Faults(self._emulation.device, self._emulation.links)
+        if self._recorder is not None:
+            path = self._recorder.folder / TRUTH_FILE
+            self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
+            self._emulation.device.on_frame.append(self._truth_log.write)
         self._emulation.begin()
         await self._emulation.ready()
 
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
+        if self._recorder is not None:
+            self._recorder.end()
         await self.emulation.close()
-        if self._recorder is not None and self._recorder.file is not None:
-            self._recorder.file.close()
+        files = (getattr(self._recorder, "file", None), getattr(self._truth_log, "file", None))
+        for file in files:
+            if file is not None:
+                file.close()
         if factory:
             shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
 

@@ -39,10 +39,18 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """An OBC on a serial line."""
+    """An OBC on a serial line; `answered` returns whether the unit answers a request there."""
 
-    def __init__(self, stack: SerialStack, deliver: Deliver, take: Take, dialect: Dialect | None) -> None:
+    def __init__(
+        self,
+        stack: SerialStack,
+        deliver: Deliver,
+        take: Take,
+        dialect: Dialect | None,
+        answered: Callable[[Request], bool],
+    ) -> None:
         self._stack = stack
+        self._answered = answered
         self._deliver, self._take = deliver, take
         self.dialect = dialect
         self._expected: list[tuple[Request, int]] = []
@@ -55,9 +63,10 @@ class SerialPort:
 
     def ask(self, request: Request, reply_size: int, now_s: float) -> None:  # noqa: ARG002 (the same for all)
         """Send a request."""
-        self._expected.append((request, reply_size))
-        if len(self._expected) == 1:
-            self._receiver.expect(request, reply_size)
+        if self._answered(request):
+            self._expected.append((request, reply_size))
+            if len(self._expected) == 1:
+                self._receiver.expect(request, reply_size)
         self._deliver(self._stack.encode_request(request))
 
     def answers(self, now_s: float) -> list[Reply | LinkFault]:

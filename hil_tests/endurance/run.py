@@ -252,7 +252,7 @@ class LifeRun:
                 return unit.take(link)
 
             if self._stack is not None and link == "serial":
-                self._ports[link] = SerialPort(self._stack, deliver, take, self._dialect())
+                self._ports[link] = SerialPort(self._stack, deliver, take, self._dialect(), self._answered)
             elif link == "can":
                 self._ports[link] = CanPort(deliver, take, number("can_address", 4))
             else:
@@ -395,6 +395,10 @@ class LifeRun:
         if row is None:
             return ("reply",)
         return serial_answers(self._icd, row) if link == "serial" else row.answers
+
+    def _answered(self, request: Request) -> bool:
+        row = self._icd.rows_by_key.get((request.klass, request.id))
+        return bool(self._expected_answers("serial", row))
 
     def _judge_refusal(self, sent: str, link: str, nack: Reply, verdict: ErrorCode | None) -> None:
         if verdict is ErrorCode.OK:
