@@ -96,7 +96,7 @@ class Oracle:
             "counters.telecommands": partial(self._check_count, "telecommands"),
             "counters.telemetry": partial(self._check_count, "telemetry"),
             "counters.requests": self._check_requests,
-            "clock.unix": partial(self._check_clock, 1.0, 2**32),
+            "clock.unix": partial(self._check_clock, 1.0, 2**64),
             "clock.seconds": partial(self._check_clock, 1.0, 2**32),
             "clock.milliseconds": partial(self._check_clock, 1e3, 1),
             "uptime": self._check_uptime,
