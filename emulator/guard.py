@@ -60,6 +60,24 @@ def until_cancelled(
     return serve_until_cancelled
 
 
+def log_loop_errors_once(loop: asyncio.AbstractEventLoop) -> None:
+    """Log each error of an event loop once, in one line, with its traceback at level debug.
+
+    Without free file descriptors, asyncio would log a traceback for every waiting connection, every second.
+    """
+    logged: set[str] = set()
+
+    def log_once(_loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        text = context["message"] + ("" if error is None else f": {one_line(error)}")
+        if text not in logged:
+            logged.add(text)
+            log.error("event loop: %s", text)
+            log.debug("event loop", exc_info=error)
+
+    loop.set_exception_handler(log_once)
+
+
 async def close_all(closers: Sequence[Callable[[], object]]) -> None:
     """Call, and await if needed, each closer in order; a failure is logged, and the others are called."""
     async with AsyncExitStack() as stack:

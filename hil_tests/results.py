@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,6 +22,8 @@ FAILED: Final = "failed"
 SKIPPED: Final = "skipped"
 NOT_RUN: Final = "not run"
 """Status of a case that was not run; skipped in a JUnit file."""
+INVALID_IN_XML: Final = re.compile("[^\t\n -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Control characters, surrogates and U+FFFE and U+FFFF; a carriage return would become a line feed."""
 SHOWN_VALUES: Final = 6
 """Number of values of a row shown in the line of a step."""
 
@@ -178,22 +181,25 @@ def write_junit(path: Path, name: str, cases: Sequence[TestCase], seconds: float
         item = ET.SubElement(
             suite,
             "testcase",
-            {"classname": case.suite, "name": _printable(case.name), "time": f"{case.seconds:.6f}"},
+            {"classname": case.suite, "name": case.name, "time": f"{case.seconds:.6f}"},
         )
         if case.status == FAILED:
-            failure = ET.SubElement(item, "failure", {"message": _printable(case.detail)})
-            failure.text = _printable(case.detail)
+            failure = ET.SubElement(item, "failure", {"message": case.detail})
+            failure.text = case.detail
         elif case.status in (SKIPPED, NOT_RUN):
-            ET.SubElement(item, "skipped", {"message": _printable(case.detail)})
+            ET.SubElement(item, "skipped", {"message": case.detail})
         if case.output:
-            ET.SubElement(item, "system-out").text = _printable(case.output)
+            ET.SubElement(item, "system-out").text = case.output
+    for element in root.iter():
+        element.attrib = {key: _replace_invalid(value) for key, value in element.attrib.items()}
+        element.text = element.text and _replace_invalid(element.text)
     ET.indent(root)
     write_report(path, ET.tostring(root, encoding="utf-8", xml_declaration=True))
 
 
-def _printable(text: str) -> str:
+def _replace_invalid(text: str) -> str:
     """Replace characters that XML 1.0 cannot carry."""
-    return "".join(ch if ch in "\t\n" or ord(ch) >= 0x20 else "\N{REPLACEMENT CHARACTER}" for ch in text)
+    return INVALID_IN_XML.sub("\N{REPLACEMENT CHARACTER}", text)
 
 
 def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:

@@ -31,6 +31,7 @@ from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
+from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
@@ -99,7 +100,7 @@ def run_session(request: SessionRequest) -> SessionResult:
         prepare_report(request.junit)
     show = _printer(quiet=request.quiet)
     if not request.quiet:
-        Console(highlight=False).print(Text(script.title, style="bold"))
+        Console(highlight=False).print(Text(escape_controls(script.title), style="bold"))
     result: SessionResult | None = None
     try:
         with ExitStack() as stack:
@@ -224,13 +225,15 @@ def _printer(*, quiet: bool) -> Callable[[StepResult], None]:
         mark, style = STYLES[result.status]
         line = Text(f"{mark} ", style=style)
         line.append(f"{result.number:3d}  ", style="dim")
-        line.append(result.name)
+        line.append(escape_controls(result.name))
         if result.link:
             line.append(f"  [{result.link}]", style="dim")
         if result.latency_s is not None:
             line.append(f"  {result.latency_s:.4f} s", style="cyan")
         if result.detail:
-            line.append(f"  {result.detail}", style="red" if result.status == FAILED else "dim")
+            line.append(
+                f"  {escape_controls(result.detail)}", style="red" if result.status == FAILED else "dim"
+            )
         console.print(line, soft_wrap=True)
 
     return (lambda _result: None) if quiet else show

@@ -1,4 +1,4 @@
-"""Base class of the errors of this package, and the reason of a failed system call as text."""
+"""Base class of the errors of this package, the reason of a failed system call as text, and text for a terminal."""
 
 from __future__ import annotations
 
@@ -22,3 +22,8 @@ def reason(error: Exception) -> str:
     if isinstance(number, int) and number > 0:
         return os.strerror(number)
     return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
+def escape_controls(text: str) -> str:
+    """Return text with each character escaped that could control a terminal, end the line or reorder the text."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

@@ -1,16 +1,21 @@
-"""Fair sharing of an event loop by many connections, and socket options for TCP.
+"""Fair sharing of an event loop by many connections, a limit of their number, and socket options for TCP.
 
 Each connection reads a limited amount per turn of the loop, and no sender waits for the backlog of another.
+A server without a limit would take every file descriptor of the process, and links could not be reopened.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
+import resource
 import socket
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Hashable, Sequence
-from typing import Final
+from typing import Final, cast
+
+log: Final = logging.getLogger("starhil.connections")
 
 TURN: Final = 4 * 1024
 """Maximum number of bytes that a connection reads per turn of the loop: about 100 CAN frames as text, or 10
@@ -26,6 +31,55 @@ answer."""
 
 UNREAD_LIMIT_MS: Final = 10_000
 """A server that has not acknowledged sent data for this time is lost."""
+
+MAX_CONNECTIONS: Final = 64
+"""Maximum number of connections of a server."""
+
+SHARE_OF_DESCRIPTORS: Final = 8
+"""A server uses at most one in this many of the file descriptors that the process may open."""
+
+
+class ConnectionLimit:
+    """Rejects connections of a server that has too many; the first rejection is logged.
+
+    Parameters
+    ----------
+    server
+        Name of the server, for the log.
+    refusal
+        Sent to a peer that is rejected.
+
+    Attributes
+    ----------
+    size
+        Maximum number of connections. As `backlog` of the server it also limits the connections that asyncio
+        accepts in one turn of the loop.
+    """
+
+    def __init__(self, server: str, refusal: bytes = b"") -> None:
+        self._server = server
+        self._refusal = refusal
+        self._logged = False
+        descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        unlimited = descriptors == resource.RLIM_INFINITY
+        share = MAX_CONNECTIONS if unlimited else descriptors // SHARE_OF_DESCRIPTORS
+        self.size = max(1, min(MAX_CONNECTIONS, share))
+
+    def admits(self, transport: asyncio.BaseTransport, connected: int) -> bool:
+        """Return whether there is room besides the connected peers; close the connection if not."""
+        if connected < self.size:
+            return True
+        if not self._logged:
+            self._logged = True
+            log.warning(
+                "%s: %d connections are open, the maximum; further ones are closed, and not logged again",
+                self._server,
+                self.size,
+            )
+        stream = cast("asyncio.WriteTransport", transport)
+        stream.write(self._refusal)
+        stream.close()
+        return False
 
 
 class TurnProtocol(asyncio.BufferedProtocol):

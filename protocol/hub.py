@@ -22,7 +22,14 @@ from typing import Final, TextIO, cast
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import format_candump
 from starhil.protocol.errors import ProtocolError, reason
-from starhil.protocol.flow import WINDOW, FairQueue, TurnProtocol, detect_lost_peer, limit_buffers
+from starhil.protocol.flow import (
+    WINDOW,
+    ConnectionLimit,
+    FairQueue,
+    TurnProtocol,
+    detect_lost_peer,
+    limit_buffers,
+)
 from starhil.protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
 
 _LOGGER: Final = logging.getLogger("starhil.hub")
@@ -81,6 +88,8 @@ class _Client(TurnProtocol):
         self.remote = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        if not self._hub.limit.admits(transport, self._hub.statistics.clients):
+            return
         self._transport = cast("asyncio.Transport", transport)
         detect_lost_peer(transport)
         limit_buffers(transport)
@@ -89,6 +98,8 @@ class _Client(TurnProtocol):
         self._hub.join(self)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (asyncio's signature)
+        if self._transport is None:  # rejected
+            return
         self._transport = None
         if self._settle is not None:
             self._settle.cancel()
@@ -217,6 +228,7 @@ class CanHub:
         self.host: Final = host
         self.port = port
         self.statistics: Final = HubStatistics()
+        self.limit: Final = ConnectionLimit("CAN hub", b"< error too many clients >")
         self._log_path = log
         self._log: TextIO | None = None
         self._now = now
@@ -228,7 +240,9 @@ class CanHub:
         """Listen. Raises ProtocolError if the address or the log is not available."""
         loop = asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(lambda: _Client(self), self.host, self.port)
+            self._server = await loop.create_server(
+                lambda: _Client(self), self.host, self.port, backlog=self.limit.size
+            )
         except (OSError, UnicodeError) as error:
             remedy = "--host" if isinstance(error, UnicodeError | socket.gaierror) else "--port"
             raise ProtocolError(

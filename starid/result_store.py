@@ -1,7 +1,8 @@
-"""Results of long computations on disk: one file per finished part, and a plan that identifies them."""
+"""Results of long computations on disk: a sealed file per finished part, and a plan that identifies them."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zipfile
 import zlib
@@ -16,6 +17,8 @@ from starid.errors import StaridError
 from starid.files import write_atomically
 
 PLAN_FILE: Final = "plan.json"
+SEAL: Final = "seal_"
+"""Name of the array with the seal of a part."""
 
 Results = dict[str, NDArray[Any]]
 """Results of a part: named arrays."""
@@ -84,6 +87,7 @@ class ResultStore:
         self._what = what
         plan_file = folder / PLAN_FILE
         content = json.loads(json.dumps(plan))
+        self._plan = json.dumps(content, sort_keys=True)
         try:
             if plan_file.exists():
                 self._check_same(plan_file, content)
@@ -105,10 +109,19 @@ class ResultStore:
         Raises
         ------
         StaridError
-            The file is damaged.
+            The file is damaged, was changed, or belongs to another part or plan.
         """
         file = self.file(part)
-        return read_results(file, self._what) if file.exists() else None
+        if not file.exists():
+            return None
+        results = read_results(file, self._what)
+        seal = results.pop(SEAL, None)
+        if seal is None or str(seal) != self._seal(part, results):
+            raise StaridError(
+                f"{self._what}: {file} was not written by this {self._what} or was changed; remove it to compute "
+                "it again"
+            )
+        return results
 
     def save(self, part: str, results: Mapping[str, NDArray[Any]]) -> None:
         """Save the results of a finished part.
@@ -120,11 +133,19 @@ class ResultStore:
         """
         file = self.file(part)
         try:
-            write_results(file, results)
+            write_results(file, {**results, SEAL: np.array(self._seal(part, results))})
         except OSError as error:
             raise StaridError(
                 f"{self._what}: {file} cannot be written: {error.strerror}; run the same command again to resume"
             ) from error
+
+    def _seal(self, part: str, results: Mapping[str, NDArray[Any]]) -> str:
+        """Return a hash of plan, part and results."""
+        seal = hashlib.sha256(repr((self._plan, part)).encode())
+        for name, values in sorted(results.items()):
+            seal.update(repr((name, values.dtype.descr, values.shape)).encode())
+            seal.update(values.tobytes())
+        return seal.hexdigest()
 
     def _check_same(self, plan_file: Path, content: dict[str, Any]) -> None:
         """Reject a plan file with other content; the error names the first difference."""

@@ -16,7 +16,7 @@ from starhil.emulator.cli.output import show_every_character
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.validation_messages import plain
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.errors import ProtocolError, escape_controls
 from starid.errors import StaridError
 
 EXIT_BAD_INPUT: Final = 2
@@ -198,5 +198,5 @@ def main() -> None:
 
 def exit_for_bad_input(why: str) -> NoReturn:
     """Print one line on stderr and exit."""
-    print(f"starhil: {' '.join(why.split())}", file=sys.stderr)
+    print(f"starhil: {escape_controls(' '.join(why.split()))}", file=sys.stderr)
     raise SystemExit(EXIT_BAD_INPUT) from None

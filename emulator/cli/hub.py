@@ -25,6 +25,7 @@ def command(
     import asyncio
     import signal
 
+    from starhil.emulator.guard import log_loop_errors_once
     from starhil.protocol.hub import DEFAULT_BUS, CanHub
 
     if log is not None:
@@ -36,6 +37,7 @@ def command(
         print(f"ready can=socketcand:{hub.host}:{hub.port}/{DEFAULT_BUS}", flush=True)
         ended = asyncio.Event()
         loop = asyncio.get_running_loop()
+        log_loop_errors_once(loop)
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, ended.set)
         await ended.wait()

@@ -130,6 +130,7 @@ def command(
 
     from starhil.emulator.cli.console_client import ConsoleClient
     from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.guard import log_loop_errors_once
     from starhil.emulator.launch import Run, RunOptions, path_of_head, with_own_seeds
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
 
@@ -196,6 +197,7 @@ def command(
 
         emulator = Run(profiles[0], options, worker, profiles[1:])
         loop = asyncio.get_running_loop()
+        log_loop_errors_once(loop)
         ends = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
             ends.append(signal.SIGHUP)

@@ -256,13 +256,15 @@ class Console:
             return {**identity, "ok": False, "error": f"internal error: {one_line(error)}"}
 
     async def _subscribe(self, viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
+        rows = request.get("rows") or []
+        if not isinstance(rows, list) or not all(isinstance(name, str) for name in rows):
+            raise EmulatorError("rows: must be a list of names of telemetry rows")
         begins, viewer.frames = not viewer.frames, bool(request.get("frames"))
         if begins and viewer.frames and self._last_frame:
             viewer.send_frame(self._last_frame)
         begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
         if begins and viewer.wire:
             viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
-        rows = request.get("rows") or ()
         known = self._emulation.device.icd.telemetry
         viewer.rows = frozenset(name for name in rows if name in known)
         self._viewers_changed()
@@ -270,7 +272,7 @@ class Console:
 
     async def _control(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         wanted = dict(_table(request, "request"))
-        if wanted.get("do") not in CONTROL:
+        if str(wanted.get("do")) not in CONTROL:
             raise EmulatorError(f"request: do must be one of {', '.join(sorted(CONTROL))}")
         return await self._execute(wanted)
 

@@ -12,6 +12,7 @@ from typing import Any, Final, Literal, Protocol
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.values import FieldError, Value
@@ -198,7 +199,7 @@ class ConsoleObc:
     def _row(self, kind: str, name: str) -> Row:
         rows = self._icd.telecommands if kind == "telecommand" else self._icd.telemetry
         if name not in rows:
-            raise EmulatorError(f"{name}: no such {kind}")
+            raise EmulatorError(f"{escape_controls(name)}: no such {kind}")
         return rows[name]
 
     def session(self, title: str) -> str:

@@ -16,8 +16,9 @@ from starid.catalog import load_catalog
 from starid.star_names import STAR_NAMES
 
 DEFAULT_RATE_DEG_S: Final = 0.5
+MAX_NUMBER: Final = 1e12
 
-_HIP: Final = re.compile(r"(?:HIP\s*)?(\d+)", re.IGNORECASE)
+_HIP: Final = re.compile(r"(?:HIP\s*)?(\d{1,9})", re.IGNORECASE)
 
 
 def pointing_request(
@@ -57,7 +58,7 @@ def pointing_request(
     content: dict[str, Any] = {"attitude": of_body(here)}
     if kind == "rate":
         rate = wanted.get("rate_deg_s")
-        if not isinstance(rate, list) or len(rate) != 3 or not all(isinstance(x, (int, float)) for x in rate):
+        if not isinstance(rate, list) or len(rate) != 3 or not all(map(_is_number, rate)):
             raise EmulatorError("rate_deg_s: three numbers are needed")
         content["rate_deg_s"] = (to_body @ np.array(rate)).tolist()
     elif kind in ("slew", "fixed"):
@@ -70,6 +71,11 @@ def pointing_request(
     else:
         raise EmulatorError("kind: must be slew, rate or fixed")
     return {"do": "set_truth", "truth": {"kind": kind, **content}}
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a value is a number with which the truth can be computed."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < MAX_NUMBER
 
 
 def _target(to: dict[str, Any], here: Attitude, catalog_path: str | None, epoch: float) -> Attitude:

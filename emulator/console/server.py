@@ -10,15 +10,17 @@ import logging
 import secrets
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, cast
 from urllib.parse import urlsplit
 
 from aiohttp import WSMsgType, web
+from aiohttp.http import HttpProcessingError
 
 from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.errors import reason
+from starhil.protocol.flow import ConnectionLimit
 
 log = logging.getLogger("starhil.console")
 
@@ -37,6 +39,15 @@ HEARTBEAT_S: Final = 20.0
 """Time after which a page that does not answer is disconnected, seconds."""
 
 MAX_VIEWERS: Final = 32
+
+REQUEST_S: Final = 10.0
+"""Time within which a peer must send a request after it has connected or received the last response, and the
+body of a request after its headers, seconds."""
+
+BUSY: Final = (
+    b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain\r\nConnection: close\r\n\r\n"
+    b"503: too many connections; close other pages of the console\n"
+)
 
 HEADERS: Final = {
     "Cache-Control": "no-cache",
@@ -64,6 +75,7 @@ class ConsoleServer:
         self._consoles = consoles
         self.token = secrets.token_urlsafe(18) if token is None else token
         self._runner: web.AppRunner | None = None
+        self._listener: asyncio.Server | None = None
 
     async def start(self, where: str) -> str:
         """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page.
@@ -82,22 +94,34 @@ class ConsoleServer:
         app.router.add_get("/wire.log", self._wire_log)
         app.router.add_post("/runs", self._report)
         app.router.add_static("/static", STATIC)
-        self._runner = web.AppRunner(app, access_log=None, handle_signals=False, shutdown_timeout=0.5)
+        self._runner = web.AppRunner(
+            app,
+            access_log=None,
+            logger=_ServerLog(log),
+            handle_signals=False,
+            shutdown_timeout=0.5,
+            keepalive_timeout=REQUEST_S,
+        )
         await self._runner.setup()
-        site = web.TCPSite(self._runner, host, port)
+        server, limit = cast("web.Server", self._runner.server), ConnectionLimit("console", BUSY)
         try:
-            await site.start()
+            self._listener = await asyncio.get_running_loop().create_server(
+                lambda: _Gate(server, limit), host, port, backlog=limit.size
+            )
         except (OSError, UnicodeError) as error:
             await self.close()
             raise EmulatorError(
                 f"--view {where}: cannot listen ({reason(error)}); choose another port, or auto"
             ) from None
-        bound = self._runner.addresses[0]
+        bound = self._listener.sockets[0].getsockname()
         name = f"[{bound[0]}]" if ":" in bound[0] else bound[0]
         return f"http://{name}:{bound[1]}/?token={self.token}"
 
     async def close(self) -> None:
         """Stop listening and close all connections."""
+        if self._listener is not None:
+            self._listener.close()
+            self._listener = None
         if self._runner is not None:
             await self._runner.cleanup()
             self._runner = None
@@ -142,7 +166,14 @@ class ConsoleServer:
 
     async def _report(self, request: web.Request) -> web.Response:
         try:
-            event = json.loads(await request.read())
+            async with asyncio.timeout(REQUEST_S):
+                body = await request.read()
+        except TimeoutError:
+            response = web.Response(status=408, text=f"408: no complete report within {REQUEST_S:g} s\n")
+            response.force_close()
+            return response
+        try:
+            event = json.loads(body)
         except (ValueError, RecursionError):
             raise EmulatorError("report: not JSON") from None
         self._consoles[0].runs.report(event)
@@ -172,6 +203,30 @@ class ConsoleServer:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
         return socket
+
+
+class _ServerLog(logging.LoggerAdapter[logging.Logger]):
+    """Logs a request that is not HTTP at level debug: its peer is answered with 400, and could fill the log."""
+
+    def log(self, level: int, msg: object, *args: object, **options: Any) -> None:
+        """Log an event of the HTTP server."""
+        from_peer = isinstance(options.get("exc_info"), HttpProcessingError)
+        super().log(logging.DEBUG if from_peer else level, msg, *args, **options)
+
+
+class _Gate(asyncio.Protocol):
+    """Passes a new connection to the HTTP server unless there are too many."""
+
+    def __init__(self, server: web.Server, limit: ConnectionLimit) -> None:
+        self._server = server
+        self._limit = limit
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Replace this protocol by one of the server."""
+        if self._limit.admits(transport, len(self._server.connections)):
+            protocol = self._server()
+            transport.set_protocol(protocol)
+            protocol.connection_made(transport)
 
 
 async def _receive(

@@ -60,12 +60,14 @@ from starhil.emulator.truth.source import TruthState
 from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError, reason
+from starhil.protocol.flow import ConnectionLimit
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
 
 MAX_LINE: Final = 1 << 20
 KEPT_FRAMES: Final = 200
+BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
 
 Answer = dict[str, Any]
 
@@ -112,6 +114,7 @@ class ControlServer:
         self._quit = quit_run
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
+        self._limit = ConnectionLimit("control channel", BUSY)
         self._actions: dict[str, Callable[[ControlTarget, dict[str, Any]], Awaitable[Answer]]] = {
             "status": self._status,
             "truth": self._truth,
@@ -138,7 +141,10 @@ class ControlServer:
             path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
             self._socket = ControlSocket(path)
             self._server = await asyncio.start_unix_server(
-                until_cancelled(self._serve_connection), sock=self._socket.socket, limit=MAX_LINE
+                until_cancelled(self._serve_connection),
+                sock=self._socket.socket,
+                limit=MAX_LINE,
+                backlog=self._limit.size,
             )
             return f"unix:{path}"
         host, _, port = where.rpartition(":")
@@ -146,7 +152,9 @@ class ControlServer:
             raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
         try:
             serve = until_cancelled(self._serve_connection)
-            self._server = await asyncio.start_server(serve, host, int(port), limit=MAX_LINE)
+            self._server = await asyncio.start_server(
+                serve, host, int(port), limit=MAX_LINE, backlog=self._limit.size
+            )
         except (OSError, ValueError) as error:  # an invalid host name is a ValueError
             raise EmulatorError(
                 f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"
@@ -164,6 +172,8 @@ class ControlServer:
             writer.transport.abort()
 
     async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if not self._limit.admits(writer.transport, len(self._writers)):
+            return
         self._writers.add(writer)
         try:
             async for line in read_lines(reader):

@@ -35,6 +35,7 @@ from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.source import TruthSource
 from starhil.emulator.validation_messages import explain
+from starhil.protocol.errors import reason
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
@@ -134,10 +135,16 @@ def load_scenario(name_or_path: str) -> Scenario:
     EmulatorError
         The file is missing or invalid; one line with file, key and remedy.
     """
-    path = Path(name_or_path).expanduser()
-    if "/" not in name_or_path and not name_or_path.endswith(".toml"):
-        path = configs_folder() / "scenarios" / f"{name_or_path}.toml"
-    if not path.exists():
+    try:
+        path = Path(name_or_path).expanduser()
+        if "/" not in name_or_path and not name_or_path.endswith(".toml"):
+            path = configs_folder() / "scenarios" / f"{name_or_path}.toml"
+        found = path.exists()
+    except (OSError, RuntimeError) as error:  # RuntimeError: the home folder of an unknown user
+        raise EmulatorError(
+            f"scenario {name_or_path!r}: cannot be read ({reason(error)}); give another path"
+        ) from None
+    if not found:
         known = ", ".join(sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
         raise EmulatorError(f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}")
     values = read_toml(path, "scenario")

@@ -13,6 +13,7 @@ from starhil.emulator.json_lines import read_lines
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.lock_step import LockStep, Step
 from starhil.protocol.errors import reason
+from starhil.protocol.flow import ConnectionLimit
 
 log = logging.getLogger("starhil.truth")
 
@@ -65,6 +66,7 @@ class LiveFeed:
         self._server: asyncio.Server | None = None
         self._client: asyncio.Task[None] | None = None
         self._writers: set[asyncio.StreamWriter] = set()
+        self._limit = ConnectionLimit("truth feed")
 
     async def start(self, socket: Socket, host: str, port: int) -> str:
         """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
@@ -88,7 +90,11 @@ class LiveFeed:
                 address = transport.get_extra_info("sockname")
             else:
                 self._server = await asyncio.start_server(
-                    until_cancelled(self._serve_connection), host, port, limit=self.truth.format.max_size
+                    until_cancelled(self._serve_connection),
+                    host,
+                    port,
+                    limit=self.truth.format.max_size,
+                    backlog=self._limit.size,
                 )
                 address = self._server.sockets[0].getsockname()
         except (OSError, ValueError) as error:  # ValueError: not a valid host name
@@ -135,6 +141,8 @@ class LiveFeed:
             await asyncio.sleep(RETRY_S)
 
     async def _serve_connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if not self._limit.admits(writer.transport, len(self._writers)):
+            return
         self._writers.add(writer)
         try:
             async for data in read_lines(reader, self.truth.format.end):

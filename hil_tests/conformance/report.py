@@ -13,6 +13,7 @@ from rich.text import Text
 
 from starhil.hil_tests.conformance.runner import Outcome
 from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED, TestCase, write_junit, write_report
+from starhil.protocol.errors import escape_controls
 
 STYLES: Final = {
     PASSED: ("✓", "green"),
@@ -67,11 +68,12 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
     mark, style = STYLES[outcome.status]
     line = Text(f"{mark} ", style=style)
     line.append(f"{outcome.id}  ")
-    line.append(f"{outcome.title} [{outcome.clause}]", style="dim")
+    line.append(f"{escape_controls(outcome.title)} [{escape_controls(outcome.clause)}]", style="dim")
     if outcome.status == FAILED:
-        line.append(f"\n    expected {outcome.expected}\n    seen     {outcome.seen}", style="red")
+        expected, seen = escape_controls(outcome.expected), escape_controls(outcome.seen)
+        line.append(f"\n    expected {expected}\n    seen     {seen}", style="red")
     elif outcome.status in (SKIPPED, NOT_RUN):
-        line.append(f"  {outcome.seen}", style="yellow")
+        line.append(f"  {escape_controls(outcome.seen)}", style="yellow")
     console.print(line, soft_wrap=True)
 
 
@@ -131,7 +133,7 @@ def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> Non
         areas=f"<table><tr>{heads}</tr>{''.join(rows)}</table>",
         details="".join(_area_table(area, outcomes) for area in areas_of(outcomes)),
     )
-    write_report(path, text.encode())
+    write_report(path, text.encode(errors="replace"))
 
 
 def _area_table(area: str, outcomes: Sequence[Outcome]) -> str:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import threading
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,6 +27,8 @@ _BMP: Final = b"BM"
 SUFFIXES: Final = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 _FORMATS_OF_8_BITS: Final = {".jpg": "JPEG", ".jpeg": "JPEG", ".bmp": "BMP"}
 _CHUNK_FRAME: Final = 12
+_STDERR: Final = 2
+_stderr_lock: Final = threading.Lock()
 _GREY_WEIGHTS: Final = np.array([0.114, 0.587, 0.299])
 """Weights of blue, green and red in the luma of ITU-R BT.601."""
 
@@ -172,6 +178,26 @@ def _png_is_whole(content: bytes) -> bool:
     return False
 
 
+@contextlib.contextmanager
+def _without_stderr() -> Iterator[None]:
+    """Discard what is written to stderr: libpng reports errors and warnings there, and OpenCV cannot turn that off.
+
+    This includes other threads, for the few milliseconds that it takes to decode an image.
+    """
+    with _stderr_lock, contextlib.ExitStack() as stack:
+        try:
+            kept = os.dup(_STDERR)
+        except OSError:  # there is no stderr
+            yield
+            return
+        stack.callback(os.close, kept)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        stack.callback(os.close, nowhere)
+        os.dup2(nowhere, _STDERR)
+        stack.callback(os.dup2, kept, _STDERR)
+        yield
+
+
 def _decode(source: Path, content: bytes) -> NDArray[Any]:
     """Decode the pixels (height, width) or (height, width, channels) as stored."""
     import cv2
@@ -180,7 +206,8 @@ def _decode(source: Path, content: bytes) -> NDArray[Any]:
     level = log.getLogLevel()
     log.setLogLevel(0)
     try:
-        pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+        with _without_stderr() if content.startswith(_PNG) else contextlib.nullcontext():
+            pixels = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise StaridError(f"image {source}: cannot be decoded ({error.err}); convert it to PNG") from None
     finally:

@@ -175,6 +175,32 @@ def test_a_damaged_chunk_is_named(tmp_path):
         list(run_campaign(CampaignPlan(frames=1, seed=11), folder=tmp_path))
 
 
+def test_a_chunk_that_was_changed_or_copied_from_another_place_is_rejected(tmp_path):
+    def plan(seed):
+        return asdict(CampaignPlan(frames=4, seed=seed, chunk=2))
+
+    rows = np.zeros(2, RECORD)
+    store, other = open_store(tmp_path / "a", plan(1)), open_store(tmp_path / "b", plan(2))
+    store.save("chunk-000000", {"rows": rows})
+    other.save("chunk-000000", {"rows": rows})
+    assert list(store.load("chunk-000000")) == ["rows"]
+    with np.load(store.file("chunk-000000")) as stored:
+        fewer = {**stored, "rows": stored["rows"][:1]}
+    np.savez_compressed(tmp_path / "fewer.npz", **fewer)
+    np.savez_compressed(tmp_path / "plain.npz", rows=rows)
+    for source, part in (
+        (store.file("chunk-000000"), "chunk-000001"),
+        (other.file("chunk-000000"), "chunk-000000"),
+        (tmp_path / "fewer.npz", "chunk-000000"),
+        (tmp_path / "plain.npz", "chunk-000000"),
+    ):
+        store.file(part).write_bytes(source.read_bytes())
+        with pytest.raises(
+            StaridError, match=rf"{part}\.npz .* not written by this campaign.* remove it to compute it again"
+        ):
+            store.load(part)
+
+
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_the_blocked_share_of_the_image_is_black(share):
     image = np.full((200, 300), 9, np.uint8)

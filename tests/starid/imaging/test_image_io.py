@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import struct
+import zlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -185,3 +188,55 @@ def test_public_names_are_available_from_the_package() -> None:
     assert "load_catalog" in dir(starid)
     with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
         _ = starid.nonsense
+
+
+def png(*chunks: tuple[bytes, bytes], depth: int = 8) -> bytes:
+    """A PNG of 8×8 grey pixels with the given chunks between head and end; every checksum is correct."""
+    head = struct.pack(">IIBBBBB", 8, 8, depth, 0, 0, 0, 0)
+    parts = [
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in ((b"IHDR", head), *chunks, (b"IEND", b""))
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+ROWS = b"".join(b"\0" + bytes(range(row, row + 8)) for row in range(8))
+DAMAGED = {
+    "short": png((b"IDAT", zlib.compress(ROWS[:20]))),
+    "not zlib": png((b"IDAT", b"stars")),
+    "filter": png((b"IDAT", zlib.compress(b"\x09" + ROWS[1:]))),
+    "depth": png((b"IDAT", zlib.compress(ROWS)), depth=7),
+    "no data": png(),
+}
+
+
+@pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
+def test_a_damaged_png_is_rejected_without_lines_of_the_decoder(content, tmp_path, capfd):
+    file = tmp_path / "a.png"
+    file.write_bytes(content)
+    with pytest.raises(StaridError, match="truncated or damaged"):
+        read_image(file)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_png_with_a_damaged_optional_chunk_is_read_without_lines_of_the_decoder(tmp_path, capfd):
+    file = tmp_path / "a.png"
+    file.write_bytes(png((b"gAMA", b"xx"), (b"IDAT", zlib.compress(ROWS))))
+    assert read_image(file).tolist()[7] == list(range(7, 15))
+    assert capfd.readouterr() == ("", "")
+
+
+def test_stderr_works_after_images_are_read_in_many_threads_or_without_stderr(tmp_path, capfd):
+    file = tmp_path / "a.png"
+    file.write_bytes(png((b"IDAT", zlib.compress(ROWS))))
+    with ThreadPoolExecutor(8) as threads:
+        assert len({image.tobytes() for image in threads.map(read_image, [file] * 200)}) == 1
+    os.write(2, b"still here")
+    assert capfd.readouterr().err == "still here"
+    kept = os.dup(2)
+    try:
+        os.close(2)
+        assert read_image(file).shape == (8, 8)
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -1,0 +1,214 @@
+"""Peers that open many connections, or send half a request, do not hold up the run or fill the log."""
+
+import asyncio
+import errno
+import logging
+import resource
+import subprocess
+import sys
+import time
+
+import aiohttp
+import pytest
+
+from starhil.emulator.console import server
+from starhil.emulator.guard import log_loop_errors_once
+from starhil.emulator.launch import RunOptions
+from starhil.protocol.hub import CanHub
+from tests.emulator.console.pages import OPTIONS, WITHIN_S
+from tests.emulator.runs import Control
+
+DESCRIPTORS = 128
+CONNECTIONS = 130
+
+FLOOD = f"""
+import socket, sys
+port, begin = int(sys.argv[1]), sys.argv[2].encode()
+peers = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range({CONNECTIONS})]
+for peer in peers:
+    try:
+        peer.sendall(begin)
+    except ConnectionError:
+        pass
+print("connected", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def few_descriptors():
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (DESCRIPTORS, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def flood(port, begin):
+    """Hold many connections with the begin of a request from another process."""
+
+    def many_descriptors():
+        hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+
+    command = [sys.executable, "-c", FLOOD, str(port), begin]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    return subprocess.Popen(command, preexec_fn=many_descriptors, **pipes)
+
+
+async def flooded(port, begin, check):
+    """Call `check` while the connections are held."""
+    peers = flood(port, begin)
+    try:
+        async with asyncio.timeout(WITHIN_S):
+            assert await asyncio.to_thread(peers.stdout.readline) == b"connected\n"
+        await asyncio.sleep(1.2)  # asyncio accepts again after a second
+        await check()
+    finally:
+        await asyncio.to_thread(peers.communicate)
+
+
+def view_port(emulation):
+    return int(emulation.ready_fields["view"].split("/")[2].rpartition(":")[2])
+
+
+async def seconds_of_status(control):
+    begin = time.monotonic()
+    async with asyncio.timeout(WITHIN_S):
+        assert (await control.do("status"))["ok"]
+    return time.monotonic() - begin
+
+
+def test_half_sent_requests_on_many_connections_leave_the_control_channel_free(run, few_descriptors, caplog):
+    async def scenario(emulation, _line):
+        async def check():
+            async with Control(emulation) as control:
+                assert await seconds_of_status(control) < 1.0
+
+        log_loop_errors_once(asyncio.get_running_loop())
+        await flooded(view_port(emulation), "GET / HTTP/1.1\r\nHost: x\r\n", check)
+
+    run(scenario, options=OPTIONS)
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == [
+        "console: 16 connections are open, the maximum; further ones are closed, and not logged again"
+    ]
+
+
+def test_many_connections_to_the_control_channel_leave_an_open_one_and_the_console_free(
+    run, few_descriptors, caplog
+):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+
+            async def check():
+                assert await seconds_of_status(control) < 1.0
+                async with Control(emulation) as another:
+                    assert await another.do("status") == {
+                        "ok": False,
+                        "error": "too many connections to the control channel; close others first",
+                    }
+                async with aiohttp.request("GET", emulation.ready_fields["view"]) as page:
+                    assert page.status == 200
+
+            await seconds_of_status(control)
+            port = int(emulation.ready_fields["control"].rpartition(":")[2])
+            await flooded(port, '{"do": ', check)
+
+    run(scenario, options=RunOptions(control="127.0.0.1:0", view="auto", make_client=OPTIONS.make_client))
+    assert [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING] == [
+        "control channel: 16 connections are open, the maximum; further ones are closed, and not logged again"
+    ]
+
+
+def test_a_hub_rejects_clients_above_its_limit_and_serves_the_others(few_descriptors):
+    async def main():
+        hub = CanHub(port=0)
+        await hub.start()
+        reader, writer = await asyncio.open_connection("127.0.0.1", hub.port)
+        assert await reader.readexactly(6) == b"< hi >"
+
+        async def check():
+            assert hub.statistics.clients == 16
+            writer.write(b"< echo >")
+            assert await asyncio.wait_for(reader.readexactly(8), WITHIN_S) == b"< echo >"
+
+        try:
+            await flooded(hub.port, "< open", check)
+            async with asyncio.timeout(WITHIN_S):
+                while hub.statistics.clients > 1:
+                    await asyncio.sleep(0.01)
+        finally:
+            writer.close()
+            await hub.close()
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("begin", "end"),
+    [
+        ("", b""),
+        ("GET / HTTP/1.1\r\nHost: x\r\n", b""),
+        ("POST /runs?{} HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n{{", b"HTTP/1.1 408"),
+    ],
+    ids=["nothing", "headers", "body"],
+)
+def test_a_half_sent_request_is_closed_after_a_time(run, monkeypatch, begin, end):
+    monkeypatch.setattr(server, "REQUEST_S", 0.3)
+
+    async def scenario(emulation, _line):
+        reader, writer = await asyncio.open_connection("127.0.0.1", view_port(emulation))
+        writer.write(begin.format(emulation.ready_fields["view"].partition("?")[2]).encode())
+        answer = await asyncio.wait_for(reader.read(), WITHIN_S)
+        assert answer.startswith(end)
+        assert bool(answer) == bool(end)
+        writer.close()
+
+    run(scenario, options=OPTIONS)
+
+
+def test_an_error_of_the_event_loop_is_logged_once(caplog):
+    async def main():
+        loop = asyncio.get_running_loop()
+        log_loop_errors_once(loop)
+        full = OSError(errno.EMFILE, "Too many open files")
+        for _ in range(100):
+            loop.call_exception_handler(
+                {"message": "socket.accept() out of system resource", "exception": full}
+            )
+        loop.call_exception_handler({"message": "another"})
+
+    asyncio.run(main())
+    assert [record.getMessage() for record in caplog.records] == [
+        "event loop: socket.accept() out of system resource: OSError: [Errno 24] Too many open files",
+        "event loop: another",
+    ]
+
+
+@pytest.mark.parametrize(
+    "request_", [b"GET / HTTP/9.9\r\n\r\n", b"GET / HTTP/1.1\r\nA B: c\r\n\r\n", b"GET /" + bytes(9000)]
+)
+def test_a_request_that_is_not_http_is_answered_and_not_logged(run, caplog, request_):
+    async def scenario(emulation, _line):
+        reader, writer = await asyncio.open_connection("127.0.0.1", view_port(emulation))
+        writer.write(request_)
+        assert (await asyncio.wait_for(reader.read(), WITHIN_S)).startswith(b"HTTP/1.0 400 ")
+        writer.close()
+
+    run(scenario, options=OPTIONS)
+    assert not [record for record in caplog.records if record.levelno >= logging.WARNING]
+
+
+def test_an_internal_error_of_the_console_is_logged(run, caplog, monkeypatch):
+    async def fail(_request):
+        raise KeyError("stars")
+
+    monkeypatch.setattr(server, "_page", fail)
+
+    async def scenario(emulation, _line):
+        async with aiohttp.request("GET", emulation.ready_fields["view"]) as page:
+            assert page.status == 500
+
+    run(scenario, options=OPTIONS)
+    assert [record.levelno for record in caplog.records if record.levelno >= logging.WARNING] == [
+        logging.ERROR
+    ]
