@@ -259,7 +259,8 @@ class LifeGenerator:
         row = self._random.choice(rows)
         match self._random.randrange(3):
             case 0:
-                known = {other.id for other in rows if other.klass == row.klass}
+                on_wire = any(item.code is not None for item in self._icd.classes)
+                known = {other.id for other in rows if not on_wire or other.klass == row.klass}
                 unknown = [number for number in range(256) if number not in known]
                 number = self._random.choice(unknown) if unknown else row.id
                 kind = row.kind if self._icd.classes else self._icd.kind_of_id(number).value
