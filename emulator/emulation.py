@@ -22,7 +22,6 @@ from starhil.emulator.guard import close_all
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.error_model import ErrorModelImager
 from starhil.emulator.pipeline.imager import PipelineImager, ProcessImager, ThreadImager
 from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
 from starhil.emulator.pipeline.worker_process import WorkerProcess
@@ -155,6 +154,8 @@ class Emulation:
         if worker is not None:
             worker.end()
         if self.profile.run.worker == "error_model":
+            from starhil.emulator.pipeline.error_model import ErrorModelImager
+
             return ErrorModelImager(setup)
         return ThreadImager(setup)
 
