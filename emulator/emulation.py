@@ -22,7 +22,7 @@ from starhil.emulator.guard import close_all
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
-from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.imager import PipelineImager, ProcessImager, ThreadImager
 from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
@@ -102,7 +102,7 @@ class Emulation:
         self.clock: Clock = make_clock(profile.run.clock) if leader is None else leader.clock
         if tape is not None:
             self.clock = tape.clock
-        self.imager: ProcessImager | ThreadImager = self._make_imager(worker)
+        self.imager: PipelineImager = self._make_imager(worker)
         self._requests: Requests | None = None
         self.serial: SerialLink | None = None
         self.can: CanLink | None = None
@@ -145,7 +145,7 @@ class Emulation:
         """
         return self.requests.device
 
-    def _make_imager(self, worker: WorkerProcess | None) -> ProcessImager | ThreadImager:
+    def _make_imager(self, worker: WorkerProcess | None) -> PipelineImager:
         setup = replace(
             pipeline_setup(self.profile, repeatable=self.tape is not None), previews=self._previews
         )
@@ -153,6 +153,10 @@ class Emulation:
             return ProcessImager(setup, worker or WorkerProcess())
         if worker is not None:
             worker.end()
+        if self.profile.run.worker == "error_model":
+            from starhil.emulator.pipeline.error_model import ErrorModelImager
+
+            return ErrorModelImager(setup)
         return ThreadImager(setup)
 
     async def open(self) -> None:

@@ -53,8 +53,9 @@ class RunConfig(Strict):
     """`real`, `scaled:FACTOR` or `stepped` (advances only by `step` on the control channel)."""
     algorithm: Literal["geometric", "lsi", "rsi"] = "geometric"
     """Star identification algorithm: `geometric`, or one of the thesis (`lsi`, `rsi`)."""
-    worker: Literal["process", "thread"] = "process"
-    """Whether frames are rendered and solved in a worker process or in a thread of the emulator."""
+    worker: Literal["process", "thread", "error_model"] = "process"
+    """Whether frames are rendered and solved in a worker process or in a thread of the emulator, or replaced by an
+    error model: attitudes are the truth with noise, and there are no images of the sky."""
     state_dir: str = ""
     """Folder for state that survives a restart: saved parameters, boot count, CANopen settings. Empty: no
     state is kept."""

@@ -119,13 +119,13 @@ class StepPump:
         self._clock = clock
         self._time_passes = time_passes
         self._imagers = [imager for _, imager in devices]
-        self._transports = transports
+        self._transports = [transport for transport in transports if not transport.immediate]
         self._stalled: dict[Transport[Any], int] = {}
         """Transports for which steps do not wait, with the items sent when the peer stopped reading."""
         self._lock = asyncio.Lock()
 
-    async def step(self, seconds: float) -> None:
-        """Advance simulation time; on return, all events within the step are done.
+    async def step(self, seconds: float) -> int:
+        """Advance simulation time; on return, all events within the step are done. Return their number.
 
         Raises
         ------
@@ -137,14 +137,17 @@ class StepPump:
         await self._time_passes.wait()
         async with self._lock:
             end_ns = self._clock.now_ns() + round(seconds * NANOSECONDS)
+            events = 0
             await self._settle()
             while (event := self._pop_next(end_ns)) is not None:
+                events += 1
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
                 if self._tape is not None:
                     self._tape.write("event")
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
             self._clock.set_ns(end_ns)
+            return events
 
     def _pop_next(self, end_ns: int) -> Event | None:
         """Remove and return the earliest event of all devices that is due at `end_ns`, or None."""

@@ -155,6 +155,8 @@ def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
 
 def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     values = profile.model_dump(mode="json")
+    # what the profile does not set is the unit's, which may have no dialects and another bit rate
+    values["links"]["serial"] = profile.links.serial.model_dump(mode="json", exclude_unset=True)
     if isinstance(profile.truth, FileConfig):
         shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
         values["truth"]["path"] = TRUTH_SOURCE_FILE

@@ -15,7 +15,7 @@ from typing import Final
 from starhil.emulator.device.device import PIPELINE_ENDED, Device
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
-from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
+from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.messages import PipelineReady
 
 log = logging.getLogger("starhil.run")
@@ -36,7 +36,7 @@ class PipelineRevival:
     """
 
     def __init__(
-        self, imager: ProcessImager | ThreadImager, device: Device, ready: Callable[[PipelineReady], None]
+        self, imager: PipelineImager, device: Device, ready: Callable[[PipelineReady], None]
     ) -> None:
         self._imager = imager
         self._device = device

@@ -37,6 +37,7 @@ COMMANDS: Final[dict[str, str]] = {
     "render": "render",
     "identify": "identify",
     "campaign": "campaign",
+    "endurance": "endurance",
     "catalog": "catalog",
     "calibrate": "calibrate",
     "session": "session",

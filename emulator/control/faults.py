@@ -166,7 +166,7 @@ class Faults:
         EmulatorError
             A name is unknown, or the run has no such link.
         """
-        enums = self._device.icd.enums
+        enums = self._device.icd.model.enums
         if request.device is not None:
             errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
             for key, name, known in (

@@ -39,6 +39,11 @@ class Scheduler:
         self.on_add: Callable[[], None] | None = None
         """Called when an event has been added, so that a sleeping loop can wake up earlier."""
 
+    @property
+    def count(self) -> int:
+        """Number of events in the queue, cancelled ones included."""
+        return len(self._queue)
+
     def at(self, due_ns: int, action: Action) -> Event:
         """Schedule an action at a simulation time, nanoseconds."""
         event = Event(due_ns, next(self._order), action)

@@ -55,6 +55,27 @@ class Imager(Protocol):
         ...
 
 
+class PipelineImager(Imager, Protocol):
+    """An image pipeline that can be started, and started again after an unexpected end."""
+
+    on_failure: Callable[[str], None] | None
+    """Called with the reason if the pipeline ends after it was ready; a failed start raises instead."""
+    watchers: set[object]
+    """Viewers of the frames; frames come with a preview unless this is empty."""
+
+    async def start(self) -> PipelineReady:
+        """Wait until the pipeline is ready; raise EmulatorError with the reason if it fails, in one line."""
+        ...
+
+    async def restart(self) -> PipelineReady:
+        """Start the pipeline again after it has ended, and wait until it is ready."""
+        ...
+
+    async def close(self) -> None:
+        """End the pipeline and wait for it."""
+        ...
+
+
 class _RequestQueue:
     """Callbacks of pending requests, in order, and the future that reports the start of the pipeline."""
 

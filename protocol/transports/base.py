@@ -48,6 +48,9 @@ class Statistics:
 class Transport(ABC, Generic[Item]):
     """A port or bus in the running event loop; callbacks run in the loop's thread."""
 
+    immediate: ClassVar[bool] = False
+    """Whether an item has arrived when `send` returns, so that `drain` has nothing to wait for."""
+
     def __init__(self, description: str, statistics: Statistics | None = None) -> None:
         self.description = description
         """Specification that opens the same port again; valid once started."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import selectors
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +12,7 @@ from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore
+from starhil.emulator.endurance.simulated_loop import SimulatedLoop
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
@@ -41,31 +41,6 @@ from tests.protocol.canopen.conftest import import_eds
 BAUD = 115200
 BOUND_S = 0.0005
 """A turn of the loop that waits for nothing takes this long, so that simulated time goes on."""
-
-
-class _Selector(selectors.SelectSelector):
-    """Never waits: time that would be waited is put on the clock."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.time = 0.0
-
-    def select(self, timeout: float | None = None) -> list:
-        events = super().select(0)
-        if not events and timeout is not None:
-            self.time += timeout
-        return events
-
-
-class SimulatedLoop(asyncio.SelectorEventLoop):
-    """An event loop whose time passes only while everybody waits."""
-
-    def __init__(self) -> None:
-        self._simulated = _Selector()
-        super().__init__(self._simulated)
-
-    def time(self) -> float:
-        return self._simulated.time
 
 
 class LoopClock:

@@ -11,6 +11,7 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
+from starhil.emulator.profile import Profile
 from starhil.emulator.replay import replay
 from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
 from starhil.hil_tests.async_client import AsyncObcClient
@@ -111,6 +112,23 @@ def test_can_frames_and_canopen_are_repeated(record):
     assert report.differences == []
     assert report.sent["can"] > 8
     assert report.sent["canopen"] >= 1
+
+
+def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+        )
+        await client.start()
+        for _ in range(5):
+            await client.telemetry("solution")
+        await client.close()
+
+    folder = record(scenario, unit="sagitta")
+    assert report_of(folder).differences == []
+    run = json.loads((folder / RUN_FILE).read_text())
+    given = Profile.model_validate(run["profile"]).links.serial.model_fields_set
+    assert given.isdisjoint({"dialect", "baud"})
 
 
 @pytest.mark.parametrize("clock", ["real", "stepped"])

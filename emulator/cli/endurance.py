@@ -1,0 +1,255 @@
+"""`starhil endurance`: random lives of units in simulated time, judged by an oracle."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import resource
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+import typer
+
+from starhil.emulator.cli.options import AsJson
+
+IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
+"""Folder for the state of the units, if there is one: a stored parameter then costs no time on a disk."""
+RENDERED_STEPS: Final = 40
+"""Steps of a life whose images are rendered."""
+SIGMA_ARCSEC: Final = {False: (10.0, 33.0), True: (60.0, 300.0)}
+"""Largest standard deviations across and about the boresight of the error model, and of rendered images."""
+YEAR_S: Final = 365.25 * 86_400.0
+
+
+def command(
+    unit: Annotated[
+        list[str] | None,
+        typer.Option(help="Unit: a name or a folder. Repeatable; default: all bundled units in turns."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first life; the others follow.")] = 1,
+    lives: Annotated[int, typer.Option(min=1, help="Number of lives.")] = 60,
+    hours: Annotated[
+        float | None, typer.Option(min=0.001, help="Start lives for this time instead of a number of them.")
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a life.")] = 400,
+    rendered: Annotated[
+        int, typer.Option(min=0, help="One life in this number is rendered and solved; 0: none.")
+    ] = 100,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    life: Annotated[
+        Path | None, typer.Option(help="Repeat one life, a file that an earlier run has written.")
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Folder for lives that end in a violation.")
+    ] = Path("out/endurance"),
+    as_json: AsJson = False,
+) -> None:
+    """Let units live random lives in simulated time; an oracle that knows only the bus judges them.
+
+    Requests valid and invalid on every link, faults, resets, power cycles, full disks, tumbles. A life that ends in
+    a violation is shortened and written to -o as a life, a session and a recording. The exit status is 1 if
+    there is one.
+    """
+    from starhil.protocol.unit_folders import bundled_units
+
+    if life is not None:
+        found = read_life(life)
+        outcomes = [live(found.unit, found, rendered=False, folder=output)]
+    else:
+        plan = _plan(
+            unit or sorted(bundled_units()), seed, None if hours is not None else lives, steps, rendered
+        )
+        outcomes = list(_run(plan, output, jobs, lives, hours))
+    figures = summary(outcomes)
+    if as_json:
+        print(json.dumps({**figures, "violations": [item for item in outcomes if item["violation"]]}))
+    else:
+        _print(figures, outcomes)
+    if any(item["violation"] for item in outcomes):
+        raise typer.Exit(1)
+
+
+def _plan(
+    units: list[str], seed: int, lives: int | None, steps: int, rendered: int
+) -> Iterator[tuple[str, int, int, bool]]:
+    number = 0
+    while lives is None or number < lives:
+        whole = rendered > 0 and number % rendered == rendered - 1
+        yield units[number % len(units)], seed + number, RENDERED_STEPS if whole else steps, whole
+        number += 1
+
+
+def _run(
+    plan: Iterator[tuple[str, int, int, bool]], folder: Path, jobs: int, lives: int, hours: float | None
+) -> Iterator[dict[str, Any]]:
+    """Run the lives of a plan in processes, until its end or that of the time."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    begin = time.monotonic()
+    total = lives if hours is None else hours * 3600.0
+    with (
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+        Progress(console=Console(stderr=True)) as progress,
+    ):
+        task = progress.add_task("endurance", total=total)
+        running: set[Future[dict[str, Any]]] = set()
+        done = 0
+        while True:
+            in_time = hours is None or time.monotonic() - begin < hours * 3600.0
+            while in_time and len(running) < 2 * jobs and (item := next(plan, None)) is not None:
+                running.add(pool.submit(live_from_seed, *item, folder))
+            if not running:
+                return
+            ended, running = wait(running, return_when=FIRST_COMPLETED)
+            done += len(ended)
+            progress.update(task, completed=done if hours is None else time.monotonic() - begin)
+            for future in ended:
+                yield future.result()
+
+
+def live_from_seed(unit: str, seed: int, steps: int, rendered: bool, folder: Path) -> dict[str, Any]:
+    """Generate a life and live it."""
+    from starhil.emulator.endurance.unit_under_test import links_of
+    from starhil.hil_tests.endurance.life import make_life
+    from starhil.protocol.icd import load_unit
+
+    icd = load_unit(unit)
+    return live(unit, make_life(icd, unit, links_of(icd), seed, steps), rendered=rendered, folder=folder)
+
+
+def live(unit: str, life: Any, *, rendered: bool, folder: Path) -> dict[str, Any]:
+    """Live a life; if it ends in a violation, shorten it and write it to the folder."""
+    from starhil.hil_tests.endurance.shrink import kind_of, shortened
+
+    logging.getLogger("starhil").addHandler(logging.NullHandler())
+    logging.getLogger("starhil").propagate = False
+    begin = time.process_time()
+    outcome = run_once(life, rendered=rendered)
+    figures = {
+        "unit": unit, "seed": life.seed, "rendered": rendered, **asdict(outcome),
+        "cpu_s": time.process_time() - begin,
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    }  # fmt: skip
+    if outcome.violation:
+        kind = kind_of(outcome.violation)
+        upto = replace(life, steps=life.steps[: outcome.step + 1])
+        short = (
+            upto if rendered else shortened(upto, lambda other: kind_of(run_once(other).violation) == kind)
+        )
+        figures["steps"] = len(short.steps)
+        figures["files"] = [str(path) for path in write_life(short, outcome.violation, folder)]
+    return figures
+
+
+def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -> Any:
+    """Live a life once and return its outcome."""
+    from starhil.emulator.endurance.simulated_loop import SimulatedLoop
+    from starhil.emulator.endurance.unit_under_test import UnitUnderTest
+    from starhil.hil_tests.endurance.run import LifeRun
+    from starhil.protocol.icd import load_unit
+
+    icd = load_unit(life.unit)
+    with tempfile.TemporaryDirectory(dir=IN_MEMORY if IN_MEMORY.is_dir() else None) as folder:
+        loop = SimulatedLoop()
+        asyncio.set_event_loop(loop)
+        unit = UnitUnderTest(
+            icd,
+            life.unit,
+            life.links,
+            life.profile,
+            life.seed,
+            Path(folder),
+            rendered=rendered,
+            record=record,
+        )
+        try:
+            return loop.run_until_complete(LifeRun(life, icd, unit, SIGMA_ARCSEC[rendered]).run())
+        finally:
+            unit.dispose()
+            loop.close()
+            asyncio.set_event_loop(None)
+
+
+# --- files ---
+
+
+def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
+    """Write a life as JSON, as a session, and as the recording of its last time under power."""
+    from starhil.hil_tests.endurance.session_text import session_of
+    from starhil.protocol.icd import load_unit
+
+    name = f"{Path(life.unit).name}-{life.seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    file, session, recording = folder / f"{name}.json", folder / f"{name}.toml", folder / f"{name}-recording"
+    file.write_text(json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n", encoding="utf-8")
+    session.write_text(session_of(life, load_unit(life.unit), violation), encoding="utf-8")
+    run_once(life, record=recording)
+    return [file, session, recording]
+
+
+def read_life(path: Path) -> Any:
+    """Read a life that `write_life` has written."""
+    from starhil.emulator.errors import EmulatorError
+    from starhil.hil_tests.endurance.life import Life
+    from starhil.protocol.user_file import read_user_text
+
+    try:
+        content = json.loads(read_user_text(path))
+        links, steps = tuple(content["links"]), tuple(content["steps"])
+        return Life(content["unit"], content["seed"], links, content["profile"], steps)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
+
+
+# --- figures ---
+
+
+def summary(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return device-years, counts and the ratio of device time to processor time, in all and by unit."""
+    by_unit = {unit: _of(group) for unit, group in _grouped(outcomes).items()}
+    return {**_of(outcomes), "units": by_unit}
+
+
+def _grouped(outcomes: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
+    groups: dict[str, list[dict[str, Any]]] = {}
+    for item in outcomes:
+        groups.setdefault(item["unit"], []).append(item)
+    return dict(sorted(groups.items()))
+
+
+def _of(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
+    device_s, cpu_s = sum(item["device_s"] for item in outcomes), sum(item["cpu_s"] for item in outcomes)
+    return {
+        "lives": len(outcomes),
+        "device_years": device_s / YEAR_S,
+        "factor": device_s / max(cpu_s, 1e-9),
+        "requests": sum(item["requests"] for item in outcomes),
+        "readings": sum(item["readings"] for item in outcomes),
+        "attitudes": sum(item["attitudes"] for item in outcomes),
+        "violating": sum(bool(item["violation"]) for item in outcomes),
+    }
+
+
+def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    columns = ("lives", "device_years", "factor", "requests", "readings", "attitudes", "violating")
+    table = Table("unit", *(name.replace("_", " ") for name in columns))
+    for name, row in [*figures["units"].items(), ("all", figures)]:
+        table.add_row(
+            name, *(f"{row[key]:.4g}" if isinstance(row[key], float) else str(row[key]) for key in columns)
+        )
+    Console().print(table)
+    for item in outcomes:
+        if item["violation"]:
+            print(f"{item['unit']} seed {item['seed']}: {item['violation']}")
+            print(f"  {item['steps']} steps; {' '.join(item['files'])}")

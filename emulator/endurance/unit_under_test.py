@@ -1,0 +1,374 @@
+"""A unit that runs in memory on the stepped clock: power, surroundings and the device's end of its links."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import resource
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Final, TypeVar
+
+from pydantic import TypeAdapter
+
+from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
+from starhil.emulator.control.faults import FaultRequest, Faults
+from starhil.emulator.device.device import Background
+from starhil.emulator.emulation import Emulation
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.error_model import ErrorModelImager
+from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.profile import Profile
+from starhil.emulator.pump import MAX_STEP_S, StepPump
+from starhil.emulator.replay import prepare_recording
+from starhil.emulator.tape import TRUTH_FILE, Recorder
+from starhil.emulator.truth.config import TruthConfig
+from starhil.emulator.truth_log import TruthLog
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.transports.base import Transport
+from starhil.protocol.transports.paced import SerialTransport
+
+Item = TypeVar("Item", bytes, CanFrame)
+
+STATE_FOLDER: Final = "state"
+TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
+
+
+class MemoryTransport(Transport[Item]):
+    """The device's end of a link without a wire.
+
+    Attributes
+    ----------
+    sent
+        Items that the device has sent and nobody has taken.
+    reads
+        Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader.
+    """
+
+    immediate: ClassVar[bool] = True
+
+    def __init__(self, description: str) -> None:
+        super().__init__(description)
+        self.sent: list[Item] = []
+        self.reads = True
+
+    async def _open(self) -> None:
+        """Do nothing: there is no port."""
+
+    def send(self, item: Item) -> bool:
+        """Keep an item for the peer."""
+        count = len(item) if isinstance(item, bytes) else 1
+        if not self.reads:
+            self.statistics.dropped += count
+            return False
+        self.statistics.sent += count
+        self.sent.append(item)
+        return True
+
+    def deliver(self, item: Item) -> None:
+        """Pass an item to the device."""
+        self._receive(item)
+
+    async def drain(self) -> None:
+        """Return at once: nothing waits."""
+
+    async def close(self) -> None:
+        """Do nothing: there is no port."""
+
+
+class MemorySerial(MemoryTransport[bytes], SerialTransport):
+    """The device's end of a serial line."""
+
+    def set_baud(self, baud: int) -> None:
+        """Do nothing: bytes take no time."""
+
+
+class MemoryTape:
+    """Connects an emulation to transports in memory, and records it if a recorder is given."""
+
+    plays: Final = False
+
+    def __init__(
+        self, port: MemorySerial, buses: Mapping[str, MemoryTransport[CanFrame]], recorder: Recorder | None
+    ) -> None:
+        self.port = port
+        self._buses = buses
+        self._recorder = recorder
+        self.clock: Clock = SteppedClock() if recorder is None else recorder.clock
+
+    def begin(self) -> None:
+        """Begin: time passes."""
+        if self._recorder is not None:
+            self._recorder.begin()
+
+    def latch(self) -> None:
+        """Do nothing: the clock is stepped."""
+
+    def write(self, kind: str, **values: Any) -> None:
+        """Record an entry."""
+        if self._recorder is not None:
+            self._recorder.write(kind, **values)
+
+    def enter(self, kind: str, **values: Any) -> None:
+        """Record an entry."""
+        self.write(kind, **values)
+
+    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
+        """Return the serial line."""
+        port = self.port
+        return port if self._recorder is None else self._recorder.serial(lambda: port)
+
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (no bus is opened)
+        """Return a CAN bus."""
+        bus = self._buses[name]
+        return bus if self._recorder is None else self._recorder.can(name, lambda: bus)
+
+    def imager(self, inner: Imager) -> Imager:
+        """Return the pipeline."""
+        return inner if self._recorder is None else self._recorder.imager(inner)
+
+    def background(self, inner: Background) -> Background:
+        """Return the function that runs writes."""
+        return inner if self._recorder is None else self._recorder.background(inner)
+
+
+class _InternalErrors(logging.Handler):
+    """Collects what the emulator logs as internal errors."""
+
+    def __init__(self) -> None:
+        super().__init__(logging.ERROR)
+        self.texts: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Keep a message."""
+        self.texts.append(record.getMessage())
+
+
+class UnitUnderTest:
+    """An emulated unit in memory.
+
+    Parameters
+    ----------
+    icd
+        Definition of the unit.
+    unit
+        Its name or folder.
+    links
+        The links to open.
+    profile
+        Keys of the profile.
+    seed
+        Seed of the noise.
+    folder
+        Folder of the state, best in memory (tmpfs).
+    rendered
+        Whether images are rendered and solved; otherwise the pipeline is an error model.
+    record
+        Folder of a recording, which holds the time since power was last switched on.
+
+    """
+
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        unit: str,
+        links: tuple[str, ...],
+        profile: Mapping[str, Any],
+        seed: int,
+        folder: Path,
+        *,
+        rendered: bool = False,
+        record: Path | None = None,
+    ) -> None:
+        self.links = links
+        run = {
+            **profile.get("run", {}),
+            "seed": seed,
+            "clock": "stepped",
+            "worker": "thread" if rendered else "error_model",
+            "state_dir": str(folder.resolve() / STATE_FOLDER),
+        }
+        channels: dict[str, Any] = {
+            "serial": {"port": "auto" if "serial" in links else "off"},
+            "can": {"channel": "auto" if "can" in links or icd.canopen_only else "off"},
+            "canopen": {"node": node_of(icd) if "canopen" in links else 0},
+        }
+        self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
+        self._folder = folder
+        self._record = record
+        self._recorder: Recorder | None = None
+        self._truth_log: TruthLog | None = None
+        self._emulation: Emulation | None = None
+        self._faults: Faults | None = None
+        self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
+        self._transports: dict[str, MemoryTransport[Any]] = {}
+        self._errors = _InternalErrors()
+        logging.getLogger("starhil.internal").addHandler(self._errors)
+
+    @property
+    def emulation(self) -> Emulation:
+        """The emulation; power must be on."""
+        if self._emulation is None:
+            raise EmulatorError("endurance: power is off")
+        return self._emulation
+
+    @property
+    def faults(self) -> Faults:
+        """The faults of the unit; power must be on."""
+        if self._faults is None:
+            raise EmulatorError("endurance: power is off")
+        return self._faults
+
+    # --- power ---
+
+    async def power_on(self) -> None:
+        """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
+        reads = {name: transport.reads for name, transport in self._transports.items()}
+        port = MemorySerial("serial")
+        buses: dict[str, MemoryTransport[CanFrame]] = {
+            name: MemoryTransport(name) for name in ("can", "canopen")
+        }
+        self._transports = {"serial": port, **buses}
+        for name, transport in self._transports.items():
+            transport.reads = reads.get(name, True)
+        if self._record is not None:
+            shutil.rmtree(self._record, ignore_errors=True)
+            prepare_recording(self._record, self.profile, "")
+            self._recorder = Recorder(self._record, SteppedClock())
+            self._recorder.open()
+        tape = MemoryTape(port, buses, self._recorder)
+        self._emulation = Emulation(self.profile, tape=tape)
+        await self._emulation.open()
+        self._faults = Faults(self._emulation.device, self._emulation.links)
+        if self._recorder is not None:
+            path = self._recorder.folder / TRUTH_FILE
+            self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
+            self._emulation.device.on_frame.append(self._truth_log.write)
+        self._emulation.begin()
+        await self._emulation.ready()
+
+    async def power_off(self, *, factory: bool = False) -> None:
+        """Switch the unit off; `factory` deletes its stored state."""
+        if self._recorder is not None:
+            self._recorder.end()
+        await self.emulation.close()
+        files = (getattr(self._recorder, "file", None), getattr(self._truth_log, "file", None))
+        for file in files:
+            if file is not None:
+                file.close()
+        if factory:
+            shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
+
+    # --- time and links ---
+
+    @property
+    def now_s(self) -> float:
+        """Simulation time since power was switched on, seconds."""
+        return self.emulation.clock.now_ns() / NANOSECONDS
+
+    async def step(self, seconds: float, *, most: int | None = None) -> None:
+        """Let simulation time pass, and the same time of the event loop.
+
+        Parameters
+        ----------
+        seconds
+            Time.
+        most
+            End early after about this many events in the unit.
+        """
+        stepper = self._stepper
+        left, chunk, done = seconds, seconds if most is None else 1.0, 0
+        while left > 0.0:
+            chunk = min(left, chunk, MAX_STEP_S)
+            done += await stepper.step(chunk)
+            await asyncio.sleep(chunk)
+            left -= chunk
+            if most is not None and done >= most:
+                break
+            chunk *= 2.0 if most is None or done < most // 4 else 1.0
+
+    @property
+    def _stepper(self) -> StepPump:
+        stepper = self.emulation.stepper
+        if stepper is None:
+            raise EmulatorError("endurance: the clock is not stepped")
+        return stepper
+
+    def deliver(self, link: str, item: bytes | CanFrame) -> None:
+        """Pass bytes or a frame to the device."""
+        self._transports[link].deliver(item)
+
+    def take(self, link: str) -> list[Any]:
+        """Return what the device has sent on a link since the last call."""
+        sent = self._transports[link].sent
+        taken = list(sent)
+        sent.clear()
+        return taken
+
+    # --- surroundings ---
+
+    async def set_truth(self, truth: Mapping[str, Any]) -> None:
+        """Replace the truth by a table as `[truth]` in a profile."""
+        await self.emulation.change_truth(TRUTH.validate_python(dict(truth)))
+
+    def fault(self, fault: Mapping[str, Any]) -> None:
+        """Inject faults, a request as on the control channel."""
+        request = FaultRequest.model_validate(dict(fault))
+        if self._recorder is not None:
+            self._recorder.enter("fault", request=request.model_dump(mode="json"))
+        self.faults.inject(request)
+
+    def clear_faults(self) -> None:
+        """End all faults."""
+        if self._recorder is not None:
+            self._recorder.enter("clear_faults")
+        self.faults.clear()
+
+    def end_pipeline(self) -> None:
+        """End the image pipeline, as the death of its process does."""
+        imager = self.emulation.imager
+        if isinstance(imager, ErrorModelImager):
+            imager.end("pipeline: ended by an endurance run")
+
+    def set_disk(self, *, full: bool) -> None:
+        """Set whether this process can write to files; by the kernel, so that it concerns every writer."""
+        _, hard = self._unlimited
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard) if full else self._unlimited)
+
+    def set_peer(self, link: str, *, reads: bool) -> None:
+        """Set whether the peer of a link reads."""
+        self._transports[link].reads = reads
+
+    # --- what the bus does not show ---
+
+    def internal_errors(self) -> list[str]:
+        """Return the internal errors logged since the last call."""
+        found, self._errors.texts = self._errors.texts, []
+        return found
+
+    def open_descriptors(self) -> int:
+        """Return the number of open file descriptors of this process."""
+        return len(list(Path("/proc/self/fd").iterdir()))
+
+    def queued_events(self) -> int:
+        """Return the number of events in the queue of the device."""
+        return self.emulation.device.scheduler.count
+
+    def dispose(self) -> None:
+        """Remove the log handler and the limit of files."""
+        logging.getLogger("starhil.internal").removeHandler(self._errors)
+        self.set_disk(full=False)
+
+
+def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:
+    """Return the names of a unit's links."""
+    there = {"serial": icd.link.serial is not None, "can": icd.link.can is not None}
+    there["canopen"] = icd.canopen is not None
+    return tuple(name for name, present in there.items() if present)
+
+
+def node_of(icd: InterfaceDefinition) -> int:
+    """Return the CANopen node ID of a unit."""
+    return int(icd.device_parameters["canopen_node"].default)

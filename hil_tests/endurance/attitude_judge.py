@@ -1,0 +1,186 @@
+"""Whether an attitude may be reported as valid, and how far from the truth it may be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+from starhil.hil_tests.endurance.truth import (
+    IDENTITY,
+    Error,
+    Motion,
+    Quaternion,
+    conjugate,
+    frame_turned,
+    of_matrix,
+    product,
+)
+from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
+from starhil.protocol.codec import Field
+from starhil.protocol.conventions import Conventions
+from starhil.protocol.units_of_measure import factor
+from starhil.protocol.values import Value
+
+SIGMAS: Final = 6.0
+"""A valid attitude is within this many of its stated standard deviations of the truth."""
+PROCESSING_S: Final = 1.0
+"""Longest time from the end of an exposure to its result."""
+STALE_PERIODS: Final = 3
+STALE_S: Final = 2.0
+"""An attitude is not reported longer than `STALE_PERIODS` update periods and `STALE_S` after its exposure."""
+KEPT_PERIODS: Final = 20
+ARCSEC: Final = math.radians(1.0 / 3600.0)
+
+Readings = Mapping[str, tuple[Field, Value]]
+"""Field and value of each quantity of a row."""
+
+
+class AttitudeJudge:
+    """Judges attitudes by the motion of the sensor and the parameters in use.
+
+    Parameters
+    ----------
+    conventions
+        Conventions in which the unit reports attitudes.
+    sigma_arcsec
+        Largest standard deviation across and about the boresight that the unit may leave unstated.
+
+    Attributes
+    ----------
+    count
+        Number of valid attitudes compared with the truth.
+    motions
+        Motions of the sensor, in the order of their start.
+    dark_since_s
+        Time since which no light reaches the detector; None: it does.
+    """
+
+    def __init__(self, conventions: Conventions, sigma_arcsec: tuple[float, float]) -> None:
+        self._conventions = conventions
+        self._sigma_arcsec = sigma_arcsec
+        self.count = 0
+        self.motions: list[Motion] = []
+        self.dark_since_s: float | None = None
+        self._periods: list[tuple[float, float]] = []
+        self._turn_cache: tuple[tuple[float, ...], Quaternion] = ((), IDENTITY)
+
+    def started(self, now_s: float, values: Mapping[str, Known | None]) -> None:
+        """The unit has started with these parameters."""
+        self._periods = [(now_s, period_s(values))]
+
+    def retimed(self, now_s: float, values: Mapping[str, Known | None]) -> None:
+        """Parameters that set the period of the exposures may have changed."""
+        self._periods = [*self._periods[-KEPT_PERIODS:], (now_s, period_s(values))]
+
+    def judge(
+        self, row: str, read: Readings, now_s: float, values: Mapping[str, Known | None], *, imaging: bool
+    ) -> None:
+        """Judge the attitude in a row, read now.
+
+        Parameters
+        ----------
+        row
+            Name of the row.
+        read
+            Its values.
+        now_s
+            Simulation time, seconds.
+        values
+            Parameters in use.
+        imaging
+            Whether the unit may be in a mode with frames.
+        """
+        four = [read.get(f"attitude.{letter}") for letter in "xyzw"]
+        valid = flag(read["attitude.valid"][1])
+        numbers = [0.0 if item is None else float(item[1]) for item in four if not isinstance(item, str)]
+        if not valid:
+            if any(item is not None and abs(float(item[1])) > resolution(item[0]) for item in four):
+                raise Violation(f"{row}: quaternion {numbers} though the attitude is invalid")
+            return
+        if not imaging:
+            raise Violation(f"{row}: a valid attitude in a mode without images")
+        window_s = self._window_s(now_s, values)
+        dark_s = math.inf if self.dark_since_s is None else self.dark_since_s
+        if now_s > dark_s + window_s - STALE_S:
+            raise Violation(f"{row}: a valid attitude {now_s - dark_s:.3f} s after the lens was covered")
+        if any(item is None for item in four):
+            return
+        finest = max(resolution(item[0]) for item in four if item is not None) + 1e-7
+        length = math.sqrt(sum(number * number for number in numbers))
+        if abs(length - 1.0) > 4.0 * finest:
+            raise Violation(f"{row}: the quaternion has length {length!r}")
+        x, y, z, w = (number / length for number in numbers)
+        measured = self._to_sensor((x, y, z, w), values)
+        if measured is not None and math.isfinite(window_s):
+            self.count += 1
+            self._check_error(row, self._errors(measured, now_s, window_s), read, 4.0 * finest)
+
+    def _check_error(self, row: str, errors: list[Error], read: Readings, tolerance_rad: float) -> None:
+        stated = [read.get("attitude.sigma_cross"), read.get("attitude.sigma_roll")]
+        cross, roll = (
+            (largest if item is None else float(item[1]) * (factor(item[0].unit, "arcsec") or 1.0))
+            * ARCSEC
+            * SIGMAS
+            for item, largest in zip(stated, self._sigma_arcsec, strict=True)
+        )
+        if any(
+            item.cross_rad <= cross + tolerance_rad and abs(item.z) <= roll + tolerance_rad for item in errors
+        ):
+            return
+        best = min(errors, key=lambda item: item.cross_rad + abs(item.z))
+        raise Violation(
+            f"{row}: a valid attitude {best.cross_rad / ARCSEC:.2f} arcsec across and {abs(best.z) / ARCSEC:.2f} about "
+            f"the boresight from the truth; {SIGMAS:g} sigma are {cross / ARCSEC:.2f} and {roll / ARCSEC:.2f}"
+        )
+
+    def _errors(self, measured: Quaternion, now_s: float, window_s: float) -> list[Error]:
+        """Return the errors to the truth at the times at which the exposure may have been."""
+        errors: list[Error] = []
+        begin_s = now_s - window_s
+        for number, motion in enumerate(self.motions):
+            later = self.motions[number + 1].start_s if number + 1 < len(self.motions) else now_s
+            if later < begin_s:
+                continue
+            start_s, end_s = max(begin_s, motion.start_s), max(min(later, now_s), motion.start_s)
+            turn_rad = motion.speed_rad_s * (end_s - start_s)
+            count = 1 + min(5000, math.ceil(turn_rad / 0.02))
+            slack_s = 0.5 * (end_s - start_s) / count + 1e-3
+            for step in range(count):
+                mid_s = start_s + (step + 0.5) * (end_s - start_s) / count
+                errors.append(Error.between(measured, motion.at(mid_s)).along(motion.rate_rad_s, slack_s))
+        return errors
+
+    def _to_sensor(self, reported: Quaternion, values: Mapping[str, Known | None]) -> Quaternion | None:
+        """Return a reported attitude in the sensor frame; None if the mounting is not known."""
+        conventions = self._conventions
+        if conventions.quaternion == "attitude":
+            reported = conjugate(reported)
+        angles = [values[f"mounting_{name}"] for name in ("alpha", "beta", "gamma")]
+        if any(angle is None for angle in angles):
+            return None
+        numbers = tuple(float(angle[0]) for angle in angles if angle is not None)
+        if self._turn_cache[0] != numbers:
+            turn = IDENTITY
+            for axis, angle in enumerate(numbers):
+                unit = [float(index == axis) for index in range(3)]
+                turn = product(frame_turned(unit, math.radians(angle)), turn)
+            self._turn_cache = (numbers, product(of_matrix(conventions.rows), turn))
+        return product(conjugate(self._turn_cache[1]), reported)
+
+    def _window_s(self, now_s: float, values: Mapping[str, Known | None]) -> float:
+        """Return the largest age that a valid attitude may have now; infinite if it is not known."""
+        longest = period_s(values)
+        for number, (_, period) in enumerate(self._periods):
+            until_s = self._periods[number + 1][0] if number + 1 < len(self._periods) else now_s
+            if now_s - until_s <= (STALE_PERIODS + 1) * period + STALE_S + PROCESSING_S:
+                longest = max(longest, period)
+        return (STALE_PERIODS + 1) * longest + STALE_S + PROCESSING_S
+
+
+def period_s(values: Mapping[str, Known | None]) -> float:
+    """Return the time between exposures with these parameters; infinite if they are not known."""
+    rate, exposure, delay = (values.get(name) for name in ("update_rate", "exposure", "delay_time"))
+    if rate is None or exposure is None or delay is None:
+        return math.inf
+    return max(1.0 / float(rate[0]), (float(exposure[0]) + float(delay[0])) / 1000.0)

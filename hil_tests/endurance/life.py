@@ -1,0 +1,324 @@
+"""The random life of a unit: steps generated from a seed and the unit's definition.
+
+A step is a JSON object with `do`:
+
+=================  ==================================================================================================
+`do`               effect
+=================  ==================================================================================================
+``wait``           `s`: let simulation time pass
+``request``        `link`, `row` ("class id"), `data`: send a request and judge the answers
+``burst``          `link`, `rows`: send telemetry requests without waiting; the answers come in order
+``junk``           `link`, `data` or `frames`: send input that is not a request for this unit; nothing may answer
+``truth``          `truth`: a table as `[truth]` in a profile
+``fault``          `fault`: a request of faults as on the control channel; ``clear`` ends all faults
+``power``          switch the unit off and on; `factory`: delete its stored state
+``end_pipeline``   end the image pipeline unexpectedly
+``disk``           `full`: whether files can be written
+``peer``           `link`, `reads`: whether the peer of a link reads
+``recover``        end all faults, restore the unit, and wait: its attitude must be valid
+=================  ==================================================================================================
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Parameter, Value
+
+Step = dict[str, Any]
+
+SHORTEST_S: Final = 0.001
+LONGEST_S: Final = 40_000.0
+"""Waits are log-uniform between these limits."""
+MOST_EVENTS: Final = 400
+"""Waits end early after about this many events in the unit: exposures, messages, heartbeats."""
+USUAL_SHARE: Final = 0.75
+"""Share of values that are set to their default, so that the unit mostly works."""
+EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
+"""Clock settings next to the wraps of 2038 and 2106."""
+
+
+@dataclass(frozen=True)
+class Life:
+    """A life: the unit's profile, and the steps.
+
+    Attributes
+    ----------
+    unit
+        Name or folder of the unit.
+    seed
+        Seed of the life and of the noise in it.
+    links
+        The links that are open: `serial`, `can`, `canopen`.
+    profile
+        Keys of the unit's profile.
+    steps
+        The steps in order.
+    """
+
+    unit: str
+    seed: int
+    links: tuple[str, ...]
+    profile: dict[str, Any]
+    steps: tuple[Step, ...]
+
+
+def make_life(icd: InterfaceDefinition, unit: str, links: tuple[str, ...], seed: int, count: int) -> Life:
+    """Generate a life of `count` steps."""
+    random_of_life = random.Random(f"{unit} {seed}")  # noqa: S311 (reproducible, not secret)
+    commanded = any(row.action == "set_mode" for row in icd.telecommands.values())
+    start_mode = random_of_life.choice(["standby", "lost_in_space"]) if commanded else "lost_in_space"
+    update_rate = round(10.0 ** random_of_life.uniform(-2.0, 1.0), 3)
+    profile: dict[str, Any] = {"parameters": {"start_mode": start_mode, "update_rate": update_rate}}
+    if update_rate > 2.0:
+        profile["parameters"]["exposure"] = 50
+    profile["run"] = {
+        "start_unix_s": float(random_of_life.choice([1_767_225_600, 2**31 - 3600, 4_102_444_800]))
+    }
+    used = tuple(link for link in links if random_of_life.random() < 0.6) or (random_of_life.choice(links),)
+    generator = LifeGenerator(icd, used, random_of_life)
+    return Life(unit, seed, used, profile, tuple(generator.steps(count)))
+
+
+class LifeGenerator:
+    """Generates steps for a unit.
+
+    Parameters
+    ----------
+    icd
+        Definition of the unit.
+    links
+        Its links: `serial`, `can`, `canopen`.
+    random_of_life
+        Source of chance.
+    """
+
+    def __init__(
+        self, icd: InterfaceDefinition, links: tuple[str, ...], random_of_life: random.Random
+    ) -> None:
+        self._icd = icd
+        self._links = links
+        self._random = random_of_life
+        self._telemetry = list(icd.telemetry.values())
+        self._attitude_rows = [
+            row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)
+        ]
+        self._telecommands = list(icd.telecommands.values())
+        self._mode_rows = [row for row in self._telecommands if row.action == "set_mode"]
+        self._period_s = 1.0
+        weighted: list[tuple[float, Callable[[], Step]]] = [
+            (30, self._wait),
+            (16, self._read_any),
+            (16, self._read_attitude),
+            (18, self._command),
+            (6, self._invalid),
+            (8, self._mode),
+            (2, self._burst),
+            (2, self._junk),
+            (5, self._truth),
+            (4, self._fault),
+            (4, lambda: {"do": "clear"}),
+            (1.5, self._power),
+            (0.5, lambda: {"do": "end_pipeline"}),
+            (1, lambda: {"do": "disk", "full": self._random.random() < 0.5}),
+            (0.5, self._peer),
+            (2, lambda: {"do": "recover"}),
+        ]
+        self._makers = [maker for _, maker in weighted]
+        self._weights = [weight for weight, _ in weighted]
+
+    def steps(self, count: int) -> Iterator[Step]:
+        """Generate steps."""
+        for _ in range(count):
+            (maker,) = self._random.choices(self._makers, self._weights)
+            yield maker()
+
+    # --- time and requests ---
+
+    def _wait(self) -> Step:
+        exponent = self._random.uniform(math.log(SHORTEST_S), math.log(LONGEST_S))
+        return {"do": "wait", "s": round(math.exp(exponent), 6)}
+
+    def _request(self, row: Row, data: bytes = b"") -> Step:
+        return self._raw_request(row.klass, row.id, row.kind, data)
+
+    def _raw_request(self, klass: str, row_id: int, kind: str, data: bytes) -> Step:
+        step: Step = {"do": "request", "link": self._random.choice(self._links), "row": [klass, row_id, kind]}
+        return {**step, "data": data.hex()} if data else step
+
+    def _read_any(self) -> Step:
+        return self._request(self._random.choice(self._telemetry))
+
+    def _read_attitude(self) -> Step:
+        return self._request(self._random.choice(self._attitude_rows or self._telemetry))
+
+    def _command(self) -> Step:
+        if not self._telecommands:
+            return self._read_any()
+        row = self._random.choice(self._telecommands)
+        return self._request(row, row.encode(self._values(row), check=False))
+
+    def _mode(self) -> Step:
+        if not self._mode_rows:
+            return self._read_any()
+        row = self._random.choice(self._mode_rows)
+        values = self._values(row)
+        for field in row.named_fields.values():
+            if field.argument == "mode" and field.enum is not None:
+                wanted = [
+                    name for name in ("lost_in_space", "tracking", "standby") if name in field.enum.values
+                ]
+                if wanted:
+                    values[field.name] = self._random.choice([wanted[0], *wanted])
+        return self._request(row, row.encode(values, check=False))
+
+    def _burst(self) -> Step:
+        rows = [self._random.choice(self._telemetry) for _ in range(self._random.randint(2, 6))]
+        link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
+        return {"do": "burst", "link": link, "rows": [[row.klass, row.id, row.kind] for row in rows]}
+
+    # --- values ---
+
+    def _values(self, row: Row) -> dict[str, Value]:
+        values = {name: self._value(field) for name, field in row.named_fields.items() if field.const is None}
+        if row.action == "set_parameter":
+            self._choose_parameter(row, values)
+        return values
+
+    def _choose_parameter(self, row: Row, values: dict[str, Value]) -> None:
+        """Set one parameter of the unit, mostly to a value within its limits."""
+        by_argument = {field.argument: field for field in row.named_fields.values()}
+        parameter = self._random.choice(list(self._icd.parameters.values()))
+        number, value = by_argument.get("parameter"), by_argument.get("value")
+        if number is not None and value is not None:
+            values[number.name] = parameter.id
+            values[value.name] = self._parameter_value(parameter)
+
+    def _parameter_value(self, parameter: Parameter) -> float:
+        chance = self._random.random()
+        if chance < USUAL_SHARE:
+            return parameter.to_number(parameter.default)
+        if parameter.enum is not None:
+            return float(self._random.choice(list(parameter.enum.values.values())))
+        low, high = (0.0, 1.0) if parameter.type == "bool" else (parameter.minimum, parameter.maximum)
+        span = high - low
+        edges = [low, high, low - 1.0, high + 1.0, low - 1e-3 * span, high + 1e-3 * span, -0.0, 5e-324]
+        value = self._random.choice(edges) if chance > 0.9 else self._random.uniform(low, high)
+        return value if parameter.type.startswith("f") else float(round(value))
+
+    def _value(self, field: Field) -> Value:
+        """Return a value within the limits of a field."""
+        chance = self._random.random()
+        if field.argument in ("unix", "seconds") and chance < 0.5:
+            low, high = field.physical_limits
+            inside = [second for second in EDGE_CLOCKS_S if low <= second <= high]
+            if inside:
+                return self._random.choice(inside)
+        if field.parameter is not None and chance < USUAL_SHARE:
+            default = self._icd.device_parameters[field.parameter].default
+            if field.kind in ("integer", "float", "bits") and not isinstance(default, str):
+                low, high = field.physical_limits
+                return min(max(default, low), high)
+            if isinstance(default, str) and field.enum is not None and default in field.enum.values:
+                return default
+        match field.kind:
+            case "flag":
+                return self._random.random() < 0.5
+            case "bytes":
+                return self._random.randbytes(field.size)
+            case "text":
+                return "x" * self._random.randint(0, field.size)
+            case "enum":
+                return self._random.choice(list(field.enum.values)) if field.enum is not None else 0
+            case "float":
+                low, high = field.physical_limits
+                edges = [low, high, 0.0, 1.0]
+                finite = [edge for edge in edges if low <= edge <= high and abs(edge) < 1e30]
+                if finite and (chance > 0.9 or high - low > 1e9):
+                    return self._random.choice(finite)
+                return self._random.uniform(low, high)
+            case _:
+                low_raw, high_raw = field.raw_limits
+                raw = (
+                    self._random.choice((low_raw, high_raw))
+                    if chance > 0.9
+                    else self._random.randint(low_raw, high_raw)
+                )
+                return field.to_physical(raw)
+
+    # --- invalid input ---
+
+    def _invalid(self) -> Step:
+        rows = [*self._telecommands, *self._telemetry]
+        row = self._random.choice(rows)
+        match self._random.randrange(3):
+            case 0:
+                on_wire = any(item.code is not None for item in self._icd.classes)
+                known = {other.id for other in rows if not on_wire or other.klass == row.klass}
+                unknown = [number for number in range(256) if number not in known]
+                number = self._random.choice(unknown) if unknown else row.id
+                kind = row.kind if self._icd.classes else self._icd.kind_of_id(number).value
+                return self._raw_request(row.klass, number, kind, b"")
+            case 1:
+                size = row.size if row.kind == "telecommand" else 0
+                # one byte more may be a CRC
+                wrong = self._random.choice([size + 2, size + 7, max(0, size - 1)])
+                return self._request(row, self._random.randbytes(wrong))
+            case _:
+                size = row.size if row.kind == "telecommand" else 0
+                return self._request(row, self._random.randbytes(size))
+
+    def _junk(self) -> Step:
+        link = self._random.choice(self._links)
+        count = self._random.randint(1, 6)
+        if link == "serial":
+            return {"do": "junk", "link": link, "data": self._random.randbytes(count * 3).hex()}
+        frames = [
+            [self._random.getrandbits(29), self._random.randbytes(self._random.randint(0, 8)).hex()]
+            for _ in range(count)
+        ]
+        return {"do": "junk", "link": link, "frames": frames}
+
+    # --- surroundings ---
+
+    def _truth(self) -> Step:
+        attitude = {
+            "ra_deg": self._random.choice([0.0, 359.9999, self._random.uniform(0.0, 360.0)]),
+            "dec_deg": self._random.choice(
+                [-90.0, 90.0, math.degrees(math.asin(self._random.uniform(-1.0, 1.0)))]
+            ),
+            "roll_deg": self._random.uniform(0.0, 360.0),
+        }
+        if self._random.random() < 0.6:
+            return {"do": "truth", "truth": {"kind": "fixed", "attitude": attitude}}
+        scale = 10.0 ** self._random.uniform(-3.0, 1.5)
+        rate = [round(self._random.gauss(0.0, scale), 9) for _ in range(3)]
+        return {"do": "truth", "truth": {"kind": "rate", "attitude": attitude, "rate_deg_s": rate}}
+
+    def _fault(self) -> Step:
+        links = {"can" if link == "canopen" else link for link in self._links}
+        kinds: list[dict[str, Any]] = [
+            {"optical": {"blocked_share": self._random.choice([0.5, 1.0, 1.0])}},
+            {"device": {"stuck": True}},
+            {"device": {"error": self._random.choice(["sensor", "processing", "injected", "catalogue"])}},
+            {"device": {"reset": self._random.choice(["watchdog", "brown_out", "software"])}},
+        ]
+        for link in sorted(links):
+            kinds.append({link: {"drop": self._random.choice([0.1, 1.0])}})
+            kinds.append({link: {"corrupt": 0.3, "junk": 0.3}})
+            kinds.append(
+                {link: {"delay_s": self._random.uniform(0.0, 3.0), "split": 3 if link == "serial" else 0}}
+            )
+        return {"do": "fault", "fault": self._random.choice(kinds)}
+
+    def _power(self) -> Step:
+        return {"do": "power", "factory": self._random.random() < 0.2}
+
+    def _peer(self) -> Step:
+        return {"do": "peer", "link": self._random.choice(self._links), "reads": self._random.random() < 0.6}

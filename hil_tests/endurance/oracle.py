@@ -1,0 +1,471 @@
+"""The oracle: what a unit may and must do, judged from its definition and its bus alone.
+
+It keeps its own model of the unit - parameters in use and stored, mode, clock, counters, faults - and updates it by
+what was sent and answered. What it cannot know (an answer lost on a faulty link, a parameter that a plugin may have
+changed) is None, and is learned from the next reading. A `Violation` is raised for the first thing that a unit
+must never do.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, Final
+
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
+from starhil.hil_tests.endurance.truth import Motion
+from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.device_model import PARAMETER
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.messages import ErrorCode
+from starhil.protocol.units_of_measure import factor
+from starhil.protocol.values import MessageError, Value
+
+BOOT_S: Final = 0.6
+"""Longest boot of the profile of a run."""
+RECOVERY_S: Final = 15.0
+"""Longest time from the end of the last fault to a valid attitude, with default parameters."""
+IMAGING: Final = frozenset({"lost_in_space", "tracking"})
+SECOND_NS: Final = 1_000_000_000
+
+
+class Oracle:
+    """A model of a unit that is updated by what happens on its bus.
+
+    Parameters
+    ----------
+    icd
+        Definition of the unit.
+    parameters
+        Defaults of parameters in the profile of the run.
+    start_unix_s
+        Device clock at each start.
+    sigma_arcsec
+        Largest standard deviation across and about the boresight that the unit may leave unstated.
+    """
+
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        parameters: Mapping[str, Value],
+        start_unix_s: float,
+        sigma_arcsec: tuple[float, float],
+    ) -> None:
+        self._icd = icd
+        self._start_unix_ns = round(start_unix_s * SECOND_NS)
+        calibrated = {"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"}
+        self._defaults: dict[str, Known | None] = {
+            name: None if name in calibrated else (parameter.default, 1e-9)
+            for name, parameter in icd.device_parameters.items()
+        }
+        self._defaults.update({name: (value, 1e-9) for name, value in parameters.items()})
+        self._stored: dict[str, Known | None] = {}
+        self.values: dict[str, Known | None] = dict(self._defaults)
+        self.modes: set[str] = {"boot"}
+        self.counts: dict[str, int | None] = {}
+        self._boot_count: int | None = None
+        self.attitudes: Final = AttitudeJudge(icd.conventions, sigma_arcsec)
+        self.disk_full = False
+        self.stuck = False
+        self.disturbed: set[str] = set()
+        """Links on which answers may be lost, late or damaged."""
+        self.bursts = False
+        """Whether packets of a file may arrive."""
+        self.now_s = 0.0
+        self._has_imaged = False
+        self._frames: int | None = None
+        self._selected: int | None = None
+        self._last: tuple[int, ErrorCode] | None = None
+        self._effects: dict[str, Callable[[Row, Mapping[str, Any]], None]] = {
+            "set_parameters": self._parameters_set,
+            "set_parameter": self._parameter_set,
+            "select_parameter": self._parameter_selected,
+            "select_unsolicited": self._unsolicited_selected,
+            "save_parameters": self._parameters_saved,
+            "restore_parameters": self._parameters_restored,
+            "default_parameters": self._defaults_set,
+            "clear_counters": self._counters_cleared,
+            "set_clock": self._clock_changed,
+            "set_mode": self._mode_commanded,
+            "start_burst": self._burst_started,
+        }
+        self._checks: dict[str, Callable[[str, Field, Value], None]] = {
+            "mode": self._check_mode,
+            "counters.telecommands": partial(self._check_count, "telecommands"),
+            "counters.telemetry": partial(self._check_count, "telemetry"),
+            "counters.requests": self._check_requests,
+            "clock.unix": partial(self._check_clock, 1.0, 2**64),
+            "clock.seconds": partial(self._check_clock, 1.0, 2**32),
+            "clock.milliseconds": partial(self._check_clock, 1e3, 1),
+            "uptime": self._check_uptime,
+            "uptime.seconds": self._check_uptime,
+            "boot.count": self._check_boot_count,
+            "frame.counter": self._check_frames,
+            "selected.id": self._check_selected,
+            "request.last": self._check_last,
+        }
+        self._start(0.0)
+
+    # --- what happens to the unit ---
+
+    def powered(self, *, factory: bool, motion: Motion) -> None:
+        """Power was switched off and on; simulation time begins again with a motion of the sensor."""
+        if factory:
+            self._stored, self._boot_count = {}, 0
+        self.now_s = 0.0
+        self.stuck = False
+        self.disturbed.clear()
+        self.attitudes.dark_since_s = None
+        self.attitudes.motions = [motion]
+        self._start(0.0)
+
+    def restarted(self) -> None:
+        """The unit has restarted by itself, now."""
+        self._start(self.now_s)
+
+    def _start(self, at_s: float) -> None:
+        self._started_s: float | None = at_s
+        self.values = {**self._defaults, **self._stored}
+        self.modes = {"boot"}
+        self.counts = {"telecommands": 0, "telemetry": 0}
+        self._boot_count = (
+            None if self._boot_count is None or self.disk_full else (self._boot_count + 1) & 0xFFFF
+        )
+        self._clock: tuple[float, int] | None = (at_s, self._start_unix_ns)
+        self._clock_set_s = at_s
+        self._has_imaged = False
+        self._frames = None
+        self._selected = next(iter(self._icd.parameters_by_id), None)
+        self._last = None
+        self.bursts = False
+        self.attitudes.started(at_s, self.values)
+
+    def time_passed(self, now_s: float) -> None:
+        """Simulation time has passed."""
+        self.now_s = now_s
+        if "boot" in self.modes:
+            start = self.values.get("start_mode")
+            if start is None or start[0] != "lost_in_space":
+                self.modes.add("standby")
+            if start is None or start[0] == "lost_in_space":
+                self.modes |= IMAGING
+            if self._started_s is not None and now_s - self._started_s > BOOT_S:
+                self.modes.discard("boot")
+        self._has_imaged = self._has_imaged or bool(self.modes & IMAGING)
+
+    def moved(self, motion: Motion) -> None:
+        """The truth was replaced, now."""
+        self.attitudes.motions.append(motion)
+
+    def failed(self) -> None:
+        """The unit must be in the error mode, now."""
+        self.modes = {"error"}
+
+    def pipeline_ended(self) -> None:
+        """The image pipeline has ended: the error mode, until it is restarted and the mode is commanded."""
+        self.modes = {"error"}
+
+    def covered(self, *, fully: bool) -> None:
+        """The lens was covered, now, or is not fully covered any more."""
+        if not fully:
+            self.attitudes.dark_since_s = None
+        elif self.attitudes.dark_since_s is None:
+            self.attitudes.dark_since_s = self.now_s
+
+    def forget(self) -> None:
+        """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
+        self.values = dict.fromkeys(self.values)
+        self._stored = dict.fromkeys(self.values)
+        self.counts = dict.fromkeys(self.counts)
+        self._clock = self._boot_count = self._selected = self._last = self._started_s = None
+        self.modes = {"boot", "standby", "error", *IMAGING}
+        self.bursts = True
+        self.attitudes.retimed(self.now_s, self.values)
+
+    # --- requests ---
+
+    def verdict(self, row: Row | None, kind: str, data: bytes) -> ErrorCode | None:
+        """Return OK if a request must be accepted, the code with which it must be refused, or None: either."""
+        if row is None:
+            return ErrorCode.INVALID_ID
+        if kind == "telemetry":
+            images = any((field.value or "").startswith(("image.", "file.")) for field in row.fields)
+            return ErrorCode.INVALID_LENGTH if data else None if images else ErrorCode.OK
+        if len(data) != row.size:
+            return ErrorCode.INVALID_LENGTH
+        try:
+            values = row.decode(data)
+        except MessageError as error:
+            return error.code
+        arguments = _by_argument(row, values)
+        match row.action:
+            case "set_mode":
+                return self._mode_verdict(str(arguments.get("mode")))
+            case "set_parameter":
+                return self._parameter_verdict(arguments)
+            case "select_parameter":
+                known = int(float(arguments["parameter"])) in self._icd.parameters_by_id
+                return ErrorCode.OK if known else ErrorCode.INVALID_PARAMETER
+            case "save_parameters":
+                return ErrorCode.INTERNAL if self.disk_full else ErrorCode.OK
+            case "set_parameters" if any(field.parameter in _BOUND for field in row.fields):
+                return None
+            case "nothing" | None | "reset" | "set_clock" | "clear_counters" | "restore_parameters":
+                return ErrorCode.OK
+            case "default_parameters" | "set_parameters":
+                return ErrorCode.OK
+            case _:
+                return None
+
+    def _mode_verdict(self, wanted: str) -> ErrorCode | None:
+        votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
+        if votes == {False} or (wanted == "tracking" and not self._has_imaged):
+            return ErrorCode.SEQUENCE
+        certain = votes == {True} and wanted != "tracking" and "error" not in self.modes
+        return ErrorCode.OK if certain else None
+
+    def _parameter_verdict(self, arguments: Mapping[str, Any]) -> ErrorCode | None:
+        parameter = self._icd.parameters_by_id.get(int(arguments["parameter"]))
+        try:
+            if parameter is None:
+                return ErrorCode.INVALID_PARAMETER
+            parameter.check(arguments["value"])
+        except MessageError:
+            return ErrorCode.INVALID_PARAMETER
+        return None if parameter.name in _BOUND else ErrorCode.OK
+
+    def counted(self, kind: str) -> None:
+        """A request was received."""
+        count = self.counts[f"{_COUNTER[kind]}"]
+        self.counts[_COUNTER[kind]] = None if count is None else (count + 1) & 0xFFFF
+
+    def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode) -> None:
+        """A telecommand was answered with a code."""
+        self._last = (row_id, code)
+        if row is None or code is not ErrorCode.OK:
+            return
+        arguments = _by_argument(row, row.decode(data))
+        action = row.action or "nothing"
+        if action in self._effects:
+            self._effects[action](row, arguments)
+        elif action not in _WITHOUT_EFFECT:
+            self.forget()
+
+    def _set(self, changes: Mapping[str, Known | None]) -> None:
+        self.values.update(changes)
+        if changes.keys() & _BOUND:
+            self.attitudes.retimed(self.now_s, self.values)
+
+    def _parameters_set(self, row: Row, arguments: Mapping[str, Any]) -> None:
+        self._set(
+            {
+                field.parameter: (arguments[field.name], resolution(field))
+                for field in row.named_fields.values()
+                if field.parameter is not None
+            }
+        )
+
+    def _parameter_set(self, _row: Row, arguments: Mapping[str, Any]) -> None:
+        parameter = self._icd.parameters_by_id[int(arguments["parameter"])]
+        self._set({parameter.name: (parameter.check(arguments["value"]), 1e-9)})
+        self._selected = parameter.id
+
+    def _parameter_selected(self, _row: Row, arguments: Mapping[str, Any]) -> None:
+        self._selected = int(arguments["parameter"])
+
+    def _unsolicited_selected(self, _row: Row, arguments: Mapping[str, Any]) -> None:
+        self._set({"unsolicited_selection": (int(arguments["telemetry"]), 0.0), "unsolicited_rate": None})
+
+    def _parameters_saved(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
+        self._stored = dict(self.values)
+
+    def _parameters_restored(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
+        self._set({**self._defaults, **self._stored})
+
+    def _defaults_set(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
+        self._set(self._defaults)
+
+    def _counters_cleared(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
+        self.counts = {"telecommands": 0, "telemetry": 0}
+
+    def _clock_changed(self, _row: Row, arguments: Mapping[str, Any]) -> None:
+        if self._icd.conventions.epoch_ns is None:  # the day is that of the clock
+            self._clock = None
+        else:
+            scales = {"unix": SECOND_NS, "seconds": SECOND_NS, "milliseconds": 10**6, "microseconds": 10**3}
+            scales["nanoseconds"] = 1
+            total = sum(round(float(arguments.get(name) or 0) * scale) for name, scale in scales.items())
+            self._clock = (self.now_s, total + self._icd.conventions.epoch_ns)
+        self._clock_set_s = self.now_s
+
+    def _mode_commanded(self, _row: Row, arguments: Mapping[str, Any]) -> None:
+        wanted = str(arguments["mode"])
+        self.modes = set(IMAGING) if wanted in IMAGING else {wanted}
+        self._has_imaged = self._has_imaged or wanted in IMAGING
+
+    def _burst_started(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
+        self.bursts = True
+
+    def forget_last(self) -> None:
+        """The code with which the last telecommand was refused is not known."""
+        self._last = None
+
+    def started_at(self, at_s: float) -> None:
+        """The last start was at this time."""
+        self._started_s = at_s
+
+    # --- readings ---
+
+    def read(self, row: Row, data: bytes) -> None:
+        """Judge the telemetry of a row, received now."""
+        if len(data) != row.size:
+            raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
+        values = row.decode(data)
+        by_quantity: dict[str, tuple[Field, Value]] = {}
+        for name, value in values.items():
+            field = row.named_fields[name]
+            quantity = PARAMETER + field.parameter if field.parameter else field.value
+            if isinstance(value, float) and not math.isfinite(value):
+                raise Violation(f"{row.name}.{name}: {value}")
+            if quantity is not None:
+                by_quantity[quantity] = (field, value)
+        for quantity, (field, value) in by_quantity.items():
+            where = f"{row.name}.{field.name}"
+            if quantity.startswith(PARAMETER):
+                self._check_parameter(where, field, value, quantity.removeprefix(PARAMETER))
+            elif quantity in self._checks:
+                self._checks[quantity](where, field, value)
+        if "attitude.valid" in by_quantity:
+            imaging = bool(self.modes & IMAGING)
+            self.attitudes.judge(row.name, by_quantity, self.now_s, self.values, imaging=imaging)
+
+    def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
+        known = self.values[name]
+        if known is None:
+            if not field.aliases and not (field.kind == "enum" and not isinstance(value, str)):
+                self.values[name] = (value, resolution(field))
+            return
+        expected, tolerance = known
+        if isinstance(expected, bool) or isinstance(value, bool):
+            if field.kind in ("flag", "integer", "bits", "enum") and flag(value) != flag(expected):
+                raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
+        elif isinstance(expected, str) or isinstance(value, str):
+            if (
+                isinstance(value, str)
+                and isinstance(expected, str)
+                and not field.aliases
+                and value != expected
+            ):
+                raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
+        else:
+            unit = self._icd.device_parameters[name].unit
+            self._expect(where, field, value, float(expected) * (factor(unit, field.unit) or 1.0), tolerance)
+
+    def _expect(
+        self, where: str, field: Field, value: Value, expected: float, tolerance: float = 0.0
+    ) -> None:
+        """Check a number, which telemetry clips or wraps to the range of its field."""
+        if not isinstance(value, (int, float)):
+            return
+        low, high = field.physical_limits
+        step = abs(field.scale) if field.kind != "float" else 0.0
+        if field.wrap:
+            span = high - low + step
+            off = abs((float(value) - expected + 0.5 * span) % span - 0.5 * span)
+        else:
+            off = abs(float(value) - min(max(expected, low), high))
+        if off > tolerance + resolution(field) + 1.2e-7 * abs(expected) * (field.kind == "float"):
+            raise Violation(f"{where}: {value!r}, not {expected!r}")
+
+    def _check_mode(self, where: str, field: Field, value: Value) -> None:
+        if field.aliases or not isinstance(value, str):
+            return
+        if value not in self.modes:
+            raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
+        self.modes = set(IMAGING) if value in IMAGING else {value}
+
+    def _check_count(self, name: str, where: str, field: Field, value: Value) -> None:
+        known = self.counts[name]
+        if known is not None:
+            self._expect(where, field, value, known)
+        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
+            self.counts[name] = value
+
+    def _check_requests(self, where: str, field: Field, value: Value) -> None:
+        telecommands, telemetry = self.counts["telecommands"], self.counts["telemetry"]
+        if telecommands is not None and telemetry is not None:
+            self._expect(where, field, value, telecommands + telemetry)
+
+    def _check_clock(self, scale: float, modulo_s: int, where: str, field: Field, value: Value) -> None:
+        if self._clock is None:
+            return
+        since_s, unix_ns = self._clock
+        now_ns = self._icd.conventions.reported_ns(unix_ns + round((self.now_s - since_s) * SECOND_NS))
+        expected = now_ns % (modulo_s * SECOND_NS) / SECOND_NS * scale
+        self._expect(where, field, value, expected, 1.0 if field.kind != "float" else 1e-6 * scale)
+
+    def _check_uptime(self, where: str, field: Field, value: Value) -> None:
+        if self._started_s is not None:
+            uptime_s = self.now_s - self._started_s
+            self._expect(where, field, value, uptime_s * (factor("s", field.unit) or 1.0), 1.01)
+
+    def _check_boot_count(self, where: str, field: Field, value: Value) -> None:
+        if self._boot_count is not None:
+            self._expect(where, field, value, self._boot_count)
+        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF and not self.disk_full:
+            self._boot_count = value
+
+    def _check_frames(self, where: str, _field: Field, value: Value) -> None:
+        if isinstance(value, int) and value:  # 0: there is no frame now
+            if self._frames is not None and value < self._frames and self._frames - value < 128:
+                raise Violation(f"{where}: {value} after {self._frames}")
+            self._frames = value
+
+    def _check_selected(self, where: str, field: Field, value: Value) -> None:
+        if self._selected is not None:
+            self._expect(where, field, value, self._selected)
+
+    def _check_last(self, where: str, field: Field, value: Value) -> None:
+        if self._last is not None:
+            self._expect(where, field, value, self._last[0])
+
+
+def _by_argument(row: Row, values: Mapping[str, Value]) -> dict[str, Any]:
+    """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
+    found: dict[str, Any] = dict(row.arguments)
+    for name, field in row.named_fields.items():
+        value = values[name]
+        if field.argument in _TIME_UNITS and not isinstance(value, (str, bytes)):
+            value = float(value) * (factor(field.unit, _TIME_UNITS[field.argument]) or 1.0)
+        found[field.argument or name] = value
+    return found
+
+
+_RUNNING: Final = frozenset({"standby", *IMAGING})
+_COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
+"""Modes that can be commanded from a mode; `_RUNNING` from all others."""
+_BOUND: Final = frozenset({"update_rate", "exposure", "delay_time"})
+"""Parameters that bound each other."""
+_COUNTER: Final = {"telecommand": "telecommands", "telemetry": "telemetry"}
+_WITHOUT_EFFECT: Final = frozenset(
+    [
+        "nothing",
+        "reset",
+        "subscribe",
+        "save_image",
+        "open_image",
+        "load_image_chunk",
+        "load_file_block",
+        "set_hole_map",
+    ]
+)
+"""Actions that leave what the oracle knows as it is."""
+_TIME_UNITS: Final = {
+    "unix": "s",
+    "seconds": "s",
+    "milliseconds": "ms",
+    "microseconds": "us",
+    "nanoseconds": "ns",
+}

@@ -1,0 +1,137 @@
+"""The true attitude as the oracle knows it, in plain numbers: q rotates vectors from ICRS to the sensor, scalar last."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+Quaternion = tuple[float, float, float, float]
+
+IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+
+
+def product(p: Quaternion, q: Quaternion) -> Quaternion:
+    """Return the Hamilton product p ⊗ q."""
+    a, b, c, d = p
+    x, y, z, w = q
+    return (
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """Return the inverse of a unit quaternion."""
+    x, y, z, w = q
+    return (-x, -y, -z, w)
+
+
+def frame_turned(axis: Sequence[float], angle_rad: float) -> Quaternion:
+    """Return the quaternion that takes vectors into a frame turned by an angle about an axis."""
+    k = -math.sin(0.5 * angle_rad)
+    return (k * axis[0], k * axis[1], k * axis[2], math.cos(0.5 * angle_rad))
+
+
+def of_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
+    """Return the quaternion that rotates vectors as a matrix does (Shepperd's method)."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
+    largest = max(range(4), key=lambda index: squares[index])
+    four = (
+        (squares[0], b + d, c + g, h - f),
+        (b + d, squares[1], f + h, c - g),
+        (c + g, f + h, squares[2], d - b),
+        (h - f, c - g, d - b, squares[3]),
+    )[largest]
+    length = math.sqrt(sum(value * value for value in four))
+    x, y, z, w = (value / length for value in four)
+    return (x, y, z, w)
+
+
+def of_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:
+    """Return the attitude of a sensor: x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e, z = b."""
+    ra, dec, roll = (math.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
+    boresight = (math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec))
+    north = (-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec))
+    east = (-math.sin(ra), math.cos(ra), 0.0)
+    sine, cosine = math.sin(roll), math.cos(roll)
+    right = [-sine * n - cosine * e for n, e in zip(north, east, strict=True)]
+    down = [-cosine * n + sine * e for n, e in zip(north, east, strict=True)]
+    return of_matrix((right, down, boresight))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rotation at a constant body rate since a time; at rest if the rate is zero.
+
+    Attributes
+    ----------
+    start_s
+        Simulation time at which the motion begins.
+    attitude
+        Attitude at the start.
+    rate_rad_s
+        Body rate (3), sensor frame.
+    """
+
+    start_s: float
+    attitude: Quaternion
+    rate_rad_s: tuple[float, float, float]
+
+    @classmethod
+    def of(cls, truth: Mapping[str, Any], start_s: float) -> Motion:
+        """Return the motion of a truth table of kind `fixed` or `rate`."""
+        angles = truth["attitude"]
+        attitude = of_radec_roll(angles["ra_deg"], angles["dec_deg"], angles.get("roll_deg", 0.0))
+        x, y, z = (math.radians(value) for value in truth.get("rate_deg_s", (0.0, 0.0, 0.0)))
+        return cls(start_s, attitude, (x, y, z))
+
+    @property
+    def speed_rad_s(self) -> float:
+        """Magnitude of the body rate."""
+        return math.hypot(*self.rate_rad_s)
+
+    def at(self, t_s: float) -> Quaternion:
+        """Return the attitude at a time."""
+        speed = self.speed_rad_s
+        if speed == 0.0:
+            return self.attitude
+        axis = [component / speed for component in self.rate_rad_s]
+        return product(frame_turned(axis, speed * (t_s - self.start_s)), self.attitude)
+
+
+@dataclass(frozen=True)
+class Error:
+    """Error of an attitude: rotation vector in the sensor frame, radians."""
+
+    x: float
+    y: float
+    z: float
+
+    @classmethod
+    def between(cls, measured: Quaternion, true: Quaternion) -> Error:
+        """Return the rotation from the true to the measured attitude."""
+        x, y, z, w = product(measured, conjugate(true))
+        sign = -1.0 if w < 0.0 else 1.0
+        sine = math.sqrt(x * x + y * y + z * z)
+        k = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, sign * w) / sine
+        return cls(sign * k * x, sign * k * y, sign * k * z)
+
+    def along(self, rate: Sequence[float], slack_s: float) -> Error:
+        """Return the error that remains if the time of the measurement is uncertain by `slack_s` both ways."""
+        speed2 = sum(component * component for component in rate)
+        if speed2 == 0.0:
+            return self
+        # the frame turns by -rate * t, so a later exposure is an error along -rate
+        late_s = -(self.x * rate[0] + self.y * rate[1] + self.z * rate[2]) / speed2
+        shift_s = min(max(late_s, -slack_s), slack_s)
+        return Error(self.x + rate[0] * shift_s, self.y + rate[1] * shift_s, self.z + rate[2] * shift_s)
+
+    @property
+    def cross_rad(self) -> float:
+        """Error across the boresight."""
+        return math.hypot(self.x, self.y)

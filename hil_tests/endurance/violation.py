@@ -1,0 +1,25 @@
+"""Violations, and values as an oracle knows them."""
+
+from __future__ import annotations
+
+from starhil.protocol.codec import Field
+from starhil.protocol.values import Value
+
+Known = tuple[Value, float]
+"""A value and its tolerance."""
+
+
+class Violation(Exception):  # noqa: N818 (what it is called)
+    """Something that a unit must never do."""
+
+
+def flag(value: Value) -> bool:
+    """Return a truth value that may have been sent as a member of an enumeration."""
+    return value == "true" if isinstance(value, str) else bool(value)
+
+
+def resolution(field: Field) -> float:
+    """Return the largest difference between a value and what its field carries of it."""
+    if field.kind == "float":
+        return 1e-9 * abs(field.scale)
+    return 0.51 * abs(field.scale)

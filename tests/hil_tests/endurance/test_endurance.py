@@ -1,0 +1,110 @@
+"""Random lives of units: none ends in a violation, the same seed gives the same life, and what fails is written."""
+
+import asyncio
+import json
+from dataclasses import asdict, replace
+
+import pytest
+
+from starhil.emulator.cli.endurance import live, read_life, run_once
+from starhil.emulator.device.counters import Counters
+from starhil.emulator.device.state_store import FileStore
+from starhil.emulator.endurance.unit_under_test import links_of
+from starhil.emulator.replay import replay
+from starhil.hil_tests.endurance.life import Life, make_life
+from starhil.hil_tests.endurance.shrink import kind_of, shortened
+from starhil.hil_tests.endurance.truth import Error, Motion
+from starhil.protocol.icd import load_unit
+from starhil.protocol.unit_folders import bundled_units
+
+LIVES, STEPS = 4, 150
+
+
+def life_of(unit, seed, steps=STEPS):
+    icd = load_unit(unit)
+    return make_life(icd, unit, links_of(icd), seed, steps)
+
+
+@pytest.mark.parametrize("unit", sorted(bundled_units()))
+def test_no_life_ends_in_a_violation(unit):
+    outcomes = [run_once(life_of(unit, seed)) for seed in range(1, LIVES + 1)]
+    assert [outcome.violation for outcome in outcomes] == [""] * LIVES
+    assert sum(outcome.readings for outcome in outcomes) > 20
+    assert sum(outcome.device_s for outcome in outcomes) > 3600.0
+
+
+def test_a_life_whose_images_are_rendered_ends_without_a_violation():
+    outcome = run_once(life_of("sagitta", 5, 25), rendered=True)
+    assert outcome.violation == ""
+
+
+def test_a_seed_gives_one_life_and_one_outcome():
+    assert life_of("cubestar", 3) == life_of("cubestar", 3)
+    assert life_of("cubestar", 3) != life_of("cubestar", 4)
+    assert asdict(run_once(life_of("oresat", 3))) == asdict(run_once(life_of("oresat", 3)))
+
+
+@pytest.fixture
+def forgetful(monkeypatch):
+    """A unit that does not clear its counter of telemetry requests."""
+
+    def clear(self):
+        self.telecommands = 0
+
+    monkeypatch.setattr(Counters, "clear", clear)
+
+
+def violating(unit):
+    lives = (life_of(unit, seed, 400) for seed in range(1, 30))
+    return next((life, run_once(life).violation) for life in lives if run_once(life).violation)
+
+
+def test_a_defect_is_found_shortened_written_and_repeated(forgetful, tmp_path):
+    life, violation = violating("cubestar")
+    assert "count" in violation
+    figures = live("cubestar", life, rendered=False, folder=tmp_path)
+    assert figures["steps"] < 12
+    written = read_life(tmp_path / f"cubestar-{life.seed}.json")
+    assert kind_of(run_once(written).violation) == kind_of(violation)
+    assert (tmp_path / f"cubestar-{life.seed}.toml").read_text().startswith("title = ")
+    assert (tmp_path / f"cubestar-{life.seed}-recording" / "events.jsonl").is_file()
+
+
+def test_a_store_that_loses_what_it_stores_is_found(monkeypatch):
+    monkeypatch.setattr(FileStore, "save", lambda _self, _content: None)
+    assert violating("cubestar")[1]
+
+
+def test_a_file_that_is_no_life_is_rejected(tmp_path):
+    path = tmp_path / "life.json"
+    path.write_text(json.dumps({"unit": "cubestar"}))
+    with pytest.raises(Exception, match=r"life\.json: not a life"):
+        read_life(path)
+
+
+def test_a_life_is_shortened_to_the_events_that_matter():
+    steps = tuple({"do": "wait", "s": float(number)} for number in range(100))
+    life = Life("cubestar", 1, ("serial",), {}, steps)
+    short = shortened(
+        life,
+        lambda other: {"do": "wait", "s": 17.0} in other.steps and {"do": "wait", "s": 80.0} in other.steps,
+    )
+    assert [step["s"] for step in short.steps] == [17.0, 80.0]
+    assert replace(short, steps=steps) == life
+
+
+def test_a_late_exposure_is_no_error_along_the_motion():
+    motion = Motion(0.0, (0.0, 0.0, 0.0, 1.0), (0.0, 0.01, 0.0))
+    error = Error.between(motion.at(10.0), motion.at(10.3))
+    assert abs(error.y) == pytest.approx(0.003)
+    left = error.along(motion.rate_rad_s, 0.5)
+    assert (left.x, left.y, left.z) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    assert abs(error.along(motion.rate_rad_s, 0.1).y) == pytest.approx(0.002)
+
+
+def test_the_recording_of_a_life_is_repeated_to_the_byte(tmp_path):
+    outcome = run_once(life_of("sagitta", 7, 60), record=tmp_path / "recording")
+    assert outcome.violation == ""
+    report = asyncio.run(replay(tmp_path / "recording"))
+    assert report.differences == []
+    assert report.sent["serial"] > 0
