@@ -242,12 +242,13 @@ def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    columns = ("lives", "device_years", "factor", "requests", "readings", "attitudes", "violating")
-    table = Table("unit", *(name.replace("_", " ") for name in columns))
+    formats = {
+        "lives": "d", "device_years": ".4f", "factor": ".0f", "requests": "d", "readings": "d", "attitudes": "d",
+        "violating": "d",
+    }  # fmt: skip
+    table = Table("unit", *(name.replace("device_", "") for name in formats), box=None)
     for name, row in [*figures["units"].items(), ("all", figures)]:
-        table.add_row(
-            name, *(f"{row[key]:.4g}" if isinstance(row[key], float) else str(row[key]) for key in columns)
-        )
+        table.add_row(name, *(format(row[key], text) for key, text in formats.items()))
     Console().print(table)
     for item in outcomes:
         if item["violation"]:

@@ -266,7 +266,7 @@ class EnduroSat:
         pytest.fail("the file list never ends")
 
     def download(self, info: FileInfo, lose: Callable[[int, int], bool]) -> bytes:
-        """Blocks of 20 480 bytes; `lose` gives the packet that is lost in each burst of a block."""
+        """Blocks of 20 480 bytes; `lose` returns whether a packet is lost in a burst of a block."""
         file, offset = bytearray(-(-info.size // 20) * 20), 0
         received = 0
         while received < -(-info.size // 20):
