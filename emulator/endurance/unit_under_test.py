@@ -326,11 +326,13 @@ class UnitUnderTest:
             self._recorder.enter("clear_faults")
         self.faults.clear()
 
-    def end_pipeline(self) -> None:
-        """End the image pipeline, as the death of its process does."""
+    def end_pipeline(self) -> bool:
+        """End the image pipeline, as the death of its process does; return False if it renders images."""
         imager = self.emulation.imager
-        if isinstance(imager, ErrorModelImager):
-            imager.end("pipeline: ended by an endurance run")
+        if not isinstance(imager, ErrorModelImager):
+            return False
+        imager.end("pipeline: ended by an endurance run")
+        return True
 
     def set_disk(self, *, full: bool) -> None:
         """Set whether this process can write to files; by the kernel, so that it concerns every writer."""

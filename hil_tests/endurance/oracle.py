@@ -160,11 +160,7 @@ class Oracle:
         self.attitudes.motions.append(motion)
 
     def failed(self) -> None:
-        """The unit must be in the error mode, now."""
-        self.modes = {"error"}
-
-    def pipeline_ended(self) -> None:
-        """The image pipeline has ended: the error mode, until it is restarted and the mode is commanded."""
+        """The unit must be in the error mode, now, by a fault or because its image pipeline has ended."""
         self.modes = {"error"}
 
     def covered(self, *, fully: bool) -> None:

@@ -75,8 +75,8 @@ class Unit(Protocol):
         """End all faults."""
         ...
 
-    def end_pipeline(self) -> None:
-        """End the image pipeline unexpectedly."""
+    def end_pipeline(self) -> bool:
+        """End the image pipeline unexpectedly; return whether this is possible."""
         ...
 
     def set_disk(self, *, full: bool) -> None:
@@ -531,8 +531,8 @@ class LifeRun:
             self._connect()
 
     async def _end_pipeline(self, _step: Step) -> None:
-        self._unit.end_pipeline()
-        self._oracle.pipeline_ended()
+        if self._unit.end_pipeline():
+            self._oracle.failed()
 
     async def _disk(self, step: Step) -> None:
         self._unit.set_disk(full=step["full"])

@@ -18,6 +18,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_folders import bundled_units
 
 LIVES, STEPS = 4, 150
+READ_MODE = {"do": "request", "link": "serial", "row": ["", 160, "telemetry"]}
 
 
 def life_of(unit, seed, steps=STEPS):
@@ -36,6 +37,12 @@ def test_no_life_ends_in_a_violation(unit):
 def test_a_life_whose_images_are_rendered_ends_without_a_violation():
     outcome = run_once(life_of("sagitta", 5, 25), rendered=True)
     assert outcome.violation == ""
+
+
+def test_an_end_of_the_pipeline_is_left_out_of_a_life_whose_images_are_rendered():
+    steps = ({"do": "wait", "s": 5.0}, {"do": "end_pipeline"}, {"do": "wait", "s": 3.0}, READ_MODE)
+    life = replace(life_of("cubestar", 1, 1), links=("serial",), steps=steps)
+    assert [run_once(life, rendered=rendered).violation for rendered in (False, True)] == ["", ""]
 
 
 def test_a_seed_gives_one_life_and_one_outcome():
