@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
+from starid.cli.options import AsJson
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
 """Folder for the state of the units, if there is one: a stored parameter then costs no time on a disk."""
