@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from starid.lab.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 from starid.thesis.cme import matched_motion
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.matlab_filter import MatlabFilter, affine_inliers, trials_needed
 from starid.thesis.metrics import Confusion
-from starid.thesis.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 
 MAGNITUDES = np.array([0.5, 2.91, 1.93, 2.85, 1.58, 0.46, 1.29])
 POSITIONS = np.array(
