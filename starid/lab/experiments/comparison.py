@@ -48,6 +48,12 @@ def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
     return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
 
 
+def sampled_deviation(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two standard deviations over equally many trials, as a multiple of the standard error."""
+    error = sigma / math.sqrt(trials - 1)
+    return sigmas * error, f"{sigmas:g} standard errors of two deviations of {trials}, {sigmas * error:.2g}"
+
+
 def shown(
     quantity: str,
     *,
