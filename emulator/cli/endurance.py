@@ -205,7 +205,7 @@ def read_life(path: Path) -> Any:
         content = json.loads(read_user_text(path))
         links, steps = tuple(content["links"]), tuple(content["steps"])
         return Life(content["unit"], content["seed"], links, content["profile"], steps)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
 
 
