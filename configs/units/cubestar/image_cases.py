@@ -1,14 +1,15 @@
-"""Conformance of image and file download, on any link."""
+"""CubeStar's own cases of image and file download, on any link."""
 
 from __future__ import annotations
 
 from binascii import crc_hqx
 from typing import Final
 
+from starhil.configs.units.cubestar.controls import reset, standby
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.link_probe import INVALID_PARAMETER, SEQUENCE, LinkProbe
 from starhil.hil_tests.images import decode_bmp
-from starhil.protocol.values import Value
+from starhil.hil_tests.judge.messages import Value
 
 EDGE: Final = 64
 FRAME: Final = 128
@@ -31,14 +32,14 @@ FILES: Final = CaseArea[LinkProbe](
 
 def _save(probe: LinkProbe) -> None:
     """Store an image of 64 x 64 pixels."""
-    probe.standby()
+    standby(probe)
     probe.command("save_image", camera="star", image_size="size_64")
     probe.wait_for("image_status", {"percent": 100, "status": "ok"}, probe.times.image_s)
 
 
 @IMAGES.case("none", "without a stored image a download is refused with code 7")
 def no_image(probe: LinkProbe) -> None:
-    probe.reset()
+    reset(probe)
     for name, values in (("init_image_download", {"image_size": "size_64"}), ("advance_image_download", {"next_frame": 0}), ("start_burst", {})):  # fmt: skip
         probe.expect_refused(name, SEQUENCE, **values)
 
@@ -145,7 +146,7 @@ def one_by_one(probe: LinkProbe) -> None:
     _save(probe)
     _load(probe, 0, 990)
     sent = _burst(probe, 50, everything=True)
-    row = probe.icd.telemetry["file_packet"]
+    row = probe.unit.telemetry["file_packet"]
     for number, data in (*sent, sent[-1]):
         check_equal(probe.data_of(row), number.to_bytes(2, "little") + data, f"packet {number}")
 

@@ -1,4 +1,4 @@
-"""Conformance on any link: acknowledge, counters, data, time, modes, reset, parameter store."""
+"""CubeStar's own cases on any link: acknowledge, counters, data, time, modes, reset, parameter store."""
 
 from __future__ import annotations
 
@@ -7,6 +7,16 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Final
 
+from starhil.configs.units.cubestar.controls import (
+    CubeStarSettings,
+    parameter,
+    parameters_kept,
+    reset,
+    save_parameters,
+    set_parameter,
+    standby,
+    value_of,
+)
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_CRC,
@@ -15,13 +25,15 @@ from starhil.hil_tests.conformance.link_probe import (
     SEQUENCE,
     LinkProbe,
 )
-from starhil.hil_tests.conformance.unit_settings import save_parameters
-from starhil.protocol.values import Value
+from starhil.hil_tests.judge.messages import Value
 
 CLOCK_STEP_S: Final = 1_700_000_000
 CLOCK_TOLERANCE_S: Final = 0.25
 TEST_VALUE: Final = 137.0
 COUNTED: Final = 30
+
+settings = CubeStarSettings
+"""What a run records and restores."""
 
 ACKNOWLEDGE: Final = CaseArea[LinkProbe](
     "acknowledge",
@@ -51,7 +63,7 @@ def acknowledge_accepted(probe: LinkProbe) -> None:
         probe.command(name, **values)
         seen = probe.telemetry("acknowledge")
         wanted = {
-            "last_telecommand": probe.icd.telecommands[name].id,
+            "last_telecommand": probe.unit.telecommands[name].id,
             "processed": True,
             "error": "ok",
             "parameter_index": 0,
@@ -91,10 +103,10 @@ def acknowledge_forgets(probe: LinkProbe) -> None:
 )
 def acknowledge_crc(probe: LinkProbe) -> None:
     """The bytes are examples of the source's table: FF for no data, 72 for 5A."""
-    card, counters = (probe.icd.telecommands[name].id for name in ("format_card", "clear_counters"))
-    for row_id, data, code in ((counters, b"", 0xFF), (card, b"\x5a", 0x72)):
-        probe.expect_ack(row_id, data + bytes((code,)))
-        probe.expect_refusal(row_id, data + bytes((code ^ 1,)), INVALID_CRC)
+    for name, data, code in (("clear_counters", b"", 0xFF), ("format_card", b"\x5a", 0x72)):
+        row = probe.unit.telecommands[name]
+        probe.send_command(row, data + bytes((code,)))
+        probe.expect_refusal(row, data + bytes((code ^ 1,)), INVALID_CRC)
 
 
 # --- counters ---
@@ -156,8 +168,8 @@ ECHOES: Final = (
 
 def _echo(data: bytes, probe: LinkProbe) -> None:
     for chunk in (1, 8):
-        probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{chunk}"].id, data)
-        check_equal(probe.data_of(probe.icd.telemetry[f"hole_map_{chunk}"]), data, "the same bytes")
+        probe.send_command(probe.unit.telecommands[f"set_hole_map_{chunk}"], data)
+        check_equal(probe.data_of(probe.unit.telemetry[f"hole_map_{chunk}"]), data, "the same bytes")
 
 
 for _name, _data in ECHOES:
@@ -167,9 +179,9 @@ for _name, _data in ECHOES:
 @DATA.case("parts", "the eight parts of the hole map are independent")
 def parts(probe: LinkProbe) -> None:
     for part in range(1, 9):
-        probe.expect_ack(probe.icd.telecommands[f"set_hole_map_{part}"].id, bytes([part]) * 16)
+        probe.send_command(probe.unit.telecommands[f"set_hole_map_{part}"], bytes([part]) * 16)
     for part in range(1, 9):
-        seen = probe.data_of(probe.icd.telemetry[f"hole_map_{part}"])
+        seen = probe.data_of(probe.unit.telemetry[f"hole_map_{part}"])
         check_equal(seen, bytes([part]) * 16, f"part {part}")
 
 
@@ -253,8 +265,8 @@ def uptime(probe: LinkProbe) -> None:
 
 
 @MODES.case("standby", "in standby no attitude is valid, and the rows agree")
-def standby(probe: LinkProbe) -> None:
-    probe.standby()
+def in_standby(probe: LinkProbe) -> None:
+    standby(probe)
     probe.wait_for("device_status", {"attitude_valid": False}, 2.0)
     attitude = probe.telemetry("precise_attitude")
     check_equal((attitude["valid"], attitude["q_x"], attitude["q_w"]), (False, 0.0, 0.0), "valid, q_x, q_w")
@@ -264,10 +276,10 @@ def standby(probe: LinkProbe) -> None:
 
 @MODES.case("frames", "frames are taken at the update rate outside standby, and none in standby", rule(12))
 def frames(probe: LinkProbe) -> None:
-    probe.standby()
-    with probe.parameters_kept("update_rate", "exposure"):
-        probe.set_parameter("exposure", 50.0)
-        probe.set_parameter("update_rate", 5.0)
+    standby(probe)
+    with parameters_kept(probe, "update_rate", "exposure"):
+        set_parameter(probe, "exposure", 50.0)
+        set_parameter(probe, "update_rate", 5.0)
         probe.command("set_mode", mode="lost_in_space")
         probe.sleep(0.6)
         first = _frames(probe)
@@ -283,7 +295,7 @@ def frames(probe: LinkProbe) -> None:
 
 @MODES.case("changes", "mode and its counter follow the command", rule(13))
 def changes(probe: LinkProbe) -> None:
-    probe.standby()
+    standby(probe)
     first = int(probe.telemetry("device_status")["mode_changes"])
     probe.command("set_mode", mode="lost_in_space")
     mode = probe.telemetry("device_status")["mode"]
@@ -297,7 +309,7 @@ def changes(probe: LinkProbe) -> None:
 
 @MODES.case("no-tracking", "tracking without an attitude to start from is refused with code 7", rule(14))
 def no_tracking(probe: LinkProbe) -> None:
-    probe.reset()
+    reset(probe)
     probe.expect_refused("set_mode", SEQUENCE, mode="tracking")
     check_equal(probe.telemetry("device_status")["mode"], "standby", "mode")
 
@@ -307,13 +319,13 @@ def no_tracking(probe: LinkProbe) -> None:
     "with stars in view, the attitude is valid, of unit length and recent, and all rows agree",
     rule(15),
 )
-def attitude(probe: LinkProbe) -> None:
-    probe.standby()
+def valid_attitude(probe: LinkProbe) -> None:
+    standby(probe)
     probe.command("set_mode", mode="lost_in_space")
     end = probe.now() + 20.0
     while not (seen := probe.telemetry("precise_attitude"))["valid"]:
         if probe.now() > end:
-            probe.standby()
+            standby(probe)
             raise CaseSkipped("no attitude was found within 20 s: no stars in view?")
         probe.sleep(0.1)
     clock = float(probe.telemetry("device_status")["clock"])
@@ -334,9 +346,9 @@ def attitude(probe: LinkProbe) -> None:
 def reset_magic(probe: LinkProbe) -> None:
     """The refused numbers include CubeWheel's, 0x55."""
     before = probe.telemetry("boot_status")["boot_count"]
-    row = probe.icd.telecommands["reset"]
+    row = probe.unit.telecommands["reset"]
     for magic in (0x00, 0x55, 0x59, 0x5B, 0xFF):
-        probe.expect_refusal(row.id, bytes([magic]), INVALID_PARAMETER)
+        probe.expect_refusal(row, bytes([magic]), INVALID_PARAMETER)
     probe.sleep(0.2)
     check_equal(probe.telemetry("boot_status")["boot_count"], before, "boot count")
 
@@ -348,7 +360,7 @@ def reset_magic(probe: LinkProbe) -> None:
 def reset_acknowledged(probe: LinkProbe) -> None:
     before = probe.telemetry("boot_status")
     began = probe.now()
-    probe.reset()
+    reset(probe)
     seen = probe.telemetry("boot_status")
     check_equal(int(seen["boot_count"]), (int(before["boot_count"]) + 1) % 65536, "boot count")
     check_equal(seen["reset_cause"], "command", "reset cause")
@@ -363,40 +375,40 @@ def reset_acknowledged(probe: LinkProbe) -> None:
 
 @STORE.case("reset", "at a reset, an unsaved parameter is lost and a saved one kept")
 def store_reset(probe: LinkProbe) -> None:
-    before = probe.value_of("exposure")
-    probe.set_parameter("exposure", TEST_VALUE)
+    before = value_of(probe, "exposure")
+    set_parameter(probe, "exposure", TEST_VALUE)
     probe.wait_for("device_status", {"parameters_changed": True}, 1.0)
     save_parameters(probe)
-    probe.set_parameter("exposure", TEST_VALUE + 1)
-    probe.reset()
+    set_parameter(probe, "exposure", TEST_VALUE + 1)
+    reset(probe)
     try:
-        check_equal(probe.value_of("exposure"), TEST_VALUE, "saved exposure")
+        check_equal(value_of(probe, "exposure"), TEST_VALUE, "saved exposure")
     finally:
-        probe.set_parameter("exposure", before)
+        set_parameter(probe, "exposure", before)
         save_parameters(probe)
 
 
 @STORE.case("restore", "restore_parameters applies the stored values", rule(17))
 def store_restore(probe: LinkProbe) -> None:
-    before = probe.value_of("exposure")
+    before = value_of(probe, "exposure")
     save_parameters(probe)
-    probe.set_parameter("exposure", TEST_VALUE)
+    set_parameter(probe, "exposure", TEST_VALUE)
     probe.command("restore_parameters")
-    check_equal(probe.value_of("exposure"), before, "exposure")
+    check_equal(value_of(probe, "exposure"), before, "exposure")
 
 
 @STORE.case("defaults", "default_parameters sets the defaults and keeps the stored values", rule(18))
 def store_defaults(probe: LinkProbe) -> None:
     save_parameters(probe)
-    stored = probe.value_of("limiting_magnitude")
-    probe.set_parameter("limiting_magnitude", 4.25)
+    stored = value_of(probe, "limiting_magnitude")
+    set_parameter(probe, "limiting_magnitude", 4.25)
     save_parameters(probe)
     probe.command("default_parameters")
-    seen = probe.parameter("limiting_magnitude")
+    seen = parameter(probe, "limiting_magnitude")
     check_equal(seen["value"], seen["default"], "limiting_magnitude")
     probe.command("restore_parameters")
-    check_equal(probe.value_of("limiting_magnitude"), 4.25, "stored limiting_magnitude")
-    probe.set_parameter("limiting_magnitude", stored)
+    check_equal(value_of(probe, "limiting_magnitude"), 4.25, "stored limiting_magnitude")
+    set_parameter(probe, "limiting_magnitude", stored)
     save_parameters(probe)
 
 
@@ -406,14 +418,14 @@ def store_defaults(probe: LinkProbe) -> None:
     "CubeComputer TC 37, TLM 202 (AlbertaSat)",
 )
 def star_config(probe: LinkProbe) -> None:
-    row = probe.icd.telecommands["set_star_config"]
+    row = probe.unit.telecommands["set_star_config"]
     before = probe.telemetry("star_config")
     wanted = {**before, "exposure": 140, "max_stars_matched": 40}
     probe.command("set_star_config", **wanted)
     check_equal(probe.telemetry("star_config"), wanted, "star_config")
-    check_equal(probe.value_of("exposure"), 140.0, "parameter exposure")
+    check_equal(value_of(probe, "exposure"), 140.0, "parameter exposure")
     bad = bytearray(row.encode({**wanted, "exposure": 160}))
-    bad[row.named_fields["max_stars_matched"].offset] = 0
-    probe.expect_refusal(row.id, bytes(bad), INVALID_PARAMETER)
+    bad[row.named["max_stars_matched"].offset] = 0
+    probe.expect_refusal(row, bytes(bad), INVALID_PARAMETER)
     check_equal(probe.telemetry("star_config"), wanted, "star_config after a refusal")
     probe.command("set_star_config", **before)
