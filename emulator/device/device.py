@@ -232,8 +232,11 @@ class Device:
             self._end_boot()
 
     def _end_boot(self) -> None:
+        """Leave the boot mode for the start mode, unless a fault has already done so."""
+        if self.modes.mode is not Mode.BOOT:
+            return
         self.modes.booted()
-        if self.parameters["start_mode"] == "lost_in_space" and self.modes.mode is Mode.STANDBY:
+        if self.parameters["start_mode"] == "lost_in_space":
             self.modes.command(Mode.LOST_IN_SPACE, has_attitude=False)
 
     # --- persistent state ---
