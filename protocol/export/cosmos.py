@@ -13,7 +13,7 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
-from starhil.protocol.export.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
+from starhil.protocol.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
 from starhil.protocol.values import EnumDefinition
 
 TARGET: Final = "STARHIL"

@@ -15,8 +15,8 @@ from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
-from starhil.protocol.export.quoting import Scope, dbc_string
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.quoting import Scope, dbc_string
 from starhil.protocol.values import EnumDefinition, IcdError
 
 EXTENDED: Final = 0x80000000

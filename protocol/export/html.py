@@ -7,7 +7,7 @@ from typing import Final
 
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
-from starhil.protocol.export.quoting import html_text
+from starhil.protocol.quoting import html_text
 from starhil.protocol.values import Section
 
 _STYLE: Final = """

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
-from starhil.protocol.export.quoting import markdown, one_line
+from starhil.protocol.quoting import markdown, one_line
 from starhil.protocol.values import Section
 
 

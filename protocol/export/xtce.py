@@ -14,7 +14,7 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
-from starhil.protocol.export.quoting import Scope, one_line, xtce_name
+from starhil.protocol.quoting import Scope, one_line, xtce_name
 
 NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
 PACKET: Final = "Packet"

@@ -16,7 +16,7 @@ from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.c.rows import RowCode
 from starhil.protocol.export.packets import key_of
-from starhil.protocol.export.quoting import Scope, c_comment, identifier
+from starhil.protocol.quoting import Scope, c_comment, identifier
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack
 
