@@ -64,12 +64,12 @@ def command(
 
     if life is not None:
         found = read_life(life)
-        outcomes = [live(found.unit, found, rendered=False, folder=output)]
+        outcomes = [{**live(found.unit, found, rendered=False, folder=output), "kind": "usual"}]
     else:
         kinds = {"rendered": (rendered, RENDERED_STEPS), "long": (long, LONG_STEPS), "usual": (1, steps)}
         plan = _plan(unit or sorted(bundled_units()), seed, None if hours is not None else lives, kinds)
         outcomes = list(_run(plan, output, jobs, lives, hours))
-    figures = summary(outcomes)
+    figures = {"seed": seed, **summary(outcomes)}
     if as_json:
         print(json.dumps({**figures, "violations": [item for item in outcomes if item["violation"]]}))
     else:
@@ -128,7 +128,7 @@ def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) ->
 
     icd = load_unit(unit)
     life = make_life(icd, unit, links_of(icd), seed, steps, is_long=kind == "long")
-    return live(unit, life, rendered=kind == "rendered", folder=folder)
+    return {**live(unit, life, rendered=kind == "rendered", folder=folder), "kind": kind}
 
 
 def live(unit: str, life: Any, *, rendered: bool, folder: Path) -> dict[str, Any]:
@@ -260,9 +260,12 @@ def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
         table.add_row(name, *(format(row[key], text) for key, text in formats.items()))
     Console().print(table)
     print(
-        f"years under power and taking images; {figures['cpu_hours']:.2f} h of processor time, factor {figures['factor']:.0f}"
+        f"Years under power, and taking images. Seed {figures['seed']}; {figures['cpu_hours']:.2f} h of processor time, "
+        f"device time : processor time {figures['factor']:.0f}"
     )
     for item in outcomes:
         if item["violation"]:
             print(f"{item['unit']} seed {item['seed']}: {item['violation']}")
             print(f"  {item['steps']} steps; {' '.join(item['files'])}")
+            kind = f"--rendered {int(item['kind'] == 'rendered')} --long {int(item['kind'] == 'long')}"
+            print(f"  starhil endurance --unit {item['unit']} --seed {item['seed']} --lives 1 {kind}")

@@ -17,8 +17,8 @@ from pydantic import TypeAdapter
 
 from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
 from starhil.emulator.control.faults import FaultRequest, Faults
-from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Background
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.endurance.simulated_loop import WORKER_WAIT_S
 from starhil.emulator.errors import EmulatorError
@@ -257,7 +257,7 @@ class UnitUnderTest:
         self._emulation = Emulation(self.profile, tape=tape)
         await self._emulation.open()
         self._faults = Faults(self._emulation.device, self._emulation.links)
-        self._emulation.device.on_frame.append(self._count_frame)
+        self._emulation.device.signals.frame_published.connect(self._count_frame)
         if self._recorder is not None:
             path = self._recorder.folder / TRUTH_FILE
             self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)

@@ -8,7 +8,7 @@ Lives do not change the mapping.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from starhil.hil_tests.endurance.oracle import Oracle
@@ -48,8 +48,7 @@ class _Mapped:
             return {}
         if packed is not None and field.width == 0:
             raw = int.from_bytes(data, "little", signed=packed.type.startswith("i"))
-            narrow = replace(field, kind="integer", scale=packed.scale)
-            return {} if field.value is None else {field.value: (narrow, raw * packed.scale)}
+            return {} if field.value is None else {field.value: (field, raw * packed.scale)}
         content = bytearray(self.row.size)
         content[span_of(field.slot)] = in_order(field.slot, data)
         values = self.row.decode(bytes(content))
@@ -148,4 +147,7 @@ def _mapped(icd: InterfaceDefinition, dictionary: DeviceDictionary, name: str) -
     row_name, _, field_name = source.partition(".")
     row = icd.telemetry[row_name]
     size = type_size(dictionary.entries[dictionary.key_of(name)].variable.data_type)
-    return _Mapped(size or 0, row, row.named_fields[field_name], packed)
+    field = row.named_fields[field_name]
+    if packed is not None and field.width == 0:
+        field = field.changed(kind="integer", scale=packed.scale)
+    return _Mapped(size or 0, row, field, packed)
