@@ -12,8 +12,8 @@ from pathlib import Path
 from urllib.parse import quote
 
 from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock, make_clock
-from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Background, Device, outcome, run_at_once
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import FileStore, MemoryStore, StateStore
@@ -178,7 +178,7 @@ class Emulation:
         imager = self.imager if self.tape is None else self.tape.imager(self.imager)
         device = Device(self.profile, self.icd, self.clock, imager, store, truth, background)
         self._requests = Requests(device)
-        device.on_frame.append(_log_frame)
+        device.signals.frame_published.connect(_log_frame)
         device.power_on()
         try:
             await self._open_links(self._requests)
@@ -258,7 +258,7 @@ class Emulation:
         """Replace the truth of all heads."""
         self.body_truth = truth
         for head in self.heads:
-            head.device.cycle.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
+            head.device.surroundings.truth = head._mounted(truth, config)  # noqa: SLF001 (of this class)
 
     def _mounted(self, truth: TruthSource, config: TruthConfig) -> TruthSource:
         """Return the truth of this head, with the mount in a configuration, or else in its profile."""
@@ -425,7 +425,7 @@ class Emulation:
             warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
             self._record_entry("ready")
-            device.on_mode.append(
+            device.signals.mode_changed.connect(
                 lambda transition: self._awake.set() if transition.before is Mode.BOOT else None
             )
             self.pipeline_ready(warm)

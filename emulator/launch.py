@@ -117,7 +117,8 @@ class Head:
         emulation = self.emulation
         await emulation.open()
         self._faults = Faults(emulation.device, emulation.links)
-        emulation.device.on_frame += [log.write for log in self._truth_logs]
+        for log in self._truth_logs:
+            emulation.device.signals.frame_published.connect(log.write)
 
     def enter(self, scenario: Scenario) -> None:
         """Schedule a scenario; only the first head sets its truth."""

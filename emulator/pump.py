@@ -41,7 +41,7 @@ class ClockPump:
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
-        scheduler.on_add = self._event_added
+        scheduler.added.connect(self._event_added)
 
     def start(self) -> None:
         """Start to run events."""
@@ -55,7 +55,7 @@ class ClockPump:
             self._timer.cancel()
             self._timer = None
 
-    def _event_added(self) -> None:
+    def _event_added(self, _event: Event) -> None:
         """Wake up earlier if the new event is due first."""
         if self._running and (self._timer is None or self._due_s() < self._timer.when()):
             self._schedule_next()

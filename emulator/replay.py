@@ -420,7 +420,7 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
         log = TruthLog(truth_log, wall_times=False)
         try:
             await emulation.open()
-            emulation.device.on_frame.append(log.write)
+            emulation.device.signals.frame_published.connect(log.write)
             faults = Faults(emulation.device, emulation.links)
             _enter_scenario(folder, emulation, faults)
             warm = await emulation.imager.start()

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.cycle import Measurement, as_quaternion
+from starhil.emulator.device.measurement import Measurement, as_quaternion
 from starhil.emulator.output_file import Output, OutputFile
 from starid.attitude import Attitude
 

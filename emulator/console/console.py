@@ -19,7 +19,7 @@ from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.trace import RequestEncoder, WireTrace
 from starhil.emulator.console.viewer import Viewer
-from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
@@ -98,8 +98,8 @@ class Console:
     def start(self) -> None:
         """Start listening."""
         device = self._emulation.device
-        device.on_frame.append(self._frame_published)
-        device.on_mode.append(self._mode_changed)
+        device.signals.frame_published.connect(self._frame_published)
+        device.signals.mode_changed.connect(self._mode_changed)
         profile = self._emulation.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
         self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, profile.epoch))

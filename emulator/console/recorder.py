@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.history import COLUMNS, MODES, History, json_row
 from starhil.emulator.console.obc import ObcClient, decode
-from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.guard import log_internal_error
@@ -127,8 +127,8 @@ class McapRecorder:
         """Start recording."""
         emulation = self._emulation
         emulation.imager.watchers.add(self)
-        emulation.device.on_frame.append(self._record_frame)
-        emulation.device.on_mode.append(self._record_mode)
+        emulation.device.signals.frame_published.connect(self._record_frame)
+        emulation.device.signals.mode_changed.connect(self._record_mode)
         self._task = asyncio.create_task(self._record_telemetry())
 
     async def close(self) -> None:

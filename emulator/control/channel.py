@@ -49,7 +49,7 @@ from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
-from starhil.emulator.device.cycle import Measurement, as_quaternion
+from starhil.emulator.device.measurement import Measurement, as_quaternion
 from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import until_cancelled
@@ -127,7 +127,7 @@ class ControlServer:
             "quit": self._quit_run,
         }
         for target in targets:
-            target.emulation.device.on_frame.append(target.frames.append)
+            target.emulation.device.signals.frame_published.connect(target.frames.append)
 
     async def start(self, where: str) -> str:
         """Listen on `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
@@ -357,7 +357,7 @@ def _record_command(target: ControlTarget, kind: str, **values: Any) -> None:
 
 
 def _state(emulation: Emulation, run_ns: int) -> TruthState:
-    return emulation.device.cycle.truth.state(run_ns / NANOSECONDS)
+    return emulation.device.surroundings.truth.state(run_ns / NANOSECONDS)
 
 
 class _Truth(BaseModel):

@@ -137,7 +137,7 @@ class Faults:
         device = self._device
         if request.optical is not None:
             self._optical = dict(request.optical)
-            device.cycle.faults = lambda _index: self._optical
+            device.surroundings.set_faults(self._optical)
         faults = {"serial": request.serial, "can": request.can}
         for name, wire in self._wires:
             fault = faults[name]
@@ -156,7 +156,7 @@ class Faults:
         if upset.parameter is not None:
             self._device.upset_parameter(upset.parameter, upset.bit)
         elif upset.star is not None:
-            self._device.cycle.upsets += (CatalogUpset(upset.star, upset.component, upset.bit),)
+            self._device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected.
@@ -202,9 +202,9 @@ class Faults:
         """End all faults; the error mode ends only by telecommand, and flipped parameters by a restart."""
         self._optical = {}
         device = self._device
-        device.cycle.faults = lambda _index: {}
+        device.surroundings.set_faults({})
         device.unresponsive = False
-        device.cycle.upsets = ()
+        device.cycle.restore_catalog()
         for _, wire in self._wires:
             wire.settings = WireFaultSettings()
 

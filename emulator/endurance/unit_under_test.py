@@ -245,7 +245,7 @@ class UnitUnderTest:
         if self._recorder is not None:
             path = self._recorder.folder / TRUTH_FILE
             self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
-            self._emulation.device.on_frame.append(self._truth_log.write)
+            self._emulation.device.signals.frame_published.connect(self._truth_log.write)
         self._emulation.begin()
         await self._emulation.ready()
 

@@ -48,7 +48,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
-        self._device.parameters.observe(self._parameters_changed)
+        self._device.signals.parameters_changed.connect(self._parameters_changed)
 
     def _wanted_baud(self) -> int:
         return int(self._device.parameters["serial_baud"])

@@ -120,7 +120,7 @@ def talkative(unit: SimulatedUnit) -> None:
     def say(reply: Reply) -> None:
         unit.link._send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY), Dialect.B)
 
-    unit.requests.unsolicited_receivers[:] = [say]
+    unit.device.signals.unsolicited.observers[:] = [say]
 
 
 def _answering(row_id: int):

@@ -351,7 +351,7 @@ def gen2(link: str = "serial") -> Iterator[UnitMutant]:
 
 def _as_replies(unit: SimulatedUnit) -> None:
     send = unit.link._send_unsolicited
-    unit.requests.unsolicited_receivers[:] = [
+    unit.device.signals.unsolicited.observers[:] = [
         lambda reply: send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY))
     ]
 

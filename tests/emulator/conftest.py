@@ -12,6 +12,7 @@ import pytest
 
 from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore, StateStore
 from starhil.emulator.emulation import Emulation
@@ -158,7 +159,11 @@ class Bench:
         """Send a telecommand; return all replies."""
         row = self.icd.telecommands[name]
         request = self.icd.request(row, row.encode(values) if data is None else data)
-        return self.requests.handle(request, self.later.append) or []
+        answer = self.requests.handle(request)
+        if not isinstance(answer, PendingAnswer):
+            return answer
+        answer.when_done(self.later.extend)
+        return []
 
     def command(self, name: str, **values: object) -> ErrorCode:
         """Send a telecommand; return what it was answered with."""

@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady
 from starhil.protocol.messages import ErrorCode, Request
@@ -52,8 +53,8 @@ class FakeImager(DirectImager):
 def command(emulation, name, **values) -> ErrorCode | None:
     """Send a telecommand past the links; return its error code, or None while its outcome is open."""
     row = emulation.device.icd.telecommands[name]
-    replies = emulation.requests.handle(Request.of(row.id, row.encode(values)))
-    return ErrorCode(replies[0].code) if replies else None
+    answer = emulation.requests.handle(Request.of(row.id, row.encode(values)))
+    return None if isinstance(answer, PendingAnswer) else ErrorCode(answer[0].code)
 
 
 def read(emulation, name) -> dict:

@@ -31,7 +31,7 @@ def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
     async def scenario(emulation, _line):
         truth.unlink()
         await emulation.stepper.step(7.0)
-        return emulation.device.cycle.truth.state(7.0).attitude
+        return emulation.device.surroundings.truth.state(7.0).attitude
 
     options = RunOptions(scenario=str(path))
     with pytest.raises(EmulatorError, match="truth file"):
@@ -122,7 +122,7 @@ def test_a_truth_log_can_be_replayed(run, tmp_path):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(5.0)
-        wanted.append(emulation.device.cycle.truth.state(2.4))
+        wanted.append(emulation.device.surroundings.truth.state(2.4))
 
     run(scenario, options=RunOptions(truth_log=path), truth=rate)
     replayed = read_truth_file(path).state(2.4)
@@ -151,7 +151,7 @@ def test_scenario_events_happen_at_their_simulation_times(run, tmp_path):
         assert run.launched.faults.describe() == {"optical": {"false_stars": 3}, "device": {"stuck": True}}
         await emulation.stepper.step(1.0)
         assert run.launched.faults.describe() == {}
-        assert emulation.device.cycle.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
+        assert emulation.device.surroundings.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
 
     run(scenario, options=RunOptions(scenario=str(path)))
 
@@ -191,7 +191,7 @@ def test_a_truth_file_of_a_scenario_is_read_at_the_start_and_starts_at_its_time(
     async def scenario(emulation, _line):
         table.unlink()
         await emulation.stepper.step(4.0)
-        return emulation.device.cycle.truth.state(3.5).attitude.ra_deg
+        return emulation.device.surroundings.truth.state(3.5).attitude.ra_deg
 
     assert run(scenario, options=RunOptions(scenario=str(path))) == pytest.approx(15.0)
 
@@ -447,8 +447,8 @@ def test_an_observer_that_fails_stops_neither_the_frames_nor_the_other_observers
     async def scenario(emulation, _line):
         device = emulation.device
         seen = []
-        device.on_frame[:0] = [lambda _measurement: 1 / 0]
-        device.on_frame.append(seen.append)
+        device.signals.frame_published.observers.insert(0, lambda _measurement: 1 / 0)
+        device.signals.frame_published.connect(seen.append)
         if emulation.stepper:
             await emulation.stepper.step(1.0)  # the boot
         assert command(emulation, "set_mode", mode="lost_in_space") is ErrorCode.OK

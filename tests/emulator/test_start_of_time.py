@@ -72,7 +72,7 @@ def test_truth_and_boot_wait_for_a_slow_start(run, slow_start, clock):
     async def scenario(emulation, _line):
         if emulation.stepper:
             await emulation.stepper.step(0.1)
-        return emulation.device.cycle.truth.state(emulation.clock.now_ns() * 1e-9).attitude.ra_deg
+        return emulation.device.surroundings.truth.state(emulation.clock.now_ns() * 1e-9).attitude.ra_deg
 
     ra_deg = run(scenario, clock=clock, truth=SLEW, device={"boot_s": 0.1})
     assert before == [(0, "boot")]
@@ -154,7 +154,7 @@ def test_a_live_feed_that_runs_during_a_slow_start_is_anchored_at_its_end(run, s
     slow_start.during = during
 
     async def scenario(emulation, _line):
-        return emulation.device.cycle.truth.state(emulation.clock.now_ns() * 1e-9)
+        return emulation.device.surroundings.truth.state(emulation.clock.now_ns() * 1e-9)
 
     state = run(scenario, clock="real", truth={"kind": "live", "stale_s": 60.0}, device={"boot_s": 0.0})
     assert state.attitude.ra_deg == pytest.approx(99.0, abs=1.0)

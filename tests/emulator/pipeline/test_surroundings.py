@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
 from starhil.emulator.pipeline.messages import CatalogUpset, FrameRequest, FrameResult

@@ -165,7 +165,7 @@ def test_lock_step_gives_the_same_truth_log_twice_and_time_passes_as_in_42(run, 
 def test_an_exposure_in_lock_step_sees_the_attitude_of_its_time(run):
     async def scenario(emulation, _line):
         frames = []
-        emulation.device.on_frame.append(frames.append)
+        emulation.device.signals.frame_published.connect(frames.append)
         stub = Stub42(blocks_of_42(51))
         await stub.connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
         return frames
