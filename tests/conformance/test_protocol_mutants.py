@@ -11,7 +11,7 @@ from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.icd import check_unit
+from starhil.protocol.unit_examples import check_unit
 from tests.conformance.links import LINKS, write_unit
 from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutant, read_mutants
 from tests.conformance.simulated import SimulatedUnit

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -16,7 +15,7 @@ from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition, load_unit
-from starhil.protocol.messages import ErrorCode, MessageClass, Reply, ReplyKind, RequestKind
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.serial_framing import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import bundled_units
@@ -159,7 +158,8 @@ def test_can_frames_are_the_published_vectors():
     assert read_answer(CanFrame(0x06850401, b"\x03"), lambda: None) == Answer("nack", 3, row_id=133, other=1)
 
 
-def test_classes_of_messages_name_the_kind_of_an_unknown_id():
-    unit = replace(read_unit("sagitta"), classes=(MessageClass("get", RequestKind.TELEMETRY, 1),))
-    assert unit.request(200, klass="get").telemetry
+def test_classes_and_ids_name_the_kind_of_an_unknown_id():
+    sagitta = read_unit("sagitta")
+    assert sagitta.request(200, klass="parameter").telemetry
+    assert not sagitta.request(200, klass="action").telemetry
     assert not read_unit("cubestar").request(31).telemetry
