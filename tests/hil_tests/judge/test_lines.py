@@ -16,7 +16,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.link_schema import SerialLinkModel
 from starhil.protocol.messages import ErrorCode, MessageClass, Reply, ReplyKind, RequestKind
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import bundled_units
 
