@@ -14,8 +14,8 @@ from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition, load_unit
-from starhil.protocol.link_schema import SerialLinkModel
-from starhil.protocol.messages import ErrorCode, MessageClass, Reply, ReplyKind, RequestKind
+from starhil.protocol.link_schema import MessageClass, SerialLinkModel
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, RequestKind
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import bundled_units
@@ -198,6 +198,8 @@ def test_can_frames_are_the_published_vectors():
 
 
 def test_classes_of_messages_name_the_kind_of_an_unknown_id():
-    unit = replace(read_unit("sagitta"), classes=(MessageClass("get", RequestKind.TELEMETRY, 1),))
+    unit = replace(
+        read_unit("sagitta"), classes=(MessageClass(name="get", kind=RequestKind.TELEMETRY, code=1),)
+    )
     assert unit.request(200, klass="get").telemetry
     assert not read_unit("cubestar").request(31).telemetry
