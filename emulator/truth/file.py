@@ -17,6 +17,7 @@ Empty lines and lines that begin with ``#`` are ignored.
 
 from __future__ import annotations
 
+import copy
 import csv
 import math
 from pathlib import Path
@@ -102,6 +103,12 @@ class FileTruth:
         self.start_s = start_s
         self.repeat = repeat
         self.orbit = orbit
+
+    def starting_at(self, start_s: float) -> FileTruth:
+        """Return the same truth with another simulation time of the file's time zero."""
+        other = copy.copy(self)
+        other.start_s = start_s
+        return other
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""

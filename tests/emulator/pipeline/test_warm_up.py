@@ -11,7 +11,7 @@ SCRIPT = """
 import sys
 from dataclasses import replace
 from numba.core.dispatcher import Dispatcher
-from starhil.emulator.emulation import pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import load_profile
 

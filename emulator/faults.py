@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -11,7 +11,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.parameters import memory_bits
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import Link
-from starhil.emulator.links.wire_faults import WireFaultSettings
+from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
@@ -117,13 +117,17 @@ class Faults:
     device
         Device that the faults affect.
     links
-        Open links of the device.
+        The links of the device, also those that are opened later.
     """
 
-    def __init__(self, device: Device, links: Iterable[Link]) -> None:
+    def __init__(self, device: Device, links: Sequence[Link]) -> None:
         self._device = device
-        self._wires = [(link.bus, link.wire) for link in links]
+        self._links = links
         self._optical: dict[str, Any] = {}
+
+    @property
+    def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
+        return [(link.bus, link.wire) for link in self._links]
 
     def inject(self, request: FaultRequest) -> None:
         """Inject the faults of a request, all or none.
