@@ -31,7 +31,7 @@ $(VENV)/.product: pyproject.toml | $(VENV)/pyvenv.cfg
 $(VENV)/.developer: pyproject.toml | $(VENV)/pyvenv.cfg
 	$(BIN)/pip install --quiet --no-compile --editable '.[test,lint,basilisk]' \
 		|| $(BIN)/pip install --quiet --no-compile --editable '.[test,lint]'
-	@touch $(VENV)/.product $@
+	@touch $(VENV)/.product $(VENV)/.lab $@
 
 demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
@@ -46,6 +46,10 @@ lint: $(VENV)/.developer
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+$(VENV)/.lab: $(VENV)/.product
+	$(BIN)/pip install --quiet --editable '.[lab]'
+	@touch $@
+
 $(VENV)/.docs: $(VENV)/.product
 	$(BIN)/pip install --quiet --editable '.[docs]'
 	@touch $@
@@ -56,8 +60,8 @@ docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html --doctree-dir out/doctrees docs out/docs
 	@echo "out/docs/index.html"
 
-reproduce: $(VENV)/.product
-	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)
+reproduce: $(VENV)/.lab
+	$(BIN)/starid reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
 	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_composed_faults.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py

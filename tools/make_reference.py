@@ -483,15 +483,18 @@ def device_parameters() -> str:
 
 
 def commands() -> str:
-    """Every command of the command line, with its arguments and options."""
+    """Every command of both programs, with its arguments and options."""
     import typer.main
 
-    from starhil.emulator.cli.app import COMMANDS, build_app
+    from starhil.emulator.cli import app as starhil
+    from starid.cli import app as starid
 
-    app: Any = typer.main.get_command(build_app())
-    return "\n\n".join(
-        part for name in COMMANDS for part in command_parts(f"starhil {name}", app.commands[name])
-    )
+    parts: list[str] = []
+    for program in (starhil, starid):
+        app: Any = typer.main.get_command(program.build_app())
+        for name in program.COMMANDS:
+            parts += command_parts(f"{app.name} {name}", app.commands[name])
+    return "\n\n".join(parts)
 
 
 def command_parts(name: str, command: Any) -> Iterator[str]:

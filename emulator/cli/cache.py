@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import report_slow_start
+from starid.cli.options import AsJson
 
 group = typer.Typer(
     help="Show, fill or clear the cache of star catalogues, indices, databases and machine code of kernels."

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
+from starid.cli.options import AsJson
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
 """Folder for the state of the units, if there is one: a stored parameter then costs no time on a disk."""
@@ -205,7 +205,7 @@ def read_life(path: Path) -> Any:
         content = json.loads(read_user_text(path))
         links, steps = tuple(content["links"]), tuple(content["steps"])
         return Life(content["unit"], content["seed"], links, content["profile"], steps)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise EmulatorError(f"{path}: not a life of `starhil endurance`: {error}") from None
 
 

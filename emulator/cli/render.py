@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 from starhil.emulator.errors import EmulatorError
+from starid.cli.output import output_help, prepare_output, report_stream
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.model import SensorModel
@@ -175,7 +175,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _marked(frame: Frame) -> Any:
     """Mark the stars of an image, with names or Hipparcos numbers for the bright ones."""
-    from starhil.emulator.cli.annotate import annotate, star_label
+    from starid.photograph.annotation import annotate, star_label
 
     stars = frame.stars
     labels = [

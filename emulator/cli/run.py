@@ -7,8 +7,10 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import DIALECTS, UnitChoice, one_of
-from starhil.emulator.cli.output import output_help, prepare_output, report_slow_start
+from starhil.emulator.cli.options import DIALECTS, UnitChoice
+from starhil.emulator.cli.output import report_slow_start
+from starid.cli.options import one_of
+from starid.cli.output import output_help, prepare_output
 
 
 def command(

@@ -146,6 +146,8 @@ class ConsoleServer:
             response = await handler(request)
         except EmulatorError as error:
             return web.Response(status=400, text=f"{error}\n", headers=HEADERS)
+        except ConnectionError:  # the page is closed, and nobody reads the response
+            return web.Response()
         if not response.prepared:
             response.headers.update(HEADERS)
         return response

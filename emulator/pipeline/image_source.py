@@ -105,7 +105,7 @@ class CheckedImages:
         if (width, height) != (self._camera.width, self._camera.height):
             raise EmulatorError(
                 f"images: {width}×{height} pixels, the camera of the profile has {self._camera.width}×"
-                f"{self._camera.height}; set [camera] to the camera that takes them (starhil calibrate writes it)"
+                f"{self._camera.height}; set [camera] to the camera that takes them (starid calibrate writes it)"
             )
         return image if self._excess is None else without_dark(image, self._excess)
 

@@ -53,7 +53,7 @@ def photographs():
 
 @pytest.fixture
 def profile(tmp_path, photographs):
-    """A profile of a folder with the photographs and the camera as `starhil calibrate` writes it."""
+    """A profile of a folder with the photographs and the camera as `starid calibrate` writes it."""
     (tmp_path / "night").mkdir()
     for number, image in enumerate(photographs):
         write_image(tmp_path / "night" / f"{number:03d}.png", image)

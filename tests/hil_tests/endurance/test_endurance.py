@@ -1,7 +1,6 @@
 """Random lives of units: none ends in a violation, the same seed gives the same life, and what fails is written."""
 
 import asyncio
-import json
 from dataclasses import asdict, replace
 
 import pytest
@@ -10,6 +9,7 @@ from starhil.emulator.cli.endurance import live, read_life, run_once
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.endurance.unit_under_test import links_of
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.life import Life, make_life
 from starhil.hil_tests.endurance.shrink import kind_of, shortened
@@ -82,10 +82,11 @@ def test_a_store_that_loses_what_it_stores_is_found(monkeypatch):
     assert violating("cubestar")[1]
 
 
-def test_a_file_that_is_no_life_is_rejected(tmp_path):
+@pytest.mark.parametrize("text", ['{"unit": "cubestar"}', "[]", "[" * 5000], ids=["keys", "list", "deep"])
+def test_a_file_that_is_no_life_is_rejected(tmp_path, text):
     path = tmp_path / "life.json"
-    path.write_text(json.dumps({"unit": "cubestar"}))
-    with pytest.raises(Exception, match=r"life\.json: not a life"):
+    path.write_text(text)
+    with pytest.raises(EmulatorError, match=r"life\.json: not a life"):
         read_life(path)
 
 

@@ -171,6 +171,7 @@ def test_the_file_keeps_groups_separate(tmp_path):
         '{"crc32": 0, "groups": {"a": {"x": "01"}}}',
         '{"groups": {}}',
         '{"crc32": 0}',
+        "[" * 5000,
     ],
 )
 def test_a_damaged_file_is_an_error_until_the_next_save(tmp_path, text):

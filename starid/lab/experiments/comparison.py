@@ -1,0 +1,142 @@
+"""Checks against published numbers: agreement within a stated tolerance, or improvement on the number."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TypedDict
+
+from starid.lab.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
+
+
+class Readings(TypedDict, total=False):
+    """A number from the author's version of the algorithm, from the printed one, and ours."""
+
+    author: float
+    printed: float
+    ours: float
+
+
+Tolerance = tuple[float, str]
+"""Largest difference from the published number, and its origin."""
+
+
+def rounding(digits: int, unit: str = "") -> Tolerance:
+    """Half a unit of the last printed digit."""
+    return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
+
+
+def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two shares (percent) counted in equally many trials, as a multiple of the standard error.
+
+    The standard error is computed for (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too.
+    """
+    share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
+    error = 100.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
+    return sigmas * error, f"{sigmas:g} standard errors of two shares of {trials}, {sigmas * error:.2g} %"
+
+
+def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two means over equally many trials, as a multiple of the standard error."""
+    error = sigma * math.sqrt(2.0 / trials)
+    return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
+
+
+def shown(
+    quantity: str,
+    *,
+    published: float | str | None = None,
+    author: float | str | None = None,
+    printed: float | str | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a row without a check."""
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        remark=remark,
+        author=value_text(author, unit, digits),
+        printed=value_text(printed, unit, digits),
+    )
+
+
+def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -> Row:
+    """Turn a row into a check that passes if all its published numbers match."""
+    met, of = sum(map(bool, matches)), len(matches)
+    return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
+
+
+def agreement(
+    quantity: str,
+    *,
+    published: float,
+    tolerance: Tolerance,
+    author: float | None = None,
+    printed: float | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a check for agreement with a published number.
+
+    The value checked is the author's version, or else the printed one, or else ours.
+
+    Raises
+    ------
+    ReproduceError
+        There is no number to check.
+    """
+    checked = author if author is not None else printed if printed is not None else ours
+    if checked is None or isinstance(checked, str):
+        raise ReproduceError(
+            f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
+        )
+    largest, origin = tolerance
+    readings = {"published": published, "author": author, "printed": printed, "ours": ours}
+    informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
+    return _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
+
+
+def same(
+    quantity: str,
+    *,
+    published: str,
+    author: str | None = None,
+    printed: str | None = None,
+    ours: str | None = None,
+    matches: Sequence[bool],
+    target: str,
+    remark: str = "",
+) -> Row:
+    """Make one row for several published numbers; `target` names the rule by which each agrees or not."""
+    met, of = sum(map(bool, matches)), len(matches)
+    remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
+    informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
+    return _checked(informing, "agrees", target, matches)
+
+
+def improvement(
+    quantity: str,
+    *,
+    published: float,
+    ours: float,
+    larger: bool,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a check that ours is better than a published number; the remark states by how much."""
+    gain = ours - published if larger else published - ours
+    better = f"by {value_text(gain, unit, digits)}"
+    if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:
+        better = f"by a factor of {published / ours:.3g}"
+    passed = bool(ours >= published if larger else ours <= published)
+    remark = f"Better {better}. {remark}".strip() if passed else remark
+    informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
+    return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])
