@@ -130,13 +130,7 @@ class Faults:
         return [(link.bus, link.wire) for link in self._links]
 
     def inject(self, request: FaultRequest) -> None:
-        """Inject the faults of a request, all or none.
-
-        Raises
-        ------
-        EmulatorError
-            A name is unknown, or the run has no such link.
-        """
+        """Inject the faults of a request, all or none."""
         self.check(request)
         device = self._device
         if request.optical is not None:
@@ -163,13 +157,7 @@ class Faults:
             self._device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
 
     def check(self, request: FaultRequest) -> None:
-        """Check that the faults of a request can be injected.
-
-        Raises
-        ------
-        EmulatorError
-            A name is unknown, or the run has no such link.
-        """
+        """Check that the faults of a request can be injected."""
         enums = self._device.icd.model.enums
         if request.device is not None:
             errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]

@@ -75,11 +75,6 @@ class Head:
         Fields of the ready line: the opened ports and buses.
     warm
         What the pipeline reported when it was last ready; None before.
-
-    Raises
-    ------
-    EmulatorError
-        The state folder is not available, or a parameter of the profile is invalid; one line.
     """
 
     def __init__(
@@ -154,13 +149,7 @@ class Head:
     # --- links ---
 
     async def open_links(self) -> None:
-        """Open ports and buses.
-
-        Raises
-        ------
-        EmulatorError, ProtocolError
-            A port or bus is not available; one line.
-        """
+        """Open ports and buses."""
         links, seed = self.profile.links, self.profile.run.seed
         stepped = isinstance(self.clock, SteppedClock)  # no time passes between two items of one event
         if links.serial.port != "off" and self.icd.link.serial is not None:
@@ -249,13 +238,7 @@ class Head:
             self._pump.start()
 
     async def ready(self) -> dict[str, str]:
-        """Wait until the device accepts commands; return the fields of the ready line.
-
-        Raises
-        ------
-        EmulatorError
-            The pipeline cannot start, for example because there is no catalogue; one line.
-        """
+        """Wait until the device accepts commands; return the fields of the ready line."""
         awake = asyncio.create_task(self._awake.wait())
         warm_up = self._warm_up_task
         if warm_up is None:
@@ -293,13 +276,7 @@ async def _cancel(task: asyncio.Task[None]) -> None:
 
 
 def check_links(profile: Profile, icd: InterfaceDefinition) -> None:
-    """Check that the unit has at least one of the requested links; log those that it lacks.
-
-    Raises
-    ------
-    EmulatorError
-        The unit has none of them, no CANopen node though one is requested, or not the requested dialect.
-    """
+    """Check that the unit has at least one of the requested links; log those that it lacks."""
     links, has, name = profile.links, icd.link, icd.name
     canopen = icd.canopen is not None
     if links.canopen.node and not canopen:

@@ -83,11 +83,6 @@ class Emulator:
         Clock, truth and heads.
     ended
         Set to end the run.
-
-    Raises
-    ------
-    EmulatorError
-        Two heads are incompatible; one line.
     """
 
     def __init__(
@@ -122,13 +117,7 @@ class Emulator:
         return any(output.failed for output in outputs)
 
     async def start(self) -> None:
-        """Open files, links and control channel, switch the devices on and start time.
-
-        Raises
-        ------
-        EmulatorError, ProtocolError
-            A file, port or bus is not available; one line.
-        """
+        """Open files, links and control channel, switch the devices on and start time."""
         with self._rejecting():
             await self._start()
 
@@ -187,11 +176,6 @@ class Emulator:
         """Wait until every device accepts commands; return the ready line.
 
         The names of the fields of the nth head end in `.n`, except for the first head.
-
-        Raises
-        ------
-        EmulatorError
-            A pipeline cannot start; one line.
         """
         with self._rejecting():
             first, *others = await self.run.ready()
@@ -279,13 +263,7 @@ def with_own_seeds(profiles: Sequence[Profile]) -> list[Profile]:
 
 
 def check_heads(profiles: Sequence[Profile]) -> None:
-    """Check that several heads can share a truth, a clock and their buses.
-
-    Raises
-    ------
-    EmulatorError
-        They are incompatible; the text names the two profiles and the key to change.
-    """
+    """Check that several heads can share a truth, a clock and their buses."""
     first = profiles[0]
     taken: dict[tuple[str, str, int], Profile] = {}
     for profile in profiles:

@@ -126,13 +126,7 @@ class StepPump:
         self._lock = asyncio.Lock()
 
     async def step(self, seconds: float) -> int:
-        """Advance simulation time; on return, all events within the step are done. Return their number.
-
-        Raises
-        ------
-        EmulatorError
-            The step is not positive, or larger than `MAX_STEP_S`.
-        """
+        """Advance simulation time; on return, all events within the step are done. Return their number."""
         if not 0.0 < seconds <= MAX_STEP_S:
             raise EmulatorError(f"step: must be seconds in (0, {MAX_STEP_S:g}], not {seconds}")
         await self._time_passes.wait()

@@ -133,13 +133,7 @@ class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
-    """Make the folder of a recording, with copies of all inputs of the run that may change later.
-
-    Raises
-    ------
-    EmulatorError
-        The folder is not empty or cannot be written.
-    """
+    """Make the folder of a recording, with copies of all inputs of the run that may change later."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
@@ -320,13 +314,7 @@ class ReplayReport:
 
 
 def read_run(folder: Path) -> tuple[Profile, bool]:
-    """Return the profile of a recording, and whether its tape ends with the entry `end`.
-
-    Raises
-    ------
-    EmulatorError
-        The folder is not a recording, or is one of another version with a different profile.
-    """
+    """Return the profile of a recording, and whether its tape ends with the entry `end`."""
     path = folder / RUN_FILE
     try:
         text = _read(path)
@@ -357,13 +345,7 @@ def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
 
 
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
-    """Yield the entries of a tape, each with file and line.
-
-    Raises
-    ------
-    EmulatorError
-        The file is missing or damaged.
-    """
+    """Yield the entries of a tape, each with file and line."""
     path = folder / EVENTS_FILE
     try:
         with open_regular(path) as file:
@@ -385,11 +367,6 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
         The recording.
     profile
         Profile of the device, instead of the recorded one; `run` except the algorithm, and `links`, are as recorded.
-
-    Raises
-    ------
-    EmulatorError
-        The folder is not a recording, or the device cannot be started with the profile.
     """
     recorded, ends = read_run(folder)
     player = Player(ends_at_once=recorded.run.clock == "stepped")

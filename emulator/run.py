@@ -61,11 +61,6 @@ class Run:
         Advances the stepped clock, once the run has begun; None with another clock.
     time_passes
         Set when the pipeline of every head is ready, which starts the clock.
-
-    Raises
-    ------
-    EmulatorError
-        A unit or a requested link is invalid; one line.
     """
 
     def __init__(
@@ -107,13 +102,7 @@ class Run:
         return len(self.heads) + len(self._plans)
 
     async def open(self) -> None:
-        """Open the truth, and switch on the heads; time does not pass yet.
-
-        Raises
-        ------
-        EmulatorError, ProtocolError
-            A file, port or bus is not available; one line. The starts are not counted.
-        """
+        """Open the truth, and switch on the heads; time does not pass yet. If one fails, no start is counted."""
         await self.truth.open()
         try:
             while self._plans:
@@ -163,13 +152,7 @@ class Run:
             await self.stepper.step(seconds)
 
     async def ready(self) -> list[dict[str, str]]:
-        """Wait until every device accepts commands; return the fields of the ready line of each.
-
-        Raises
-        ------
-        EmulatorError
-            A pipeline cannot start; one line.
-        """
+        """Wait until every device accepts commands; return the fields of the ready line of each."""
         return list(await asyncio.gather(*(head.ready() for head in self.heads)))
 
     async def close(self) -> None:

@@ -12,11 +12,11 @@ from typing import Final
 from starhil.protocol.checks import CheckFunction
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.link_schema import CubeSpaceFraming, Order, SerialLinkModel
+from starhil.protocol.conventions import Order
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.link_schema import CubeSpaceFraming, MessageClass, SerialLinkModel
 from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
-    MessageClass,
     Reply,
     ReplyKind,
     Request,

@@ -88,11 +88,6 @@ class McapRecorder:
         File to write.
     overwrite
         Whether to replace an existing file.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, or exists and is not empty.
     """
 
     def __init__(self, head: Head, client: ObcClient, path: Path, *, overwrite: bool = False) -> None:

@@ -110,13 +110,7 @@ class ControlServer:
             head.device.signals.frame_published.connect(self._frames[head.number].append)
 
     async def start(self, where: str) -> str:
-        """Listen on `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
-
-        Raises
-        ------
-        EmulatorError
-            The path or port is in use, or `where` is not an address.
-        """
+        """Listen on `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT."""
         if where == "auto" or where.startswith("unix:"):
             path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
             self._socket = ControlSocket(path)

@@ -99,11 +99,6 @@ class Scenario(Strict):
             The truth of the run; None if another head sets it.
         start_s
             Simulation time to which the times of the events are added, seconds.
-
-        Raises
-        ------
-        EmulatorError
-            An event refers to a link that this run does not have, or to a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             at_s = start_s + event.run_time_s
@@ -115,13 +110,7 @@ class Scenario(Strict):
 
 
 def load_scenario(name_or_path: str) -> Scenario:
-    """Read a scenario from a path, or by the name of one in `configs/scenarios`.
-
-    Raises
-    ------
-    EmulatorError
-        The file is missing or invalid; one line with file, key and remedy.
-    """
+    """Read a scenario from a path, or by the name of one in `configs/scenarios`."""
     try:
         path = Path(name_or_path).expanduser()
         if "/" not in name_or_path and not name_or_path.endswith(".toml"):

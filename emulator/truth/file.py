@@ -152,12 +152,6 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
 
     Messages do not quote the file, because a client of the control channel may name files that it must not
     read.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be read or lacks columns, or a row is not numeric, not a rotation, or not later than
-        the previous row; the message names the line.
     """
     try:
         text = read_text(path, MAX_BYTES)

@@ -97,13 +97,7 @@ class Truth:
         self._host = host
 
     async def open(self) -> None:
-        """Build the configured truth.
-
-        Raises
-        ------
-        EmulatorError
-            A file is invalid or a port is not available; one line.
-        """
+        """Build the configured truth."""
         self.put(*await self._load(self.configured, None))
 
     async def set(self, config: TruthConfig, at_s: float | None = None) -> None:
@@ -115,11 +109,6 @@ class Truth:
             The new truth.
         at_s
             Simulation time at which its motion begins, as in a recorded run; by default now.
-
-        Raises
-        ------
-        EmulatorError
-            A file is invalid or a port is not available; the previous source stays.
         """
         loaded = await self._load(config, at_s)
         start_s = getattr(loaded[0], "start_s", self._host.now_s())

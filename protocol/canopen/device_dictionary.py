@@ -27,7 +27,7 @@ from starhil.protocol.canopen.layout import (
     read_layout,
 )
 from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, Value, to_f32
 
 DATA_TYPES: Final[dict[str, int]] = {

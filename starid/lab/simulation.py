@@ -49,6 +49,8 @@ class NoiseModel:
         Magnitudes that the 255 steps of intensity span, and from which false stars are drawn.
     mean_spread
         Standard deviation with which the means are drawn for every frame (0: as given).
+    whole_pixels
+        `moved_frames` rounds the positions in moved frames to whole pixels of `PIXEL_DEG`.
     """
 
     position_sigma_px: float = 0.0
@@ -59,6 +61,7 @@ class NoiseModel:
     missing_stars: int = 0
     magnitude_range: tuple[float, float] = (11.5, FAINTEST_MAGNITUDE)
     mean_spread: float = 0.0
+    whole_pixels: bool = False
 
     @property
     def magnitude_per_unit(self) -> float:
@@ -197,6 +200,8 @@ def moved_frames(
         shift, turn = _random_motion(rng)
         places = turned(places, turn) + shift
         inside = np.sum(places**2, axis=1) <= radius_deg**2
+        if noise.whole_pixels:
+            places = np.rint(places / PIXEL_DEG) * PIXEL_DEG
         yield SimulatedFrame(
             ObservedFrame(mags[inside], places[inside]),
             identity[inside],
