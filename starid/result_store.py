@@ -151,7 +151,7 @@ class ResultStore:
         """Reject a plan file with other content; the error names the first difference."""
         try:
             kept = json.loads(plan_file.read_text(encoding="utf-8"))
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise StaridError(
                 f"{self._what}: {plan_file} cannot be read ({error}): give another folder"
             ) from error

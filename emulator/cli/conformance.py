@@ -130,7 +130,7 @@ def command(
     )
     console = Console(highlight=False, quiet=as_json)
     if list_only:
-        for item in all_cases(request, load_unit(unit or DEFAULT_UNIT)):
+        for item in all_cases(request):
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
         return

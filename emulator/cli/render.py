@@ -124,9 +124,10 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
     if profile is None:
         scene = _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
     else:
-        from starhil.emulator.device.device import orbit_of, profile_defaults
+        from starhil.emulator.device.device import profile_defaults
         from starhil.emulator.device.parameters import Parameters
-        from starhil.emulator.emulation import pipeline_setup
+        from starhil.emulator.device.surroundings import orbit_of
+        from starhil.emulator.pipeline_setup import pipeline_setup
         from starhil.emulator.profile import load_profile
         from starhil.protocol.icd import load_unit
 

@@ -113,7 +113,7 @@ class FileStorage:
                 raise StorageError(f"{self._path}: wrong checksum; store the parameters again")
         except FileNotFoundError:
             return {}
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise StorageError(f"{self._path}: no stored parameters ({error}); store them again") from None
         return groups
 

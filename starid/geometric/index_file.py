@@ -78,7 +78,7 @@ def load(path: Path, key: str) -> IndexArrays | None:
             return unpack(mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ), key)
     except FileNotFoundError:
         return None
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         _log.warning("index file %s is not usable (%s): built again", path, error)
         return None
 

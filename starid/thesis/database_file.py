@@ -111,7 +111,7 @@ def read_header(path: Path) -> dict[str, Any]:
         raise DatabaseError(f"database: {path} has a truncated header; build it again")
     try:
         header = json.loads(text)
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DatabaseError(f"database: {path} has a damaged header; build it again") from error
     if not isinstance(header, dict) or header.get("version") != FORMAT_VERSION:
         raise DatabaseError(

@@ -160,7 +160,9 @@ def test_a_plan_that_cannot_be_written_whole_leaves_no_plan(tmp_path, monkeypatc
     open_store(tmp_path, asdict(PLAN))
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"made_by": 3}', "\xff"])
+@pytest.mark.parametrize(
+    "text", ["{", "[]", '{"made_by": 3}', "\xff", "[" * 5000], ids=["cut", "list", "key", "coding", "deep"]
+)
 def test_an_invalid_plan_is_named(text, tmp_path):
     (tmp_path / "plan.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(StaridError, match=r"plan\.json .*give another folder"):

@@ -71,6 +71,20 @@ def test_a_header_that_cannot_be_read_is_rejected(run, headers, status):
     run(scenario, options=OPTIONS)
 
 
+def test_a_page_that_closes_before_it_is_answered_leaves_no_error_in_the_log(run, caplog):
+    async def scenario(emulation, _line):
+        host, path = emulation.ready_fields["view"].removeprefix("http://").split("/")
+        upgrade = "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="
+        _, writer = await asyncio.open_connection(*host.split(":"))
+        writer.write(f"GET /ws{path} HTTP/1.1\r\nHost: {host}\r\n{upgrade}\r\n\r\n".encode())
+        writer.close()
+        async with Page(emulation) as page:  # the other has been served
+            assert (await page.ask(do="read", row="identification"))["ok"]
+
+    run(scenario, options=OPTIONS)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 def test_previews_are_made_only_while_a_page_shows_images(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)
@@ -194,7 +208,7 @@ def test_each_head_has_its_own_page_on_a_shared_clock(run):
             await second.ask(do="control", request={"do": "fault", "device": {"stuck": True}})
             assert (await second.ask(do="read", row="device_status"))["outcome"] == "no_reply"
             assert (await first.ask(do="read", row="device_status"))["outcome"] == "ok"
-            assert run.launched.heads[0].faults.describe() == {}
+            assert run.first_head().faults.describe() == {}
             slew = {"kind": "slew", "to": {"star": "rigel", "roll_deg": 20.0}, "max_rate_deg_s": 5.0}
             await second.ask(do="point", **slew)
             await emulation.stepper.step(60.0)

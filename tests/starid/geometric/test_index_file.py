@@ -59,8 +59,9 @@ def test_arrays_are_loaded_unchanged_and_read_only(stored: Path) -> None:
         (lambda b: b[: len(b) - 1000] + bytes([b[-1000] ^ 1]) + b[len(b) - 999 :], "checksum"),
         (lambda b: b.replace(b'"key"', b'"kei"', 1), "key"),
         (lambda b: b[:8] + (1 << 62).to_bytes(8, "little") + b[16:], "header is truncated"),
+        (lambda b: b[:8] + (9000).to_bytes(8, "little") + b"[" * 9000, "recursion"),
     ],
-    ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length"],
+    ids=["empty", "foreign", "header", "half", "one byte", "one bit", "no key", "absurd length", "deep"],
 )
 def test_a_damaged_file_is_reported_and_built_again(
     stored: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage, message: str

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import struct
 
 import numpy as np
 import pytest
@@ -119,6 +120,7 @@ def test_bad_files_are_rejected_by_name(tmp_path):
         "has a truncated header": whole[: len(MAGIC) + 10],
         "is damaged": whole[:5000] + bytes([whole[5000] ^ 1]) + whole[5001:],
         "damaged header": whole[:25] + b"#" + whole[26:],
+        "has a damaged header": MAGIC + struct.pack("<I", 9000) + b"[" * 9000,
     }
     for number, (words, content) in enumerate(cases.items()):
         bad = tmp_path / f"bad{number}.db"
