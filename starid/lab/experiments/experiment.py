@@ -32,8 +32,9 @@ Parameters = Mapping[str, Any]
 EPOCH: Final = 1991.25
 """Epoch of the catalogue: the published numbers are without proper motion."""
 
-Kind = Literal["", "agrees", "better", "ours"]
-"""Class of a check: agreement with a published number, improvement on it, our own bound, or none ("")."""
+Kind = Literal["", "agrees", "fitted", "better", "ours"]
+"""Class of a check: agreement with a published number, the same after a constant was fitted to that number (only in
+the report, see `choices`), improvement on it, our own bound, or none ("")."""
 
 
 class ReproduceError(StaridError):
