@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
-from starid.lab.experiments.comparison import agreement, improvement, sampled_mean, shown
+from starid.lab.experiments.comparison import agreement, improvement, rounding, sampled_mean, shown
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -37,8 +37,6 @@ from starid.plots import colours, figure, precision_curve, save
 from starid.thesis.metrics import error_colours
 
 _PUBLISHED: Final = {0.3: 100.0, 0.2: 92.24, 0.1: 71.43, 0.013: 59.20, 0.008: 58.67, 0.002: 57.79}
-_POINTS: Final = 1.5
-"""Tolerance for shares, percentage points: the standard error of a share of 1 701 frames is 0.7 to 1.2."""
 _PSI: Final = (0.49, 0.54)
 """Mean and deviation of ε_ψ without noise, table H.1."""
 _MAP_SCALES: Final = (0.1, 1.0)
@@ -181,14 +179,13 @@ def _precision_figure(
 
 def _on_grid_rows(result: Results) -> list[Row]:
     where = f"LSI (MSE), p = {_BEST:g} %, on the grid"
-    tolerance = (_POINTS, f"{_POINTS:g} points; the standard error of 1 701 frames is 0.7 to 1.2")
     psi, spread = _PSI
     return [
         *(
             agreement(
                 f"{where}: share with ε_f ≤ {limit:g}°",
                 published=published,
-                tolerance=tolerance,
+                tolerance=rounding(2, "%"),  # the frames are the published ones, without noise
                 **shares(result, limit),
                 unit="%",
             )
