@@ -25,7 +25,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import FixedFraming
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect, serial_answers
 from starhil.protocol.values import IcdError
 
