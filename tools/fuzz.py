@@ -16,6 +16,7 @@ import os
 import re
 import sys
 import tempfile
+import traceback
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -93,14 +94,18 @@ def in_child(target: Target, options: list[str], log: Path) -> int:
     child = os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    with log.open("wb") as stream:
-        for descriptor in (1, 2):
-            os.dup2(stream.fileno(), descriptor)
-    limits = [f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}", f"-max_len={LONGEST}"]
-    with tempfile.TemporaryDirectory() as folder:
-        atheris.Setup([sys.argv[0], *limits, *options], target.runner(Path(folder)))
-        atheris.Fuzz()  # ends the process
-    return 1
+    try:
+        with log.open("wb") as stream:
+            for descriptor in (1, 2):
+                os.dup2(stream.fileno(), descriptor)
+        limits = [f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}", f"-max_len={LONGEST}"]
+        with tempfile.TemporaryDirectory() as folder:
+            atheris.Setup([sys.argv[0], *limits, *options], target.runner(Path(folder)))
+            atheris.Fuzz()  # ends the process
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(1)
 
 
 def keep(name: str, target: Target, found: Path, scratch: Path) -> int:

@@ -38,6 +38,7 @@ GROUPS = {
 """Folders of modules, and the tests among which those of a line are found; of `protocol`, only CODECS."""
 PYTEST = [
     "-q",
+    "--assert=plain",  # pytest would load what it rewrites past the mutant
     "-p",
     "no:cacheprovider",
     "-m",
@@ -270,7 +271,6 @@ def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None
             print(f"{item['module']}:{item['line']}: {item['result']}: {item['change']}", flush=True)
 
     pytest.main(["--collect-only", "-qq", *PYTEST[1:], *tests])  # imports everything once
-    gc.freeze()
     for path in sorted((ROOT / group).glob("*.py")):
         module = str(path.relative_to(ROOT))
         if not module.startswith(tuple(options.modules)) or (
