@@ -5,11 +5,12 @@
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
 # make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 110 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
-# make years       random lives of all units on two processors for HOURS (8), judged by an oracle (docs/endurance.md)
+# make years       random lives of all units on JOBS (2) processors for HOURS (8), judged by an oracle (docs/endurance.md)
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
 MINUTES ?= 15
 HOURS ?= 8
+JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
@@ -31,7 +32,7 @@ $(VENV)/.product: pyproject.toml | $(VENV)/pyvenv.cfg
 $(VENV)/.developer: pyproject.toml | $(VENV)/pyvenv.cfg
 	$(BIN)/pip install --quiet --no-compile --editable '.[test,lint,basilisk]' \
 		|| $(BIN)/pip install --quiet --no-compile --editable '.[test,lint]'
-	@touch $(VENV)/.product $@
+	@touch $(VENV)/.product $(VENV)/.lab $@
 
 demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
@@ -46,6 +47,10 @@ lint: $(VENV)/.developer
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+$(VENV)/.lab: $(VENV)/.product
+	$(BIN)/pip install --quiet --editable '.[lab]'
+	@touch $@
+
 $(VENV)/.docs: $(VENV)/.product
 	$(BIN)/pip install --quiet --editable '.[docs]'
 	@touch $@
@@ -56,8 +61,8 @@ docs: $(VENV)/.docs
 	$(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going --builder html --doctree-dir out/doctrees docs out/docs
 	@echo "out/docs/index.html"
 
-reproduce: $(VENV)/.product
-	$(BIN)/starhil reproduce --output out/reproduce $(REPRODUCE)
+reproduce: $(VENV)/.lab
+	$(BIN)/starid reproduce --output out/reproduce $(REPRODUCE)
 
 fuzz: $(VENV)/.developer
 	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_composed_faults.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
@@ -66,7 +71,7 @@ soak: $(VENV)/.product
 	$(BIN)/python tools/soak.py --minutes $(MINUTES)
 
 years: $(VENV)/.product
-	$(BIN)/starhil endurance --hours $(HOURS) --jobs 2 --seed $$(date +%s)
+	$(BIN)/starhil endurance --hours $(HOURS) --jobs $(JOBS) --seed $$(date +%s)
 
 SITE := import site; print(site.getsitepackages()[0])
 cosmos: $(VENV)/.developer

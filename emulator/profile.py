@@ -10,7 +10,7 @@ import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
@@ -22,10 +22,13 @@ from starhil.emulator.truth.config import (
     OrbitConfig,
     Strict,
     TruthConfig,
-    unix_time,
 )
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
+from starid.earth import unix_time
+
+if TYPE_CHECKING:
+    from starid.camera import Camera
 
 DEFAULT_PROFILE: Final = "cubestar"
 MAX_EXTENDS_DEPTH: Final = 8
@@ -294,7 +297,7 @@ class Profile(Strict):
     links: LinksConfig = LinksConfig()
     """Serial line, CAN and CANopen."""
     calibration: dict[str, Any] = Field(default_factory=dict)
-    """Notes by `starhil calibrate` for the reader; not used."""
+    """Notes by `starid calibrate` for the reader; not used."""
     health: dict[str, float] = Field(default_factory=dict)
     """Numbers reported as the quantities `health.NAME`, such as temperatures, in the unit of the field.
     Default: in °C, V, A or W what `[thermal]` and `[power]` give, otherwise 0."""
@@ -364,13 +367,7 @@ def configs_folder() -> Path:
 
 
 def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
-    """Return the path of a profile given by name or path.
-
-    Raises
-    ------
-    EmulatorError
-        There is no such profile; the message lists the known names.
-    """
+    """Return the path of a profile given by name or path."""
     folder = configs_folder() / "profiles"
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
         path = folder / f"{name_or_path}.toml"
@@ -389,13 +386,7 @@ def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
 
 
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
-    """Read a profile and the profiles it extends, and apply `section.key=value` overrides.
-
-    Raises
-    ------
-    EmulatorError
-        The profile is invalid; one line with file, key and remedy.
-    """
+    """Read a profile and the profiles it extends, and apply `section.key=value` overrides."""
     path = find_profile(name_or_path)
     values = _read_extended(path, 0)
     if any(override.startswith("camera.") for override in overrides):
@@ -412,6 +403,13 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
             raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
     profile._source = path  # noqa: SLF001 (private: not a key of the file)
     return profile
+
+
+def camera_of(name_or_path: str) -> Camera:
+    """Return the camera of a profile (entry point `starid.cameras`, for `starid identify --profile`)."""
+    from starid.camera import Camera
+
+    return Camera.from_dict(load_profile(name_or_path).camera.values())
 
 
 def _source_of_key(path: Path, overrides: Sequence[str], why: str) -> str:

@@ -46,7 +46,7 @@ class PipelineRevival:
         self._lost = False
         self._task: asyncio.Task[None] | None = None
         imager.on_failure = self._pipeline_lost
-        device.on_reset.append(self._device_reset)
+        device.signals.restarted.connect(self._device_reset)
 
     def _pipeline_lost(self, _text: str) -> None:
         if asyncio.get_running_loop().time() - self._ready_at_s > STEADY_S:
@@ -55,7 +55,7 @@ class PipelineRevival:
         self._device.pipeline_lost()
         self._start_attempts()
 
-    def _device_reset(self) -> None:
+    def _device_reset(self, _cause: str) -> None:
         if self._lost and self._attempts == len(PAUSES_S):
             self._attempts = 0
             self._start_attempts()

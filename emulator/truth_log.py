@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.cycle import Measurement, as_quaternion
+from starhil.emulator.device.measurement import Measurement, as_quaternion
 from starhil.emulator.output_file import Output, OutputFile
 from starid.attitude import Attitude
 
@@ -88,11 +88,6 @@ class TruthLog:
         Whether to fill the columns in `WALL_TIMES`.
     output
         The recording of which the file is a part; by default it is none.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
     def __init__(

@@ -8,6 +8,8 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from starid.errors import plain
+
 MIN_SIMILARITY: Final = 0.55
 """Similarity above which a known key is suggested for an unknown one (`difflib`)."""
 
@@ -63,23 +65,6 @@ def _most_helpful_error(error: ValidationError) -> Any:
             if other["type"] == "extra_forbidden" and other["loc"][:-1] == first["loc"][:-1]:
                 return other
     return first
-
-
-def plain(message: str) -> str:
-    """Rephrase the message of a validator in the style of the project: `must be …`, without a capital."""
-    text = message.partition(", unable to parse")[0].partition(" or instance of ")[0]
-    for original, replacement in _REPLACEMENTS:
-        text = text.replace(original, replacement)
-    return f"{text[:1].lower()}{text[1:]}"
-
-
-_REPLACEMENTS: Final = (
-    ("Value error, ", ""),
-    ("Input should be", "must be"),
-    ("valid dictionary", "table"),
-    ("greater than or equal to", "at least"),
-    ("less than or equal to", "at most"),
-)
 
 
 def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str], list[type[BaseModel]]]:

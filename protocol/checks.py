@@ -10,12 +10,12 @@ from typing import Final, assert_never
 
 import xxhash
 
+from starhil.protocol.conventions import Order
 from starhil.protocol.link_schema import (
     CheckModel,
     CrcCheck,
     CustomCheck,
     NoCheck,
-    Order,
     SumCheck,
     XorCheck,
     XxHashCheck,

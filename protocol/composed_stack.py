@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Final, TypeVar, assert_never
 
 from starhil.protocol.checks import CheckFunction, build_check
+from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.framings import (
@@ -26,7 +27,7 @@ from starhil.protocol.link_schema import (
     EscapedFraming,
     FixedFraming,
     LengthFraming,
-    Order,
+    MessageClass,
     SerialLinkModel,
     SlipFraming,
 )
@@ -34,7 +35,6 @@ from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
     FaultKind,
     LinkFault,
-    MessageClass,
     Reply,
     ReplyKind,
     Request,
@@ -42,8 +42,7 @@ from starhil.protocol.messages import (
     error_code,
 )
 from starhil.protocol.plugin import guarded
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_interface import RowShape, SerialStack
+from starhil.protocol.serial_interface import Dialect, RowShape, SerialStack
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")

@@ -20,12 +20,11 @@ from starhil.protocol.icd_schema import (
     ActionModel,
     ArgumentModel,
     DeviceModelFile,
-    DeviceParameterModel,
     QuantityModel,
 )
 from starhil.protocol.unit_folders import UNITS_FOLDER
 from starhil.protocol.user_file import read_user_text
-from starhil.protocol.values import EnumDefinition, IcdError
+from starhil.protocol.values import EnumDefinition, IcdError, Parameter
 
 MODEL_FILE: Final = UNITS_FOLDER / "model.toml"
 
@@ -43,7 +42,7 @@ HEALTH_DEFAULTS: Final = ("temperature.detector", "power.voltage", "power.curren
 class DeviceModel:
     """Parameters, quantities, actions and enumerations by name."""
 
-    parameters: Mapping[str, DeviceParameterModel]
+    parameters: Mapping[str, Parameter]
     quantities: Mapping[str, QuantityModel]
     actions: Mapping[str, ActionModel]
     enums: Mapping[str, EnumDefinition]
@@ -96,13 +95,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     return f"; did you mean {', '.join(near)}?" if near else ""
 
 
-def _of_parameter(name: str, parameter: DeviceParameterModel) -> QuantityModel:
+def _of_parameter(name: str, parameter: Parameter) -> QuantityModel:
     kinds = {"f32": "float", "f64": "float", "bool": "bool", "enum8": "text"}
     return QuantityModel.model_validate(
         {
             "name": name,
             "type": kinds.get(parameter.type, "int"),
-            "enum": parameter.enum,
+            "enum": None if parameter.enum is None else parameter.enum.name,
             "unit": parameter.unit,
             "doc": parameter.doc,
         }
@@ -116,9 +115,17 @@ def device_model() -> DeviceModel:
         file = DeviceModelFile.model_validate(tomllib.loads(read_user_text(MODEL_FILE)))
     except (OSError, ValueError, ValidationError) as error:
         raise IcdError(f"{MODEL_FILE}: not a device model: {' '.join(str(error).split())}") from None
+    enums = {item.name: item for item in file.enum}
     return DeviceModel(
-        parameters={item.name: item for item in file.parameter},
+        parameters={
+            item.name: Parameter.limited(
+                dict(item),
+                enums[item.enumeration] if item.enumeration else None,
+                f"{MODEL_FILE}: {item.name}",
+            )
+            for item in file.parameter
+        },
         quantities={item.name: item for item in file.quantity},
         actions={item.name: item for item in file.action},
-        enums={item.name: EnumDefinition(item.name, item.doc, dict(item.values)) for item in file.enum},
+        enums=enums,
     )

@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from starhil.protocol.conventions import Order
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel, Order
+from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel
 from starhil.protocol.values import SCALAR_SIZES, IcdError
 
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))

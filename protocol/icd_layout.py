@@ -1,18 +1,35 @@
-"""Layout of the fields of a row, in the order of the definition."""
+"""From the fields of a definition to the fields of a row: expanded, named, and placed in bytes one after another.
+
+One field of the definition can be several of the row: `count` and `repeat` number them, `bits` share a slot, and a
+text is short for one line of an ICD table. `TYPE NAME [UNIT] [SCALE]` is a number, `enumN NAME ENUMERATION` an
+enumeration, `bytes NAME SIZE` and `text NAME SIZE` a string, and `bits NAME[:WIDTH] …` flags and groups of bits,
+lowest first, which fill whole bytes. `-` means no name or no unit. Braces repeat the field as in a shell:
+`i16 mag{0,1}_{x,y,z} uT 0.01` is six fields, `u8 css{0..9}` is ten.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import Final, Protocol
+from itertools import product
+from typing import Any, Final, Protocol
+
+from pydantic import ValidationError
 
 from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
-from starhil.protocol.field_text import fields_of
-from starhil.protocol.icd_schema import BitModel, FieldModel, RepeatModel, Scalar
-from starhil.protocol.link_schema import Order
-from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError
+from starhil.protocol.conventions import Order
+from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance, RepeatModel
+from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError, Scalar
 
 NUMBER: Final = "[n]"
+_KINDS: Final[dict[str, FieldKind]] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
+_UNPLACED: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
+"""The defaults of a field."""
+MAX_NAMES: Final = 256
+"""Maximum number of fields that one text may expand to."""
+
+_BRACES: Final = re.compile(r"\{([^{}]*)\}")
 
 
 class Definitions(Protocol):
@@ -39,13 +56,14 @@ class Layout:
     """
 
     def __init__(
-        self, definitions: Definitions, where: str, kind: RowKind, provenance: str, number: int | None
+        self, definitions: Definitions, where: str, kind: RowKind, provenance: Provenance, number: int | None
     ) -> None:
         self._definitions = definitions
         self._where = where
         self._kind = kind
         self._provenance = provenance
         self._number = number
+        self._names: set[str] = set()
         self.fields: list[Field] = []
         self.slots: list[Slot] = []
         self.size = 0
@@ -54,10 +72,10 @@ class Layout:
         """Append the fields of another row; fields of a telecommand report the last accepted values."""
         moved = {slot.index: self._slot(slot.type, slot.size, slot.order) for slot in row.slots}
         for item in row.fields:
-            field = replace(item, slot=moved[item.slot.index])
+            field = item.changed(slot=moved[item.slot.index])
             if row.kind != self._kind:
                 source = row.name if field.parameter is None and field.const is None else None
-                field = replace(field, value=None, argument=None, telecommand=source)
+                field = field.changed(value=None, argument=None, telecommand=source)
             self._append(field)
 
     def add(self, model: FieldModel) -> None:
@@ -71,6 +89,7 @@ class Layout:
         except IcdError:
             del self.fields[fields:], self.slots[slots:]
             self.size = size
+            self._names = {item.name for item in self.fields} - {""}
             raise
 
     def _add(self, model: FieldModel) -> None:
@@ -130,27 +149,34 @@ class Layout:
         else:
             slot = self._scalar_slot(type_, model.order)
         self._check_numbers(model, where)
-        enum, aliases = self._enumeration(model, where, named=type_.startswith("enum"))
-        return Field(
-            name=model.name + suffix if model.name else "",
-            kind=_kind(model, type_, enum),
-            slot=slot,
-            unit=model.unit,
-            scale=model.scale,
-            bias=model.offset,
-            minimum=model.min if model.const is None else model.const,
-            maximum=model.max if model.const is None else model.const,
-            enum=enum,
-            default=_default(model.default, enum, where),
-            parameter=self._definitions.check_parameter(model.parameter, model.unit, where),
-            provenance=model.provenance or self._provenance,
-            doc=model.doc,
-            wrap=model.wrap,
-            value=_numbered(model.value, number, where),
-            argument=_numbered(model.argument, number, where),
-            const=model.const,
-            aliases=aliases,
-        )
+        keys = self._keys(model, where, suffix, number, unit=model.unit, named=type_.startswith("enum"))
+        if model.const is not None:
+            keys |= {"minimum": model.const, "maximum": model.const}
+        kind = "enum" if keys["enum"] is not None else _KINDS.get(type_, "integer")
+        return self._placed(model, slot, keys, kind)
+
+    def _keys(
+        self,
+        model: FieldModel | BitModel,
+        where: str,
+        suffix: str,
+        number: int | None,
+        *,
+        unit: str,
+        named: bool,
+    ) -> dict[str, Any]:
+        """Return the keys of a field that its model gives, references resolved; `named`: by `enum`."""
+        enum, aliases = self._enumeration(model, where, named=named)
+        given = vars(model)
+        return {key: given[key] for key in FieldKeys.model_fields if key in given} | {
+            "name": model.name + suffix if model.name else "",
+            "enum": enum,
+            "aliases": aliases,
+            "default": _default(model.default, enum, where),
+            "parameter": self._definitions.check_parameter(model.parameter, unit, where),
+            "value": _numbered(model.value, number, where),
+            "argument": _numbered(model.argument, number, where),
+        }
 
     def _enumeration(
         self, model: FieldModel | BitModel, where: str, *, named: bool
@@ -159,8 +185,8 @@ class Layout:
         if model.name is None:
             return None, {}
         if model.map is None:
-            return (self._definitions.enum_of(model.enum, where) if named else None), {}
-        if model.enum is not None:
+            return (self._definitions.enum_of(model.enumeration, where) if named else None), {}
+        if model.enumeration is not None:
             raise IcdError(f"{where}: has both `map` and `enum`")
         return mapped(model.map, where)
 
@@ -187,28 +213,22 @@ class Layout:
         suffix: str,
         number: int | None,
     ) -> Field:
-        enum, aliases = self._enumeration(bit, where, named=bit.enum is not None)
+        keys = self._keys(bit, where, suffix, number, unit="", named=bit.enumeration is not None)
+        enum = keys["enum"]
         if enum is not None and max(enum.values.values()) >= 2**bit.width:
             raise IcdError(f"{where}: enumeration {enum.name} does not fit {bit.width} bits")
         if bit.const is not None and not (isinstance(bit.const, int) and 0 <= bit.const < 2**bit.width):
             raise IcdError(f"{where}: const {bit.const:g} does not fit {bit.width} bits")
-        kind: FieldKind = "flag" if bit.width == 1 else "bits"
-        return Field(
-            name=bit.name + suffix if bit.name else "",
-            kind="unused" if bit.name is None else "enum" if enum is not None else kind,
-            slot=slot,
-            shift=shift,
-            width=bit.width,
-            enum=enum,
-            default=_default(bit.default, enum, where),
-            parameter=self._definitions.check_parameter(bit.parameter, "", where),
-            provenance=model.provenance or self._provenance,
-            doc=bit.doc,
-            value=_numbered(bit.value, number, where),
-            argument=_numbered(bit.argument, number, where),
-            const=bit.const,
-            aliases=aliases,
-        )
+        kind: FieldKind = "enum" if enum is not None else "flag" if bit.width == 1 else "bits"
+        keys |= {"provenance": model.provenance, "shift": shift, "width": bit.width}
+        return self._placed(bit, slot, keys, kind)
+
+    def _placed(
+        self, model: FieldModel | BitModel, slot: Slot, keys: dict[str, Any], kind: FieldKind
+    ) -> Field:
+        keys["provenance"] = keys["provenance"] or self._provenance
+        keys |= {"kind": "unused" if model.name is None else kind, "slot": slot}
+        return _UNPLACED.model_copy(update=keys)
 
     def _scalar_slot(self, type_: str, order: Order | None) -> Slot:
         """Return the slot of a number, an enumeration or a bit field."""
@@ -222,32 +242,30 @@ class Layout:
         return slot
 
     def _append(self, item: Field) -> None:
-        if item.name and any(other.name == item.name for other in self.fields):
+        if item.name in self._names:
             raise IcdError(f"{self._where}: field {item.name}: name used twice in the row")
         if not item.name and (item.value or item.argument or item.const is not None):
             raise IcdError(
                 f"{self._where}: field unused: a field with a value, argument or const needs a name"
             )
         self.fields.append(item)
+        self._names |= {item.name} - {""}
 
     @staticmethod
     def _check_numbers(model: FieldModel, where: str) -> None:
         if model.scale == 0.0:
             raise IcdError(f"{where}: scale is 0")
-        if model.min is not None and model.max is not None and model.min > model.max:
-            raise IcdError(f"{where}: min {model.min:g} is above max {model.max:g}")
+        if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
+            raise IcdError(f"{where}: min {model.minimum:g} is above max {model.maximum:g}")
         if model.wrap and not str(model.type).startswith("u"):
             raise IcdError(f"{where}: wrap: only unsigned integers wrap")
-        if model.wrap and (model.min, model.max) != (None, None):
+        if model.wrap and (model.minimum, model.maximum) != (None, None):
             raise IcdError(f"{where}: wrap: a field that wraps has no min and max")
         limits = INTEGER_RANGES.get(str(model.type))
         if limits is None:
             return
-        for name, value in (("min", model.min), ("max", model.max), ("const", model.const)):
-            if (
-                value is not None
-                and not limits[0] <= round((value - model.offset) / model.scale) <= limits[1]
-            ):
+        for name, value in (("min", model.minimum), ("max", model.maximum), ("const", model.const)):
+            if value is not None and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]:
                 raise IcdError(f"{where}: {name} {value:g} does not fit type {model.type} with its scale")
 
 
@@ -269,21 +287,12 @@ def mapped(
             raise IcdError(f"{where}: map: {wire}: no value, or a duplicate one")
         values[names[0]] = number
         aliases |= dict.fromkeys(names[1:], names[0])
-    return EnumDefinition("map", "", values), aliases
+    return EnumDefinition.model_construct(name="map", doc="", values=values), aliases
 
 
 def text_of(value: object) -> str:
     """Return the name of a value as a member of a `map`."""
     return str(value).lower() if isinstance(value, bool) else str(value)
-
-
-def _kind(model: FieldModel, type_: str, enum: EnumDefinition | None) -> FieldKind:
-    if model.name is None:
-        return "unused"
-    if enum is not None:
-        return "enum"
-    kinds: dict[str, FieldKind] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
-    return kinds.get(type_, "integer")
 
 
 def _numbered(name: str | None, number: int | None, where: str) -> str | None:
@@ -299,3 +308,78 @@ def _default(value: Scalar | None, enum: EnumDefinition | None, where: str) -> S
     if enum is not None and value is not None and value not in enum.values:
         raise IcdError(f"{where}: default {value!r} is not in enumeration {enum.name}")
     return value
+
+
+def fields_of(text: str) -> list[FieldModel]:
+    """Expand a text to fields.
+
+    Raises IcdError, whose text does not name row and file.
+    """
+    type_, *words = text.split() or [""]
+    if not words:
+        raise IcdError("needs a type and a name, such as 'u16 counter'")
+    tables = _bits(words) if type_ == "bits" else _scalars(type_, *words)
+    try:
+        return [FieldModel.model_validate(table) for table in tables]
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise IcdError(f"{first['loc'][-1]}: {first['msg']}") from None
+
+
+def _scalars(type_: str, name: str, *words: str) -> list[dict[str, Any]]:
+    kinds = {"enum": ("enum",), "byte": ("size",), "text": ("size",)}
+    keys = kinds.get(type_[:4], ("unit", "scale"))
+    if len(words) > len(keys):
+        raise IcdError(f"only {' and '.join(keys)} may follow the name")
+    table: dict[str, Any] = {"type": type_}
+    for key, word in zip(keys, words, strict=False):
+        if word != "-":
+            table[key] = word if key in ("enum", "unit") else _number(key, word)
+    return [table | _named(item) for item in _names(name)]
+
+
+def _bits(words: list[str]) -> list[dict[str, Any]]:
+    filled: list[list[dict[str, Any]]] = []
+    room = 0
+    for word in words:
+        name, _, given = word.partition(":")
+        width = int(_number("width", given)) if given else 1
+        for item in _names(name):
+            if room == 0:
+                filled.append([])
+                room = 8
+            if not 1 <= width <= room:
+                raise IcdError(f"{item}: {width} bits do not fit into the remaining {room} bits of the byte")
+            filled[-1].append(_named(item) | {"width": width})
+            room -= width
+    if room:
+        filled[-1].append({"width": room})
+    return [{"type": "bits8", "bits": bits} for bits in filled]
+
+
+def _named(name: str) -> dict[str, Any]:
+    return {} if name == "-" else {"name": name}
+
+
+def _number(key: str, word: str) -> int | float:
+    try:
+        return float(word) if key == "scale" else int(word)
+    except ValueError:
+        raise IcdError(f"{key}: {word!r} is not a number") from None
+
+
+def _names(pattern: str) -> list[str]:
+    """Expand a pattern with braces to names; the last braces vary fastest."""
+    parts = [
+        [part] if index % 2 == 0 else _choices(part) for index, part in enumerate(_BRACES.split(pattern))
+    ]
+    if not 1 <= math.prod(map(len, parts)) <= MAX_NAMES:
+        raise IcdError(f"{pattern}: must be 1 to {MAX_NAMES} fields")
+    return ["".join(chosen) for chosen in product(*parts)]
+
+
+def _choices(text: str) -> list[str]:
+    first, _, last = text.partition("..")
+    if first.isdecimal() and last.isdecimal():
+        return [str(number) for number in range(int(first), int(last) + 1)[: MAX_NAMES + 1]]
+    return text.split(",")

@@ -1,4 +1,4 @@
-"""Schema of `[link.serial]` and `[link.can]` in a unit's definition.
+"""Keys of `[[class]]`, `[link.serial]` and `[link.can]` in a unit's definition.
 
 A serial message consists of header, data and checksum; the framing marks where it begins and ends. The header
 is a list of fields by role; the checksum covers header and data unless `covers` lists other parts.
@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, WithJsonSchema
 
-from starhil.protocol.messages import DEFAULT_TIMEOUT_S
+from starhil.protocol.conventions import Order
+from starhil.protocol.messages import DEFAULT_TIMEOUT_S, RequestKind
+from starhil.protocol.values import DefinitionModel, Name
 
 HEX: Final = {"format": "hex"}
 """Schema of numbers that the reference pages show in hexadecimal."""
+Code = Annotated[int, Field(ge=0, le=0xFFFF, json_schema_extra=HEX)]
 Byte = Annotated[int, Field(ge=0, le=0xFF, json_schema_extra=HEX)]
-Order = Literal["little", "big"]
 CheckType = Literal["u8", "u16", "u32", "u64"]
 HeaderType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "bits8", "bits16", "bits32"]
 CoveredPart = Literal["start", "header", "data"]
@@ -27,11 +29,24 @@ Role = Literal[
 """Meaning of a header field; described in `HeaderFieldModel`."""
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+class MessageClass(DefinitionModel):
+    """A class of rows, with its codes in a message."""
+
+    name: Name
+    """Name that rows refer to."""
+    kind: Annotated[RequestKind, Field(strict=False), WithJsonSchema({"enum": ["telecommand", "telemetry"]})]
+    """Kind of its rows."""
+    code: Code | None = None
+    """Code in a request."""
+    reply: Code | None = None
+    """Code in a reply; default: `code`."""
+    unsolicited: Code | None = None
+    """Code in unsolicited telemetry; default: `reply`."""
+    answer: list[str] | None = None
+    """Answers of its rows, in order: `echo`, `reply`, `row:NAME`; default: `["reply"]`."""
 
 
-class CubeSpaceFraming(_Model):
+class CubeSpaceFraming(DefinitionModel):
     """The CubeSpace family's framing with its three reply dialects, without header and checksum."""
 
     kind: Literal["cubespace"]
@@ -42,7 +57,7 @@ class CubeSpaceFraming(_Model):
     """Telecommands that are neither acknowledged nor refused on the serial line."""
 
 
-class EscapedFraming(_Model):
+class EscapedFraming(DefinitionModel):
     """`escape start … escape end`, with escape bytes in between doubled (DLE framing)."""
 
     kind: Literal["escaped"]
@@ -55,7 +70,7 @@ class EscapedFraming(_Model):
     """Byte that ends a message, after `escape`."""
 
 
-class SlipFraming(_Model):
+class SlipFraming(DefinitionModel):
     """Messages between `end` bytes; `end` and `escape` inside a message are escaped (RFC 1055)."""
 
     kind: Literal["slip"]
@@ -64,7 +79,7 @@ class SlipFraming(_Model):
     """Byte after a message, and before it with `leading_end`."""
     escape: Byte = 0xDB
     """Byte before an escaped byte."""
-    substitutes: tuple[Byte, Byte] | None = None
+    substitutes: Annotated[list[Byte], Field(min_length=2, max_length=2)] | None = None
     """Escaped forms of `end` and `escape`; default without `xor`: `[0xDC, 0xDD]`."""
     xor: Byte | None = None
     """XOR mask applied to an escaped byte, instead of `substitutes` (HDLC: end 0x7E, escape 0x7D, xor
@@ -77,10 +92,11 @@ class SlipFraming(_Model):
         """Bytes that follow an escape byte instead of `end` and `escape`."""
         if self.xor is not None:
             return self.end ^ self.xor, self.escape ^ self.xor
-        return self.substitutes or (0xDC, 0xDD)
+        first, second = self.substitutes or (0xDC, 0xDD)
+        return first, second
 
 
-class LengthFraming(_Model):
+class LengthFraming(DefinitionModel):
     """`start`, a message whose header field `length` gives its size, then `end`."""
 
     kind: Literal["length"]
@@ -91,7 +107,7 @@ class LengthFraming(_Model):
     """Bytes after the checksum."""
 
 
-class FixedFraming(_Model):
+class FixedFraming(DefinitionModel):
     """`start`, a message of the size that its row has, then `end`."""
 
     kind: Literal["fixed"]
@@ -104,7 +120,7 @@ class FixedFraming(_Model):
     """Bytes between `start` and `end` if all requests have the same size."""
 
 
-class DelimitedFraming(_Model):
+class DelimitedFraming(DefinitionModel):
     """`start`, a message that must not contain the bytes of `end`, then `end`."""
 
     kind: Literal["delimited"]
@@ -117,7 +133,7 @@ class DelimitedFraming(_Model):
     """`binary`: raw bytes; `hex`: two hexadecimal digits per byte."""
 
 
-class CustomFraming(_Model):
+class CustomFraming(DefinitionModel):
     """A framing of the unit's plugin."""
 
     kind: Literal["custom"]
@@ -138,14 +154,14 @@ FramingModel = Annotated[
 ]
 
 
-class _CheckModel(_Model):
+class _CheckModel(DefinitionModel):
     order: Order | None = None
     """Byte order of the checksum; default: the unit's."""
     covers: Annotated[list[CoveredPart], Field(min_length=1)] = ["header", "data"]
     """Parts of the message that the checksum covers."""
 
 
-class NoCheck(_Model):
+class NoCheck(DefinitionModel):
     """No checksum."""
 
     kind: Literal["none"]
@@ -212,7 +228,7 @@ CheckModel = Annotated[
 ]
 
 
-class HeaderBitModel(_Model):
+class HeaderBitModel(DefinitionModel):
     """One bit or group of bits of a header field."""
 
     role: Role | None = None
@@ -225,7 +241,7 @@ class HeaderBitModel(_Model):
     """Value that is sent if the message sets none; not checked on reception, except for an address."""
 
 
-class HeaderFieldModel(_Model):
+class HeaderFieldModel(DefinitionModel):
     """One field of a header.
 
     Roles: `address` is the address of the device, in both directions; `source` (in a request) and
@@ -255,7 +271,7 @@ class HeaderFieldModel(_Model):
     """Bits, lowest first."""
 
 
-class SerialLinkModel(_Model):
+class SerialLinkModel(DefinitionModel):
     """The serial line."""
 
     baud: Annotated[int, Field(ge=300)] = 115200
@@ -274,7 +290,7 @@ class SerialLinkModel(_Model):
     """Silence after which an incomplete message is discarded, in seconds."""
 
 
-class CubeSpaceCanModel(_Model):
+class CubeSpaceCanModel(DefinitionModel):
     """CAN with the CubeSpace family's CAN ID layout and segmentation."""
 
     kind: Literal["cubespace"]
@@ -283,7 +299,7 @@ class CubeSpaceCanModel(_Model):
     """Bit rate."""
 
 
-class LinkModel(_Model):
+class LinkModel(DefinitionModel):
     """`[link]`: the links that a unit has."""
 
     serial: SerialLinkModel | None = None

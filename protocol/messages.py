@@ -147,20 +147,6 @@ class Reply:
 
 
 @dataclass(frozen=True, slots=True)
-class MessageClass:
-    """A class of rows, with its codes on the wire; None if the header has no class."""
-
-    name: str
-    kind: RequestKind
-    code: int | None = None
-    """Code in a request."""
-    reply: int | None = None
-    """Code in a reply; default: `code`."""
-    unsolicited: int | None = None
-    """Code in unsolicited telemetry; default: `reply`."""
-
-
-@dataclass(frozen=True, slots=True)
 class LinkFault:
     """Input that is not a valid message: the kind for counters, and a text."""
 

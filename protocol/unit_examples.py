@@ -11,15 +11,16 @@ from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.layout import layout_errors
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.cubespace_serial import CubeSpaceStack
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.icd import read_definition
 from starhil.protocol.icd_bindings import unbound
-from starhil.protocol.icd_builder import read_definition
 from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
 from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack, serial_answers
+from starhil.protocol.serial_stack import build_serial_stack, serial_answers
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
@@ -45,7 +46,7 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
     If the framing cannot carry these, they are the default values. Raises ProtocolError for a row whose defaults
     contradict its limits.
     """
-    stack = None if icd.link.serial is None or _unknown_link(icd) else build_serial_stack(icd)
+    stack = None if icd.link.serial is None or icd.link_is_unknown else build_serial_stack(icd)
     for row in icd.rows:
         if stack is not None:
             try:
@@ -54,13 +55,6 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
                 yield _on_serial(icd, stack, row, row.example())
         if icd.link.can is not None:
             yield _on_can(icd, row, row.sample())
-
-
-def _unknown_link(icd: InterfaceDefinition) -> bool:
-    """Return whether the serial link is of a plugin that was not run."""
-    serial = icd.link.serial
-    custom = serial is not None and "custom" in (serial.framing.kind, serial.check.kind)
-    return custom and icd.plugin.skipped is not None
 
 
 def _on_serial(
@@ -120,6 +114,11 @@ def examine(
         except ProtocolError as error:
             errors.append(f"unit {definition.name}: {error}")
     return definition, errors, examples
+
+
+def check_unit(name_or_folder: str | Path, *, run_plugin: bool = True) -> list[str]:
+    """Return all errors in a definition, each with file, row and field; none if the unit can be emulated."""
+    return examine(name_or_folder, run_plugin=run_plugin)[1]
 
 
 def _reply(

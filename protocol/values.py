@@ -1,18 +1,26 @@
-"""Values of the interface definition: enumerations, limits and device parameters."""
+"""Values of an interface definition: enumerations, limits, parameters, and the errors in definitions and values.
+
+The tables of a definition are pydantic models, validated when the file is read and used as they are from then on.
+"""
 
 from __future__ import annotations
 
 import math
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import Final
+from typing import Annotated, Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
+from pydantic_core import PydanticCustomError
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 
+Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
+ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
+Scalar = bool | int | float | str
 Value = bool | int | float | str | bytes
 """A physical value: a flag, a number in its unit, the name of a member of an enumeration, or raw bytes."""
 
@@ -70,14 +78,28 @@ class FieldError(MessageError):
     """A value outside its type, limits or enumeration; the text begins with row.field."""
 
 
-@dataclass(frozen=True)
-class EnumDefinition:
-    """Named numbers."""
+class DefinitionModel(BaseModel):
+    """A table of a definition; unknown keys and wrong types are rejected."""
 
-    name: str
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class EnumDefinition(DefinitionModel):
+    """An enumeration."""
+
+    name: Name
+    """Name that fields refer to."""
     doc: str
-    values: Mapping[str, int]
-    """Number of each name."""
+    """Description."""
+    values: dict[Name, Annotated[int, Field(ge=0, le=0xFFFFFFFF)]] = Field(min_length=1)
+    """Name → number on the wire."""
+
+    @field_validator("values")
+    @classmethod
+    def _distinct(cls, values: dict[str, int]) -> dict[str, int]:
+        if len(set(values.values())) != len(values):
+            raise PydanticCustomError("definition", "two names have the same number")
+        return values
 
     @cached_property
     def names(self) -> Mapping[int, str]:
@@ -119,31 +141,76 @@ def limits_text(minimum: float | None, maximum: float | None, unit: str) -> str:
     return f"{low} to {high} {unit}".rstrip()
 
 
-@dataclass(frozen=True)
-class Section:
-    """A section of a definition's documentation: heading, paragraphs and a table."""
+class Section(DefinitionModel):
+    """A section of documentation: paragraphs and a table."""
 
-    heading: str
-    paragraphs: tuple[str, ...]
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+    heading: Annotated[str, Field(min_length=1)]
+    paragraphs: Annotated[tuple[str, ...], Strict(strict=False)] = ()
+    columns: Annotated[tuple[str, ...], Strict(strict=False), Field(min_length=1)]
+    rows: Annotated[tuple[Annotated[tuple[str, ...], Strict(strict=False)], ...], Strict(strict=False)]
+
+    @model_validator(mode="after")
+    def _full_rows(self) -> Section:
+        for number, row in enumerate(self.rows, 1):
+            if len(row) != len(self.columns):
+                raise PydanticCustomError(
+                    "definition",
+                    "row {row} has {found} cells, must have {wanted}",
+                    {"row": number, "found": len(row), "wanted": len(self.columns)},
+                )
+        return self
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """A parameter of the device, shared by bus, device and object dictionary."""
+class ParameterKeys(DefinitionModel):
+    """What the device model and a unit say of a parameter."""
+
+    name: Name
+    type: ParameterType
+    """Type on the wire."""
+    unit: str = ""
+    minimum: float | None = Field(default=None, alias="min")
+    """None if the type or the enumeration gives it."""
+    maximum: float | None = Field(default=None, alias="max")
+    default: Scalar
+    doc: str
+
+
+class DeviceParameter(ParameterKeys):
+    """A parameter of the device model."""
+
+    enumeration: str | None = Field(default=None, alias="enum")
+    """Name of the enumeration."""
+
+
+class Parameter(ParameterKeys):
+    """A parameter with the limits of a unit, shared by bus, device and object dictionary."""
 
     id: int
-    """ID in set_parameter and select_parameter, 1 to 254."""
-    name: str
-    type: str
-    """Wire type: u8 … i32, f32, f64, bool or enum8."""
-    unit: str
+    """ID in set_parameter and select_parameter, 1 to 254; 0 if the unit does not expose it."""
     minimum: float
     maximum: float
-    default: bool | int | float | str
-    doc: str
-    enum: EnumDefinition | None = field(default=None)
+    enum: EnumDefinition | None
+
+    @classmethod
+    def limited(
+        cls, keys: Mapping[str, Any], enum: EnumDefinition | None, where: str, number: int = 0
+    ) -> Parameter:
+        """Return a parameter with the limits of its enumeration or type; raise IcdError if it has no valid ones."""
+        given = {name: keys[name] for name in ParameterKeys.model_fields}
+        parameter = cls.model_construct(**{**given, "id": number, "enum": enum})
+        low: float | None = parameter.minimum
+        high: float | None = parameter.maximum
+        if enum is not None:
+            low, high = float(min(enum.values.values())), float(max(enum.values.values()))
+        elif parameter.type == "bool":
+            low, high = 0.0, 1.0
+        elif low is None or high is None or not low <= high:
+            raise IcdError(f"{where}: needs min and max, with min not above max")
+        else:
+            lowest, highest = INTEGER_RANGES.get(parameter.type, (-math.inf, math.inf))
+            if low < lowest or high > highest:
+                raise IcdError(f"{where}: limits {low:g} to {high:g} do not fit type {parameter.type}")
+        return parameter.model_copy(update={"minimum": low, "maximum": high})
 
     def check(self, value: Value) -> bool | int | float | str:
         """Return the value in the type of the parameter, or raise FieldError, whose text gives the limits.

@@ -28,6 +28,7 @@ LIMIT_VARIABLE: Final = "STARHIL_CACHE_LIMIT_MB"
 DEFAULT_LIMIT_MB: Final = 500.0
 BYTES_PER_MB: Final = 1_000_000
 _KERNELS: Final = "kernels"
+KERNEL_SUFFIX: Final = ".kernel"
 _OWN_NAME: Final = re.compile(
     rf"(?:hipparcos|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
 )
@@ -107,7 +108,7 @@ def cached_files() -> list[CachedFile]:
 def kernels_written_since(unix_s: float) -> int:
     """Return how many kernels have been compiled into the cache since a Unix time in seconds."""
     count = 0
-    for path in cache_dir().glob(f"{_KERNELS}/*/*.nbc"):
+    for path in cache_dir().glob(f"{_KERNELS}/*/*{KERNEL_SUFFIX}"):
         try:
             count += path.stat().st_mtime >= unix_s
         except FileNotFoundError:  # another process has removed it

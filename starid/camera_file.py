@@ -71,9 +71,7 @@ def load_camera(path: str | Path) -> Camera:
     try:
         content = tomllib.loads(read_text(source))
     except FileNotFoundError:
-        raise StaridError(
-            f"camera profile {source}: no such file; write one with starhil calibrate"
-        ) from None
+        raise StaridError(f"camera profile {source}: no such file; write one with starid calibrate") from None
     except OSError as error:
         raise StaridError(f"camera profile {source}: cannot be read ({error.strerror})") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, RecursionError) as error:

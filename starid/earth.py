@@ -18,7 +18,31 @@ DAY_S: Final = 86_400.0
 UNIX_EPOCH_JD: Final = 2_440_587.5
 """Julian date of 1970-01-01."""
 
+LATEST_UNIX_S: Final = 4_102_444_800.0
+"""2100-01-01; the 32-bit seconds of telemetry wrap six years later."""
+
 _TT_MINUS_TAI_S: Final = 32.184
+
+
+def unix_time(value: object) -> float:
+    """Return the Unix time of a date: a TOML date-time, ISO 8601 text, or Unix time; UTC without an offset.
+
+    Raises
+    ------
+    ValueError
+        The value is not a date from 1970 to 2100.
+    """
+    number = value
+    if isinstance(value, str):
+        try:
+            number = datetime.fromisoformat(value)
+        except ValueError:
+            number = None
+    if isinstance(number, datetime):
+        number = (number if number.tzinfo else number.replace(tzinfo=UTC)).timestamp()
+    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= LATEST_UNIX_S:
+        raise ValueError("must be a date from 1970 to 2100, e.g. 2026-03-20T12:00:00Z")
+    return float(number)
 
 
 @lru_cache(maxsize=1)

@@ -18,27 +18,8 @@ ALGORITHMS: Final[dict[str, tuple[str, str]]] = {
     "geometric": ("starid.geometric.identifier", "Identifier"),
     "lsi": ("starid.thesis.lsi_identifier", "LsiIdentifier"),
     "rsi": ("starid.thesis.rsi_identifier", "RsiIdentifier"),
-    "pyramid": ("starid.classic.pyramid", "PyramidIdentifier"),
-    "grid": ("starid.classic.grid", "GridIdentifier"),
-    "modified-grid": ("starid.classic.modified_grid", "ModifiedGridIdentifier"),
-    "improved-grid": ("starid.classic.improved_grid", "ImprovedGridIdentifier"),
-    "match-group": ("starid.classic.match_group", "MatchGroupIdentifier"),
-    "geometric-voting": ("starid.classic.geometric_voting", "GeometricVotingIdentifier"),
-    "iterative": ("starid.classic.iterative", "IterativeIdentifier"),
-    "subgraph": ("starid.classic.subgraph", "SubgraphIdentifier"),
-    "log-polar": ("starid.classic.log_polar", "LogPolarIdentifier"),
-    "vector-pattern": ("starid.classic.vector_pattern", "VectorPatternIdentifier"),
-    "svd": ("starid.classic.svd", "SvdIdentifier"),
-    "oriented-svd": ("starid.classic.oriented_svd", "OrientedSvdIdentifier"),
-    "pole-star": ("starid.classic.pole_star", "PoleStarIdentifier"),
-    "radial-cyclic": ("starid.classic.radial_cyclic", "RadialCyclicIdentifier"),
 }
 """Name of an algorithm → module and class. A module is imported on first use."""
-
-CLASSICS: Final = tuple(
-    name for name, (module, _) in ALGORITHMS.items() if module.startswith("starid.classic.")
-)
-"""The published algorithms."""
 
 
 @runtime_checkable
@@ -109,7 +90,7 @@ def make_identifier(
     catalog: StarCatalog | None = None,
     **options: Any,
 ) -> StarIdentifier:
-    """Make a star identifier by name: "geometric", "lsi", "rsi" or one of `CLASSICS`.
+    """Make a star identifier by name: "geometric", "lsi" or "rsi".
 
     Parameters
     ----------

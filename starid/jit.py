@@ -1,65 +1,46 @@
 """Decorators that compile kernels with numba and cache their machine code on disk.
 
+A kernel is loaded, or compiled, when it is first called with arguments of certain types. numba is imported only to
+compile (`starid.kernel_library`): machine code in the cache is run without it (`starid.machine_code`), which saves
+half a second of a start and 100 MB.
+
 The machine code is in the cache folder (`starid.cache`), in one folder per state of the sources: the module
 of the function and every module of the project that it imports, directly or not. Installations with equal
 sources share it; if any of these sources changes, the function is compiled again. Each file begins with a
-checksum of the rest, because numba runs whatever it reads; a damaged file is removed.
+checksum of the rest; a damaged file is removed.
 """
 
 from __future__ import annotations
 
 import hashlib
-import importlib
-import io
+import importlib.machinery
+import importlib.util
 import logging
+import os
 import pickle
 import re
 import sys
 from collections.abc import Callable
-from functools import cache
+from functools import cache, cached_property, update_wrapper
 from pathlib import Path
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
-import numba
 import numpy as np
-from numba import njit
-from numba.core import caching
 
-from starid.cache import evict, kernel_folder, mark_used
-from starid.kernel_library import InnerCompiler, LoadedKernels, without_literals
+from starid.cache import KERNEL_SUFFIX, evict, kernel_folder, mark_used
+from starid.files import write_atomically
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
+Function = Callable[..., Any]
 
 _log = logging.getLogger(__name__)
-
-_NumbaCacheFile: Any = caching.IndexDataCacheFile
-_NumbaCache: Any = caching.FunctionCache
 
 _IMPORT: Final = re.compile(rb"^(?:from|import)[ \t]+([\w.]+)(?:[ \t]+import[ \t]+(.+))?", re.MULTILINE)
 
 
-def _import_numba_arrays() -> None:
-    """Import numba's array support without importing all of ``scipy.linalg``.
-
-    numba imports ``scipy.linalg`` only to check that it exists, which takes a fifth of the time until the
-    first kernel runs, and 12 MB. scipy is a requirement of this package; a kernel that multiplies matrices
-    imports what it needs when it is called.
-    """
-    linalg: Any = importlib.import_module("numba.np.linalg")
-    ensure_blas = linalg.ensure_blas
-    linalg.ensure_blas = lambda: None
-    try:
-        importlib.import_module("numba.np.arraymath")
-    finally:
-        linalg.ensure_blas = ensure_blas
-
-
-_import_numba_arrays()
-
-
 def compiled(function: Kernel) -> Kernel:
     """Compile a function of numbers and plain arrays, cached on disk and run without the GIL."""
-    return cast("Kernel", cached_on_disk(njit(nogil=True)(function)))
+    return cast("Kernel", KernelFunction(function))
 
 
 def compiled_ieee(function: Kernel) -> Kernel:
@@ -67,13 +48,13 @@ def compiled_ieee(function: Kernel) -> Kernel:
 
     Without numba's test of every divisor a loop over pixels has no branch and is vectorised.
     """
-    return cast("Kernel", cached_on_disk(njit(nogil=True, error_model="numpy")(function)))
+    return cast("Kernel", KernelFunction(function, error_model="numpy"))
 
 
 def compiled_sums(function: Kernel) -> Kernel:
     """Compile as `compiled_ieee`, but allow sums in any order, so that they are vectorised too."""
     reordered = {"reassoc", "nsz", "contract"}
-    return cast("Kernel", cached_on_disk(njit(nogil=True, error_model="numpy", fastmath=reordered)(function)))
+    return cast("Kernel", KernelFunction(function, error_model="numpy", fastmath=reordered))
 
 
 def inner(function: Kernel) -> Kernel:
@@ -82,142 +63,239 @@ def inner(function: Kernel) -> Kernel:
     It is optimised and cached only as part of the kernels that call it, and has no wrappers for callers in
     Python and C, which would take longer to compile than the function itself.
     """
-    return _inner(function, "numpy")
+    return cast("Kernel", InnerFunction(function, error_model="numpy"))
 
 
 def inner_checked(function: Kernel) -> Kernel:
     """Compile as `inner`, but division by zero raises an exception, as in `compiled`."""
-    return _inner(function, "python")
+    return cast("Kernel", InnerFunction(function, error_model="python"))
 
 
-def _inner(function: Kernel, error_model: str) -> Kernel:
-    options: dict[str, Any] = {
-        "no_cpython_wrapper": True,
-        "no_cfunc_wrapper": True,
-        "error_model": error_model,
-    }
-    dispatcher = njit(nogil=True, pipeline_class=InnerCompiler, **options)(function)
-    return cast("Kernel", without_literals(dispatcher))
+class InnerFunction:
+    """A function that only kernels call.
 
+    Parameters
+    ----------
+    function : callable
+        The Python function.
+    options
+        Options of numba.
 
-def cached_on_disk(dispatcher: Any) -> Any:
-    """Cache the machine code of a numba dispatcher on disk; no effect if compilation is disabled."""
-    if hasattr(dispatcher, "enable_caching"):
-        dispatcher._cache = KernelCache(dispatcher.py_func)  # noqa: SLF001
-    return dispatcher
-
-
-class KernelLocator:
-    """Location of the machine code of one function.
-
-    It is in the cache folder, or in ``__pycache__`` beside the source if no cache folder can be made.
+    Attributes
+    ----------
+    py_func : callable
+        The Python function.
+    options : dict
     """
 
-    def __init__(self, function: Any, source: str) -> None:
-        self._line = function.__code__.co_firstlineno
-        self._stamp = source_stamp(function.__module__)
-        versions = (numba.__version__, np.__version__)
-        key = hashlib.sha256(repr((function.__module__, self._stamp, versions)).encode()).hexdigest()[:16]
-        self._folder = kernel_folder(key) or Path(source).parent / "__pycache__"
+    def __init__(self, function: Function, **options: Any) -> None:
+        update_wrapper(self, function)
+        self.py_func = function
+        self.options = options
 
-    @classmethod
-    def from_function(cls, function: Any, source: str) -> KernelLocator:
-        """Return the locator of a function (called by numba)."""
-        return cls(function, source)
+    @cached_property
+    def dispatcher(self) -> Any:
+        """Dispatcher of the function."""
+        from starid.kernel_library import inner_dispatcher
 
-    def get_cache_path(self) -> str:
-        """Folder of the cache files."""
-        return str(self._folder)
+        return inner_dispatcher(self.py_func, self.options)
 
-    def get_source_stamp(self) -> str:
-        """Checksum that the index of the cache must have."""
-        return self._stamp
+    @property
+    def _numba_type_(self) -> Any:
+        """Type of the function in other kernels, which numba asks for."""
+        return self.dispatcher._numba_type_
 
-    def get_disambiguator(self) -> str:
-        """Part of the file names that distinguishes functions of the same name."""
-        return str(self._line)
-
-    def ensure_cache_path(self) -> None:
-        """Do nothing: the folder is created when a file is written."""
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the compiled function."""
+        return self.dispatcher(*arguments)
 
 
-class KernelCacheImpl(LoadedKernels):
-    """The storage of machine code, with `KernelLocator` as the only locator."""
+class KernelFunction(InnerFunction):
+    """A kernel: calls the machine code for the types of its arguments.
 
-    _locator_classes = (KernelLocator,)
-
-
-class KernelCache(_NumbaCache):  # type: ignore[misc]
-    """numba's disk cache of one function, with verified files."""
-
-    _impl_class = KernelCacheImpl
-
-    def __init__(self, function: Any) -> None:
-        super().__init__(function)
-        stamp = self._impl.locator.get_source_stamp()
-        self._cache_file = VerifiedCacheFile(self._cache_path, self._impl.filename_base, stamp)
-
-
-class VerifiedCacheFile(_NumbaCacheFile):  # type: ignore[misc]
-    """numba's cache files of one function, each with a checksum.
-
-    A damaged file is removed and the function compiled again. If a file cannot be written, a warning is
-    logged and each process compiles the function.
+    Attributes
+    ----------
+    loaded : dict of str to callable
+        Machine code loaded or compiled in this process, by the names of the argument types.
+    compilations : int
+        How many times the kernel was compiled in this process.
     """
 
-    def save(self, key: Any, data: Any) -> None:
-        """Store the machine code of a signature."""
-        folder = Path(self._cache_path)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            super().save(key, data)
-        except OSError as error:
-            _warn_not_kept(folder.parent, error.strerror)
-        else:
-            evict(keep=folder)
+    def __init__(self, function: Function, **options: Any) -> None:
+        super().__init__(function, **options)
+        self.loaded: dict[str, Function] = {}
+        self.compilations = 0
+        self._by_kind: dict[tuple[object, ...], Function] = {}
 
-    def load(self, key: Any) -> Any:
-        """Return the machine code of a signature, or None."""
-        data = super().load(key)
-        if data is not None:
-            mark_used(Path(self._cache_path))
-        return data
+    @cached_property
+    def dispatcher(self) -> Any:
+        """Numba's dispatcher of the kernel."""
+        from starid.kernel_library import kernel_dispatcher
 
-    def _load_index(self) -> dict[Any, str]:
-        try:
-            stream = io.BytesIO(self._read(Path(self._index_path)))
-        except OSError:
-            return {}
-        if pickle.load(stream) != self._version:  # noqa: S301 (this package's own cache, here and below)
-            return {}  # the rest may not be readable
-        stamp, overloads = pickle.load(stream)  # noqa: S301
-        return overloads if stamp == self._source_stamp else {}
+        return kernel_dispatcher(self)
 
-    def _save_index(self, overloads: dict[Any, str]) -> None:
-        self._write(
-            self._index_path, pickle.dumps(self._version) + self._dump((self._source_stamp, overloads))
+    def __call__(self, *arguments: Any) -> Any:
+        """Call the machine code for the types of the arguments, which is loaded or compiled the first time."""
+        kinds = tuple(
+            [(a.dtype, a.ndim, a.flags.num) if type(a) is np.ndarray else _kind(a) for a in arguments]
         )
+        function = self._by_kind.get(kinds)
+        if function is None:
+            function = self._by_kind[kinds] = self._obtain(arguments)
+        return function(*arguments)
 
-    def _load_data(self, name: str) -> Any:
-        return pickle.loads(self._read(Path(self._data_path(name))))  # noqa: S301
+    def _obtain(self, arguments: tuple[Any, ...]) -> Function:
+        """Load the machine code for the types of some arguments, or compile it."""
+        types = type_names(arguments)
+        if types not in self.loaded:
+            self.loaded[types] = self._load(types) or self._compile(types, arguments)
+        return self.loaded[types]
 
-    def _save_data(self, name: str, data: Any) -> None:
-        self._write(self._data_path(name), self._dump(data))
+    def _load(self, types: str) -> Function | None:
+        """Load machine code from the cache without numba; None if there is none that can be."""
+        from starid.machine_code import NotLoadableError, load
 
-    def _write(self, path: str, content: bytes) -> None:
-        with self._open_for_write(path) as stream:
-            stream.write(hashlib.sha256(content).digest() + content)
+        stored = self.read(types)
+        try:
+            return None if stored is None else load(stored, self.py_func)
+        except NotLoadableError as reason:
+            _log.info("%s: loaded by numba: %s", self.py_func.__name__, reason)
+            return None
 
-    @staticmethod
-    def _read(path: Path) -> bytes:
-        """Read a file; if its checksum is wrong, remove it and treat it as missing."""
+    def _compile(self, types: str, arguments: tuple[Any, ...]) -> Function:
+        """Compile the kernel with numba, or let numba load it from the cache."""
+        from starid.kernel_library import compile_kernel
+
+        return compile_kernel(self, types, arguments)
+
+    @cached_property
+    def _folder(self) -> Path:
+        """Folder of the machine code.
+
+        It is in the cache folder, or is ``__pycache__`` beside the source if no cache folder can be made.
+        """
+        module = self.py_func.__module__
+        key = hashlib.sha256(repr((module, source_stamp(module), versions())).encode()).hexdigest()[:16]
+        return kernel_folder(key) or Path(self.py_func.__code__.co_filename).parent / "__pycache__"
+
+    def _path(self, types: str) -> Path:
+        code = self.py_func.__code__
+        key = hashlib.sha256(f"{types} {code.co_firstlineno} {processor()}".encode()).hexdigest()[:16]
+        return self._folder / f"{self.py_func.__name__}-{key}{KERNEL_SUFFIX}"
+
+    def read(self, types: str) -> StoredKernel | None:
+        """Return the cached machine code for types of arguments; None if there is none."""
+        path = self._path(types)
+        content = read_verified(path)
+        if content is None:
+            return None
+        mark_used(path.parent)
+        return StoredKernel(*pickle.loads(content))  # noqa: S301 (this package's own cache)
+
+    def write(self, types: str, stored: StoredKernel) -> None:
+        """Cache machine code; if it cannot be written, a warning is logged and each process compiles it."""
+        path = self._path(types)
+        try:
+            write_verified(path, pickle.dumps(tuple(stored)))
+        except OSError as error:
+            _warn_not_kept(path.parent.parent, error.strerror)
+        else:
+            evict(keep=path.parent)
+
+
+class StoredKernel(NamedTuple):
+    """Machine code of a kernel in the cache.
+
+    Attributes
+    ----------
+    code : bytes
+        Object file (ELF).
+    entry : str
+        Name of its function that Python can call.
+    environments : list of (str, list)
+        Python objects that the code uses, by the name of the variable that refers to them.
+    linkable : bytes
+        What numba needs to link it into other kernels, pickled.
+    """
+
+    code: bytes
+    entry: str
+    environments: list[tuple[str, list[Any]]]
+    linkable: bytes
+
+
+def _kind(value: Any) -> object:
+    """Return a hashable that is equal for two arguments only if machine code for one can be called with the other."""
+    if isinstance(value, tuple):
+        return (type(value), *map(_kind, value))
+    if isinstance(value, np.ndarray):
+        return value.dtype, value.ndim, value.flags.num
+    return type(value)
+
+
+def type_names(arguments: tuple[Any, ...]) -> str:
+    """Return the types of arguments as numba names them, but those of tuples by their members' names."""
+    return ", ".join(_type_name(each) for each in arguments)
+
+
+def _type_name(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        flags, dtype = value.flags, value.dtype
+        name = dtype.name if dtype.isnative and dtype.kind in "biufc" else repr(dtype)
+        layout = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
+        return f"{'' if flags.writeable else 'readonly '}array({name}, {value.ndim}d, {layout})"
+    if isinstance(value, tuple):
+        return f"{type(value).__name__}({type_names(value)})"
+    if isinstance(value, (bool, int, float, complex, np.generic)):
+        return str(np.dtype(type(value)).name)
+    if value is None:
+        return "none"
+    return "NumPyRandomGeneratorType" if isinstance(value, np.random.Generator) else type(value).__name__
+
+
+@cache
+def versions() -> tuple[str, ...]:
+    """Versions on which machine code depends: Python, numpy and numba (which is not imported)."""
+    place = importlib.util.find_spec("numba")
+    folder = Path(cast("str", cast("Any", place).origin)).parent
+    numba = hashlib.sha256((folder / "_version.py").read_bytes()).hexdigest()
+    return importlib.machinery.EXTENSION_SUFFIXES[0], np.__version__, numba
+
+
+@cache
+def processor() -> str:
+    """Describe the processor for which machine code is compiled: its features, and settings of numba."""
+    text = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").partition("\n\n")[0]
+    fixed = ("vendor_id", "cpu family", "model", "flags", "CPU", "Features", "isa")
+    lines = [line for line in text.splitlines() if line.startswith(fixed)]
+    chosen = [os.environ.get(f"NUMBA_{name}", "") for name in ("CPU_NAME", "CPU_FEATURES", "OPT")]
+    return " ".join([*lines, *chosen])
+
+
+def write_verified(path: Path, content: bytes) -> None:
+    """Write a file that begins with the checksum of the rest.
+
+    Raises
+    ------
+    OSError
+        It cannot be written.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, lambda part: part.write_bytes(hashlib.sha256(content).digest() + content))
+
+
+def read_verified(path: Path) -> bytes | None:
+    """Return the content of a file; None if there is none, or if it is damaged, when it is removed."""
+    try:
         data = path.read_bytes()
-        size = hashlib.sha256().digest_size
-        if hashlib.sha256(data[size:]).digest() != data[:size]:
-            _log.info("%s: damaged or of another version, removed; compiled again", path)
-            path.unlink(missing_ok=True)
-            raise FileNotFoundError(path)
+    except OSError:
+        return None
+    size = hashlib.sha256().digest_size
+    if hashlib.sha256(data[size:]).digest() == data[:size]:
         return data[size:]
+    _log.info("%s: damaged or of another version, removed; compiled again", path)
+    path.unlink(missing_ok=True)
+    return None
 
 
 @cache

@@ -1,20 +1,27 @@
-"""How compiled kernels are linked and loaded, to compile less on the first start and to load less on later ones.
+"""How numba compiles and links kernels; imported only where one is compiled.
 
 numba optimises every function, with all that it calls, and turns it into machine code, before it links it into
 its callers, where both happen again. A function of `starid.jit.inner` is called by kernels only: its code is left
-as it is until a kernel is optimised as a whole. And numba parses the intermediate code of each kernel that it
-loads from the cache; here only if another kernel calls it.
+as it is until a kernel is optimised as a whole.
 """
 
 from __future__ import annotations
 
-from typing import Any, Final
+import importlib
+import pickle
+from collections.abc import Callable, Iterable
+from typing import Any, Final, NamedTuple, cast
 
-from numba.core import caching, codegen, types
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba import njit
+from numba.core import codegen, serialize, sigutils, types
+from numba.core.callwrapper import PyCallWrapper
+from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.typed_passes import NativeLowering
 
+from starid.jit import KernelFunction, StoredKernel
+
+_njit: Any = njit
 _codegen: Any = codegen
 _llvm: Any = _codegen.ll
 _types: Any = types
@@ -24,9 +31,63 @@ _Compiler: Any = CompilerBase
 _PassBuilder: Any = DefaultPassBuilder
 _PassManager: Any = PassManager
 _register_pass: Any = register_pass
-_CacheImpl: Any = caching.CompileResultCacheImpl
+_Wrapper: Any = PyCallWrapper
+_CompileResult: Any = CompileResult
+_normalize_signature: Any = sigutils.normalize_signature
+_dumps: Any = serialize.dumps
 
 _NO_CODE: Final[bytes] = _llvm.parse_assembly("").as_bitcode()
+
+
+def _import_numba_arrays() -> None:
+    """Import numba's array support without importing all of ``scipy.linalg``.
+
+    numba imports ``scipy.linalg`` only to check that it exists. scipy is a requirement of this package; a kernel that multiplies matrices
+    imports what it needs when it is called.
+    """
+    linalg: Any = importlib.import_module("numba.np.linalg")
+    ensure_blas = linalg.ensure_blas
+    linalg.ensure_blas = lambda: None
+    try:
+        importlib.import_module("numba.np.arraymath")
+    finally:
+        linalg.ensure_blas = ensure_blas
+
+
+_import_numba_arrays()
+
+
+def _keep_classes_in_environments() -> None:
+    """Let a kernel find the classes of its results in its environment, instead of unpickling them in each call.
+
+    Unpickling imports numba, and takes a microsecond for each array that a kernel returns.
+    """
+    get_environment = _Wrapper.get_env
+
+    def get_env(wrapper: Any, api: Any, builder: Any) -> Any:
+        manager = get_environment(wrapper, api, builder)
+        unserialize = api.unserialize
+
+        def from_environment(value: Any) -> Any:
+            if not isinstance(value, _InEnvironment):
+                return unserialize(value)
+            found = manager.read_const(manager.add_const(value.constant))
+            api.incref(found)  # as after unpickling
+            return found
+
+        api.serialize_object, api.unserialize = _InEnvironment, from_environment
+        return manager
+
+    _Wrapper.get_env = get_env
+
+
+class _InEnvironment(NamedTuple):
+    """A Python object that a wrapper takes from the environment of its kernel."""
+
+    constant: Any
+
+
+_keep_classes_in_environments()
 
 
 class InnerLibrary(_Library):  # type: ignore[misc]
@@ -96,15 +157,77 @@ def without_literals(dispatcher: Any) -> Any:
     return dispatcher
 
 
-class LoadedKernels(_CacheImpl):  # type: ignore[misc]
-    """numba's conversion of a kernel to and from its file, which parses intermediate code only when it is linked."""
+class LinkableCache:
+    """The disk cache of one kernel, as numba uses it to link the kernel into others."""
 
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
-        """Return the kernel of a file's content."""
-        (name, kind, (machine_code, bitcode)), description, *rest = payload
+    def __init__(self, kernel: KernelFunction) -> None:
+        self._kernel = kernel
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """Return a cached kernel, or None. Its intermediate code is parsed only when it is linked."""
+        target_context.refresh()
+        arguments, _ = _normalize_signature(signature)
+        stored = self._kernel.read(names_of_types(arguments))
+        if stored is None:
+            return None
+        (name, bitcode), description, *rest = pickle.loads(stored.linkable)  # noqa: S301 (this package's own cache)
         names = ("llvm_func_name", "llvm_cpython_wrapper_name", "llvm_cfunc_wrapper_name")
         engine = target_context.codegen()._engine  # noqa: SLF001
         engine._defined_symbols.update(getattr(description, each) for each in names)  # noqa: SLF001
-        kernel = super().rebuild(target_context, ((name, kind, (machine_code, _NO_CODE)), description, *rest))
+        library = name, "object", (stored.code, _NO_CODE)
+        kernel = _CompileResult._rebuild(target_context, library, description, *rest)  # noqa: SLF001
         kernel.library._get_module_for_linking = lambda: _llvm.parse_bitcode(bitcode)  # noqa: SLF001
         return kernel
+
+    def save_overload(self, _signature: Any, kernel: Any) -> None:
+        """Cache a kernel that was compiled."""
+        self._kernel.compilations += 1
+        if kernel.library.has_dynamic_globals or kernel.reload_init:
+            return  # refers to objects of this process
+        (name, _, (code, bitcode)), description, *rest = kernel._reduce()  # noqa: SLF001
+        used = {each.env_name: each.consts for each in rest[-1] if each.consts}
+        used = {kernel.environment.env_name: kernel.environment.consts, **used}
+        linkable = _dumps(((name, bitcode), description, *rest))
+        stored = StoredKernel(code, description.llvm_cpython_wrapper_name, list(used.items()), linkable)
+        self._kernel.write(names_of_types(description.argtypes), stored)
+
+
+def inner_dispatcher(function: Any, options: dict[str, Any]) -> Any:
+    """Return the dispatcher of a function of `starid.jit.inner`."""
+    without_wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return without_literals(
+        _njit(nogil=True, pipeline_class=InnerCompiler, **without_wrappers, **options)(function)
+    )
+
+
+def kernel_dispatcher(kernel: KernelFunction) -> Any:
+    """Return the dispatcher of a kernel, which caches the kernel on disk."""
+    dispatcher = _njit(nogil=True, **kernel.options)(kernel.py_func)
+    dispatcher._cache = LinkableCache(kernel)  # noqa: SLF001
+    return dispatcher
+
+
+def compile_kernel(kernel: KernelFunction, types: str, arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    """Compile a kernel, or load it from the cache, for the types of some arguments.
+
+    Raises
+    ------
+    TypeError
+        `starid.jit` and numba name the types differently, so the kernel would never be found in the cache.
+    """
+    signature = tuple(kernel.dispatcher.typeof_pyval(each) for each in arguments)
+    if names_of_types(signature) != types:
+        raise TypeError(f"{kernel.py_func.__name__}: arguments of types {types}, in numba {signature}")
+    return cast("Callable[..., Any]", kernel.dispatcher.compile(signature))
+
+
+def names_of_types(signature: Iterable[Any]) -> str:
+    """Return the names of types, as `starid.jit.type_names` returns those of arguments."""
+    return ", ".join(_name_of_type(each) for each in signature)
+
+
+def _name_of_type(each: Any) -> str:
+    if not isinstance(each, _types.BaseTuple):
+        return str(each)
+    name = each.instance_class.__name__ if isinstance(each, _types.BaseNamedTuple) else "tuple"
+    return f"{name}({names_of_types(each.types)})"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import importlib.util
 import subprocess
 import sys
 import time
@@ -100,6 +101,9 @@ def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
 
 def plot(comparisons: dict[str, Comparison], path: Path) -> None:
     """Plot the attitude error over time for each session."""
+    if importlib.util.find_spec("matplotlib") is None:
+        print(f"{path.name} was not drawn; it needs: pip install 'starhil[lab]'")
+        return
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -353,7 +353,7 @@ def accepted_options(algorithm: str) -> list[str]:
 
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
-    from starhil.emulator.control.faults import DeviceFault, WireFault
+    from starhil.emulator.faults import DeviceFault, WireFault
     from starhil.protocol.icd import load_unit
 
     enums = load_unit().enums
@@ -377,15 +377,16 @@ def scenario() -> str:
 
 def unit_definition() -> str:
     """Tables and keys of the files of a unit."""
-    from starhil.protocol import icd_schema, link_schema
+    from starhil.protocol import icd_schema, link_schema, values
     from starhil.protocol.canopen import layout
+    from starhil.protocol.conventions import Conventions
     from starhil.protocol.messages import ErrorCode
 
     headings: dict[str, type[BaseModel]] = {
         "[unit]": icd_schema.UnitModel,
-        "[conventions]": icd_schema.ConventionsModel,
-        "[[class]]": icd_schema.ClassModel,
-        "[[enum]]": icd_schema.EnumModel,
+        "[conventions]": Conventions,
+        "[[class]]": link_schema.MessageClass,
+        "[[enum]]": values.EnumDefinition,
         "[[telecommand]], [[telemetry]]": icd_schema.RowModel,
         "fields": icd_schema.FieldModel,
         "bits": icd_schema.BitModel,
@@ -473,7 +474,7 @@ def device_parameters() -> str:
         (
             f"`{item.name}`",
             item.unit,
-            "" if item.min is None or item.max is None else f"{number(item.min)} to {number(item.max)}",
+            "" if item.type in ("bool", "enum8") else f"{number(item.minimum)} to {number(item.maximum)}",
             literal(item.default),
             item.doc,
         )
@@ -483,15 +484,18 @@ def device_parameters() -> str:
 
 
 def commands() -> str:
-    """Every command of the command line, with its arguments and options."""
+    """Every command of both programs, with its arguments and options."""
     import typer.main
 
-    from starhil.emulator.cli.app import COMMANDS, build_app
+    from starhil.emulator.cli import app as starhil
+    from starid.cli import app as starid
 
-    app: Any = typer.main.get_command(build_app())
-    return "\n\n".join(
-        part for name in COMMANDS for part in command_parts(f"starhil {name}", app.commands[name])
-    )
+    parts: list[str] = []
+    for program in (starhil, starid):
+        app: Any = typer.main.get_command(program.build_app())
+        for name in program.COMMANDS:
+            parts += command_parts(f"{app.name} {name}", app.commands[name])
+    return "\n\n".join(parts)
 
 
 def command_parts(name: str, command: Any) -> Iterator[str]:

@@ -80,7 +80,7 @@ class CampaignPlan:
     algorithm : star identification algorithm, as in a device profile.
     chunk : frames per chunk; finished chunks are not repeated when a campaign is resumed.
     unknown_field : whether the identification has to find the field of view, like
-        `starhil identify --fov auto`; identification time then includes detection.
+        `starid identify --fov auto`; identification time then includes detection.
     """
 
     frames: int

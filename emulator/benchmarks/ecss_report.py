@@ -298,7 +298,7 @@ def _availability_csv(report: EcssReport) -> str:
 
 
 def _plot_errors(report: EcssReport, folder: Path) -> Path:
-    from starid.thesis.experiments.plots import figure, save
+    from starid.plots import figure, save
 
     shown = [line for line in (*report.lines, report.total, report.measured) if line.arcsec is not None]
     fig, axes = figure(height=3.6)
@@ -314,7 +314,7 @@ def _plot_errors(report: EcssReport, folder: Path) -> Path:
 
 
 def _plot_availability(report: EcssReport, folder: Path) -> Path:
-    from starid.thesis.experiments.plots import figure, save
+    from starid.plots import figure, save
 
     fig, axes = figure(2, 3, width=9.0, height=5.0, sharey=True)
     for axis, (name, (what, unit, _)) in zip(axes.flat, INFLUENCES.items(), strict=True):

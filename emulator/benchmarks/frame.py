@@ -15,11 +15,11 @@ from starhil.emulator.pipeline.bodies import bodies_in_field
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.view import Sky
-from starhil.emulator.truth.config import unix_time
 from starhil.emulator.truth.orbit import KeplerOrbit
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
+from starid.earth import unix_time
 from starid.imaging.detection import detect
 from starid.interface import make_identifier
 

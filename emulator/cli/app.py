@@ -1,202 +1,58 @@
-"""The `starhil` command: its sub-commands, and errors as one line with an exit status."""
+"""The `starhil` command: what concerns a device. The numerics and the laboratory have the command `starid`."""
 
 from __future__ import annotations
 
-import importlib
-import importlib.metadata
-import itertools
-import math
 import sys
-from typing import Annotated, Any, Final, NoReturn
+from collections.abc import Sequence
+from typing import Final
 
 import typer
-from typer.core import TyperCommand, TyperGroup
 
-from starhil.emulator.cli.output import show_every_character
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.validation_messages import plain
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.errors import ProtocolError, escape_controls
+from starhil.protocol.errors import ProtocolError
+from starid.cli import command_line
 from starid.errors import StaridError
 
-EXIT_BAD_INPUT: Final = 2
-"""Exit status for invalid input; 1 means that the command was carried out with a negative result."""
-
-EXIT_INTERRUPTED: Final = 130
-"""Exit status after Ctrl-C, as in shells."""
-
-USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
-"""Base class of errors about options; which library defines it depends on typer's version."""
-
 COMMANDS: Final[dict[str, str]] = {
-    "icd": "icd",
-    "unit": "unit",
-    "run": "run",
-    "replay": "replay",
-    "bench": "bench",
-    "render": "render",
-    "identify": "identify",
-    "campaign": "campaign",
-    "endurance": "endurance",
-    "catalog": "catalog",
-    "calibrate": "calibrate",
-    "session": "session",
-    "conformance": "conformance",
-    "hub": "hub",
-    "features": "features",
-    "database": "database",
-    "reproduce": "reproduce",
-    "cache": "cache",
-}
-"""Sub-command → module in `starhil.emulator.cli` with a function `command` or a `group` of sub-commands.
-
-For a fast start, these modules import slow packages inside their functions.
-"""
-
-
-def _print_version(value: bool) -> None:
-    if value:
-        print(f"starhil {importlib.metadata.version('starhil')}")
-        raise typer.Exit
-
-
-_PYTHON_NUMBERS: Final = "starhil.python_numbers"
-
-
-def _only_python_reads(word: str) -> bool:
-    """Return whether an argument is a number with underscores or non-ASCII digits."""
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return "_" in word or not word.isascii()
-
-
-OPTIONAL_VALUES: Final = {"--view": "auto"}
-"""Options whose value may be omitted → their value in this case; typer does not support this."""
-
-
-class _PlainHelp:
-    """Help that shows flags without a type, and positional arguments in capitals."""
-
-    def get_params(self, ctx: Any) -> list[Any]:
-        """Return the parameters, each with its metavar for the help."""
-        params: list[Any] = super().get_params(ctx)  # type: ignore[misc]
-        for param in params:
-            if getattr(param, "is_flag", False):
-                param.metavar = ""
-            elif param.param_type_name == "argument" and param.metavar is None:
-                param.metavar = param.name.rstrip("_").upper()
-        return params
-
-
-class Group(_PlainHelp, TyperGroup):
-    """A group of commands."""
-
-
-class FiniteCommand(_PlainHelp, TyperCommand):
-    """A command that rejects infinite numbers, NaN and numbers in Python notation (`1_0`)."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, with omitted values of `OPTIONAL_VALUES` added."""
-        words = [word.rpartition("=")[2] for word in args]
-        ctx.meta[_PYTHON_NUMBERS] = {float(word): word for word in words if _only_python_reads(word)}
-        whole = []
-        for argument, after in itertools.pairwise([*args, "--"]):
-            whole.append(argument)
-            if argument in OPTIONAL_VALUES and after.startswith("-"):
-                whole.append(OPTIONAL_VALUES[argument])
-        return super().parse_args(ctx, whole)
-
-    def invoke(self, ctx: Any) -> Any:
-        """Call the command with its options.
-
-        Raises
-        ------
-        typer.BadParameter
-            A number is not finite, or in Python notation.
-        """
-        python_numbers = ctx.meta[_PYTHON_NUMBERS]
-        params: list[Any] = list(self.params)
-        for param in params:
-            value = ctx.params.get(param.name)
-            values = value if isinstance(value, (list, tuple)) else (value,)
-            numbers = [each for each in values if isinstance(each, (int, float))]
-            if not all(math.isfinite(each) for each in numbers):
-                raise typer.BadParameter("must be finite", ctx=ctx, param=param)
-            if word := next((python_numbers[each] for each in numbers if each in python_numbers), None):
-                raise typer.BadParameter(f"{word!r} is not a number", ctx=ctx, param=param)
-        return super().invoke(ctx)
-
-
-def build_app() -> typer.Typer:
-    """Assemble the command line from the modules named in `COMMANDS`."""
-    app = typer.Typer(
-        name="starhil",
-        cls=Group,
-        help="Star tracker emulator for hardware-in-the-loop tests: renders the sky, determines the attitude and answers on the bus.",
-        no_args_is_help=True,
-        add_completion=False,
-        pretty_exceptions_enable=False,
+    name: f"starhil.emulator.cli.{name}"
+    for name in (
+        "icd",
+        "unit",
+        "run",
+        "replay",
+        "bench",
+        "render",
+        "campaign",
+        "endurance",
+        "session",
+        "conformance",
+        "hub",
+        "cache",
     )
-    app.callback()(_options)
-    for name, module_name in COMMANDS.items():
-        module = importlib.import_module(f"starhil.emulator.cli.{module_name}")
-        if hasattr(module, "group"):
-            for each in module.group.registered_commands:
-                each.cls = FiniteCommand
-            app.add_typer(module.group, name=name, cls=Group)
-        else:
-            app.command(name, cls=FiniteCommand)(module.command)
-    return app
+}
+"""Sub-command → module."""
+
+MOVED: Final[dict[tuple[str, ...], str]] = {
+    **{(name,): name for name in ("identify", "calibrate", "catalog", "features", "database", "reproduce")},
+    ("bench", "identify"): "bench",
+}
+"""Sub-commands of earlier releases → their names in `starid`; they go on working for one release."""
 
 
-def _options(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
-    ] = False,
-) -> None:
-    """Options before the sub-command."""
-
-
-def describe_os_error(error: OSError) -> str:
-    """Return one line, `path: reason`, for an error that was not handled by a command."""
-    reason = error.strerror or str(error) or type(error).__name__
-    paths = [str(path) for path in (error.filename, error.filename2) if path is not None]
-    return " ".join(": ".join([" -> ".join(paths), reason] if paths else [reason]).split())
-
-
-def describe_usage_error(error: Any) -> str:
-    """Return one line, `command: problem (see … --help)`, for an invalid option or argument."""
-    path = "" if error.ctx is None else str(error.ctx.command_path)
-    command = path.removeprefix("starhil").strip()
-    what, value, why = str(error.format_message()).partition("': ")
-    message = " ".join(f"{plain(what)}{value}{plain(why)}".split()).rstrip(".")
-    full_command = f"starhil {command}".strip()
-    return f"{f'{command}: ' if command else ''}{message} (see {full_command} --help)"
+def build_app(words: Sequence[str] = ()) -> typer.Typer:
+    """Assemble the command line, see `command_line.build_app`."""
+    about = "Star tracker emulator for hardware-in-the-loop tests: renders the sky, determines the attitude and answers on the bus."
+    return command_line.build_app("starhil", about, COMMANDS, words)
 
 
 def main() -> None:
-    """Run the command line; invalid input ends with one line on stderr and exit status 2."""
-    show_every_character()
-    try:
-        status = build_app()(prog_name="starhil", standalone_mode=False)
-    except (StaridError, ProtocolError, EmulatorError, BenchError) as error:
-        exit_for_bad_input(str(error))
-    except OSError as error:
-        exit_for_bad_input(describe_os_error(error))
-    except MemoryError as error:
-        exit_for_bad_input(f"not enough memory: {error}" if str(error) else "not enough memory")
-    except (KeyboardInterrupt, typer.Abort):
-        raise SystemExit(EXIT_INTERRUPTED) from None
-    except USAGE_ERROR as error:
-        if type(error).__name__ == "NoArgsIsHelpError":  # the help has been printed already
-            raise SystemExit(EXIT_BAD_INPUT) from None
-        exit_for_bad_input(describe_usage_error(error))
-    raise SystemExit(status if isinstance(status, int) else 0)
+    """Run the command line; a sub-command that has moved to `starid` is run there."""
+    words = sys.argv[1:]
+    for old, new in MOVED.items():
+        if tuple(words[: len(old)]) == old:
+            from starid.cli import app
 
-
-def exit_for_bad_input(why: str) -> NoReturn:
-    """Print one line on stderr and exit."""
-    print(f"starhil: {escape_controls(' '.join(why.split()))}", file=sys.stderr)
-    raise SystemExit(EXIT_BAD_INPUT) from None
+            print(f"starhil {' '.join(old)}: is now starid {new}", file=sys.stderr)
+            app.main([new, *words[len(old) :]])
+    command_line.run("starhil", build_app, words, (StaridError, ProtocolError, EmulatorError, BenchError))

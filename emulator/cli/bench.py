@@ -4,46 +4,24 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeAlias
 
 import typer
 
-from starhil.emulator.cli.options import DIALECTS, AsJson, DeviceAddress, SerialDialect, Unit, one_of
-from starhil.emulator.cli.output import output_help, prepare_output
+from starhil.emulator.cli.options import DIALECTS, DeviceAddress, SerialDialect, Unit
 from starhil.protocol.unit_folders import DEFAULT_UNIT
-
-Column: TypeAlias = tuple[str, Callable[[Any], str]]
-"""Heading of a column, and the function that formats a row for it."""
+from starid.cli.options import AsJson, one_of
+from starid.cli.output import Column, output_help, prepare_output, print_table, progress
 
 Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 
 group = typer.Typer(
-    help="Measure speed, latency, bus load and single algorithms (for the attitude accuracy of a device, see campaign).",
+    help="Measure speed, latency, bus load and centroids (for the attitude accuracy of a device, see campaign; for solvers, starid bench).",
     no_args_is_help=True,
 )
-
-
-def _progress() -> Callable[[str], None]:
-    """Return a function that prints progress to stderr."""
-    from rich.console import Console
-
-    return Console(stderr=True).print
-
-
-def _print_table(columns: Sequence[Column], rows: Iterable[Any]) -> None:
-    """Print a table in full width, even in a narrower terminal."""
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table(*(heading for heading, _ in columns), box=SIMPLE)
-    for row in rows:
-        table.add_row(*(show(row) for _, show in columns))
-    console = Console()
-    console.width = max(console.width, Console(width=1000).measure(table).maximum)
-    console.print(table)
 
 
 def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
@@ -53,11 +31,6 @@ def _dicts(rows: Iterable[Any]) -> list[dict[str, Any]]:
 def _figure(name: str, digits: int) -> Callable[[Any], str]:
     """Return a function that formats an attribute with a number of decimals."""
     return lambda row: f"{getattr(row, name):.{digits}f}"
-
-
-def _entry(name: str, digits: int) -> Callable[[Any], str]:
-    """Return a function that formats an entry of a dictionary with a number of decimals, or a dash."""
-    return lambda row: "–" if row[name] is None else f"{row[name]:.{digits}f}"
 
 
 _LATENCY_COLUMNS: Final[tuple[Column, ...]] = (
@@ -94,7 +67,7 @@ def latency(
     from starhil.hil_tests.latency import measure
 
     chosen = [one_of("--worker", worker, ("process", "thread")) for worker in workers or ["process"]]
-    report = _progress()
+    report = progress()
     rows, processes = [], []
     for worker in chosen:
         links, process = measure(unit, rates or [0.0, 1.0, 10.0], seconds, worker, report, viewers)
@@ -103,7 +76,7 @@ def latency(
     if as_json:
         print(json.dumps({"rows": _dicts(rows), "processes": _dicts(processes)}))
         return
-    _print_table(_LATENCY_COLUMNS, rows)
+    print_table(_LATENCY_COLUMNS, rows)
     for process in processes:
         print(f"{process.worker}: ready after {process.ready_s:.2f} s, {process.memory_mb:.0f} MB resident")
 
@@ -140,14 +113,15 @@ def centroid(
 
     if output is not None:
         prepare_output(output, "-o")
+        import_module("matplotlib")  # before the work
     sensor = SensorModel(bits=bits)
-    rows = measure_centroids(rates or DEFAULT_RATES_DEG_S, frames, seed, sensor, progress=_progress())
+    rows = measure_centroids(rates or DEFAULT_RATES_DEG_S, frames, seed, sensor, progress=progress())
     if output is not None:
         plot_centroids(rows, output)
     if as_json:
         print(json.dumps({"seed": seed, "frames": frames, "rows": _dicts(rows)}))
     else:
-        _print_table(_CENTROID_COLUMNS, rows)
+        print_table(_CENTROID_COLUMNS, rows)
 
 
 _FRAME_COLUMNS: Final[tuple[Column, ...]] = (
@@ -187,13 +161,13 @@ def frame(
 
     rows: list[Any]
     if bodies:
-        rows = measure_bodies(frames, seed, _progress())
+        rows = measure_bodies(frames, seed, progress())
     else:
-        rows = measure_frames(frames, seed, rate, progress=_progress())
+        rows = measure_frames(frames, seed, rate, progress=progress())
     if as_json:
         print(json.dumps({"seed": seed, "rows": _dicts(rows)}))
     else:
-        _print_table(_BODIES_COLUMNS if bodies else _FRAME_COLUMNS, rows)
+        print_table(_BODIES_COLUMNS if bodies else _FRAME_COLUMNS, rows)
 
 
 @group.command("bus")
@@ -232,13 +206,13 @@ def bus(
     from starhil.emulator.cli.bench_bus import Target, check_rows, measure, print_figures, started_device
     from starhil.hil_tests.realtime import set_realtime_priority
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.serial_framing import Dialect
+    from starhil.protocol.serial_interface import Dialect
 
     if dialect is not None:
         one_of("--dialect", dialect, DIALECTS)
     icd = load_unit(unit)
     check_rows(icd)
-    report = _progress()
+    report = progress()
     running = Target(can, serial, canopen, device_address, baud, Dialect(dialect or "b"))
     start = can is None and serial is None
     with started_device(unit, baud, realtime, report) if start else nullcontext(running) as target:
@@ -251,94 +225,3 @@ def bus(
     else:
         print_figures(figures, good)
     raise typer.Exit(0 if good else 1)
-
-
-_IDENTIFY_COLUMNS: Final[tuple[Column, ...]] = (
-    ("σ px, false, missing", lambda row: row["row"]),
-    ("solver", lambda row: row["solver"]),
-    ("frames", lambda row: str(row["frames"])),
-    ("valid %", _entry("valid_pct", 2)),
-    ("wrong (ill-conditioned)", lambda row: f"{row['wrong']} ({row['ill_conditioned']})"),
-    ("″", _entry("boresight_median_arcsec", 1)),
-    ("÷ floor", _entry("floor_ratio", 3)),
-    ("roll ÷", _entry("roll_floor_ratio", 3)),
-    ("ms", _entry("median_ms", 3)),
-    ("p99 ms", _entry("p99_ms", 2)),
-    ("CPU ms", _entry("cpu_median_ms", 3)),
-    ("p99", _entry("cpu_p99_ms", 2)),
-)
-
-
-@group.command("identify")
-def identify(
-    peers: Annotated[
-        str,
-        typer.Option(
-            help="Third-party solvers to compare with: tetra3rs,ruststartracker,cedar-solve,solve-field."
-        ),
-    ] = "",
-    solvers: Annotated[
-        str,
-        typer.Option(
-            help="Solvers: geometric,lsi,rsi, lsi-matlab,lsi-sklearn, published ones such as pyramid,grid "
-            "(pyramid-even: with evenly spread guide stars), or MODULE:FUNCTION; 'all': geometric, lsi, rsi, the published and the third-party ones."
-        ),
-    ] = "geometric",
-    frames: Annotated[int, typer.Option(min=1, help="Scenes per row.")] = 300,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 1,
-    row: Annotated[
-        list[str] | None,
-        typer.Option(
-            help="Row of the table. Repeatable. 'all': every row; 'papers': the scenes in the papers of the published algorithms. "
-            "Default: the standard rows; with --solvers all, also other fields of view."
-        ),
-    ] = None,
-    budget: Annotated[
-        float, typer.Option(help="Time limit of a solver per row, seconds; the rest of the row is skipped.")
-    ] = 120.0,
-    raw: Annotated[
-        bool, typer.Option("--raw", help="Use the answers of published algorithms without verification.")
-    ] = False,
-    output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", help="Folder for leaderboard.md, leaderboard.json and plots."),
-    ] = None,
-    as_json: AsJson = False,
-) -> None:
-    """Compare star identification solvers on the same scenes and with the least-squares bound."""
-    from starhil.emulator.benchmarks.identify import LEADERBOARD, PAPERS, ROWS, STANDARD, run
-    from starhil.emulator.benchmarks.leaderboard import write_leaderboard
-    from starhil.emulator.benchmarks.peers import ALL
-
-    everyone = solvers.strip() == "all"
-    usual = LEADERBOARD if everyone else STANDARD
-    report = _progress()
-    answer = run(
-        frames,
-        seed,
-        peers=_names(peers),
-        own=ALL if everyone else _names(solvers),
-        rows=list(usual if not row else ROWS if "all" in row else PAPERS if "papers" in row else row),
-        budget_s=budget,
-        raw=raw,
-        progress=lambda name: report(f"row {name}"),
-    )
-    if output is not None:
-        command = (
-            f"starhil bench identify --solvers {solvers} --frames {frames} --seed {seed} --budget {budget:g}"
-            + (" --raw" if raw else "")
-            + "".join(f' --row "{name}"' for name in row or [])
-        )
-        for path in write_leaderboard(answer, output, command):
-            report(f"wrote {path}")
-    if as_json:
-        print(json.dumps(answer))
-        return
-    _print_table(_IDENTIFY_COLUMNS, answer["rows"])
-    for name, why in answer["skipped"].items():
-        print(f"{name}: skipped, {why}")
-
-
-def _names(text: str) -> list[str]:
-    """Split a comma-separated list."""
-    return [name.strip() for name in text.split(",") if name.strip()]

@@ -9,8 +9,8 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import report_slow_start
+from starid.cli.options import AsJson
 
 group = typer.Typer(
     help="Show, fill or clear the cache of star catalogues, indices, databases and machine code of kernels."
@@ -62,9 +62,9 @@ def warm(
     """
     from dataclasses import replace
 
-    from starhil.emulator.emulation import pipeline_setup
     from starhil.emulator.pipeline.imager import ProcessImager
     from starhil.emulator.pipeline.worker_process import WorkerProcess
+    from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starid.cache import cache_dir, kernels_written_since
 

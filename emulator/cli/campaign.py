@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
+from starid.cli.options import AsJson
 
 group = typer.Typer(
     help="Measure the accuracy and reliability of attitudes over many rendered images (for speed and solvers, see bench).",
@@ -73,6 +74,8 @@ def campaigns(
     from starhil.emulator.benchmarks.ecss_report import as_markdown, make_report, write_report
 
     coverage_factor(confidence)  # before hours of work
+    if output is not None:
+        import_module("matplotlib")
     plan = EcssPlan(
         profile, tuple(setting or ()), seed, fields=fields, rest_frames=rest_frames, frames=frames
     )

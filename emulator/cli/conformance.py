@@ -11,7 +11,6 @@ import typer
 
 from starhil.emulator.cli.options import (
     DIALECTS,
-    AsJson,
     CanChannel,
     CanopenNode,
     ConsoleAddress,
@@ -21,10 +20,10 @@ from starhil.emulator.cli.options import (
     SerialDialect,
     SerialPort,
     UnitChoice,
-    one_of,
 )
-from starhil.emulator.cli.output import output_help
 from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starid.cli.options import AsJson, one_of
+from starid.cli.output import output_help
 
 if TYPE_CHECKING:
     from starhil.protocol.icd import InterfaceDefinition
@@ -131,7 +130,7 @@ def command(
     )
     console = Console(highlight=False, quiet=as_json)
     if list_only:
-        for item in all_cases(request, load_unit(unit or DEFAULT_UNIT)):
+        for item in all_cases(request):
             kind = "intrusive" if item.intrusive else "safe"
             print(f"{item.id}\t{kind}\t{item.title}\t{item.clause}")
         return

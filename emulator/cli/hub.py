@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.output import output_help, prepare_output
+from starid.cli.output import output_help, prepare_output
 
 
 def command(

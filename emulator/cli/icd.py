@@ -8,9 +8,11 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import AsJson, Unit
-from starhil.emulator.cli.output import output_help, prepare_output, print_text
+from starhil.emulator.cli.options import Unit
+from starhil.emulator.cli.output import print_text
 from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starid.cli.options import AsJson
+from starid.cli.output import output_help, prepare_output
 
 group = typer.Typer(help="List or export the interface definition.", no_args_is_help=True)
 

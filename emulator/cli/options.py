@@ -1,4 +1,4 @@
-"""Options and arguments that several commands share."""
+"""Options and arguments that several commands of `starhil` share."""
 
 from __future__ import annotations
 
@@ -7,10 +7,7 @@ from typing import Annotated, TypeAlias
 
 import typer
 
-from starhil.emulator.cli.output import output_help
-from starhil.emulator.errors import EmulatorError
-
-AsJson: TypeAlias = Annotated[bool, typer.Option("--json", help="Print the result as JSON.")]
+from starid.cli.output import output_help
 
 SerialPort: TypeAlias = Annotated[
     str | None,
@@ -63,17 +60,3 @@ ConsoleAddress: TypeAlias = Annotated[
 ]
 
 DIALECTS = ("a", "b", "c")
-
-
-def one_of(option: str, value: str, allowed: tuple[str, ...]) -> str:
-    """Return the value of an option.
-
-    Raises
-    ------
-    EmulatorError
-        The value is not allowed; the message lists the allowed ones.
-    """
-    if value not in allowed:
-        *others, last = allowed
-        raise EmulatorError(f"{option} {value}: must be {', '.join(others)} or {last}")
-    return value

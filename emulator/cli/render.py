@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starhil.emulator.cli.output import output_help, prepare_output, report_stream
 from starhil.emulator.errors import EmulatorError
+from starid.cli.output import output_help, prepare_output, report_stream
 
 if TYPE_CHECKING:
     from starhil.emulator.sensor.model import SensorModel
@@ -124,9 +124,10 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
     if profile is None:
         scene = _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
     else:
-        from starhil.emulator.device.device import orbit_of, profile_defaults
+        from starhil.emulator.device.device import profile_defaults
         from starhil.emulator.device.parameters import Parameters
-        from starhil.emulator.emulation import pipeline_setup
+        from starhil.emulator.device.surroundings import orbit_of
+        from starhil.emulator.pipeline_setup import pipeline_setup
         from starhil.emulator.profile import load_profile
         from starhil.protocol.icd import load_unit
 
@@ -174,7 +175,7 @@ def _size(text: str) -> tuple[int, int]:
 
 def _marked(frame: Frame) -> Any:
     """Mark the stars of an image, with names or Hipparcos numbers for the bright ones."""
-    from starhil.emulator.cli.annotate import annotate, star_label
+    from starid.photograph.annotation import annotate, star_label
 
     stars = frame.stars
     labels = [

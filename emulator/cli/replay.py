@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
+from starid.cli.options import AsJson
 
 
 def command(

@@ -10,7 +10,6 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.options import (
-    AsJson,
     CanChannel,
     ConsoleAddress,
     DeviceAddress,
@@ -20,6 +19,7 @@ from starhil.emulator.cli.options import (
     SerialPort,
     UnitChoice,
 )
+from starid.cli.options import AsJson
 
 
 def command(

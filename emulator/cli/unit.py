@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from starhil.emulator.cli.options import AsJson
 from starhil.emulator.cli.output import print_text
 from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starid.cli.options import AsJson
 
 group = typer.Typer(
     help="List, create, check and describe units. A unit is the interface of a star sensor: a folder of TOML files that define "

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode
 from starid.attitude import ARCSEC_PER_RAD, Attitude
 

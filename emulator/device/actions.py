@@ -3,8 +3,7 @@
 `starhil.emulator.device.bindings.TelecommandBinding.execute` calls them. An action gets its arguments by name,
 range-checked and in the declared units, and returns the messages that follow the answer, if any. To refuse the
 telecommand it raises `Refused`, whose `argument` names the invalid argument. An action that continues in the
-background marks the acknowledge as continuing and ends it itself; its telecommand is answered at once, unless the
-action is in `ANSWERED_WHEN_DONE`.
+background returns a `PendingAnswer`.
 """
 
 from __future__ import annotations
@@ -13,19 +12,19 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.images import edge_of
 from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.subscriptions import Subscription
-from starhil.emulator.errors import EmulatorError
 from starhil.protocol.messages import ErrorCode, Reply
 from starhil.protocol.values import MessageError, Value
 
 Arguments: TypeAlias = Mapping[str, Any]
 """Values by argument; `parameters` has the values of fields that are bound to a parameter."""
-Action: TypeAlias = Callable[[Device, Arguments, Acknowledge], list[Reply] | None]
+Outcome: TypeAlias = list[Reply] | PendingAnswer[ErrorCode] | None
+Action: TypeAlias = Callable[[Device, Arguments], Outcome]
 
 PARAMETERS: Final = "parameters"
 """Key for the values of fields that are bound to a parameter."""
@@ -34,16 +33,16 @@ SRAM_STORED: Final = 0
 """Bank of the image that save_image stored; the other bank holds the last exposure."""
 
 
-def nothing(_device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def nothing(_device: Device, _arguments: Arguments) -> None:
     """Accept the telecommand and do nothing."""
 
 
-def reset(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def reset(device: Device, _arguments: Arguments) -> None:
     """Restart once the answer has been sent."""
     device.scheduler.at(device.clock.now_ns(), lambda _due_ns: device.reset("command"))
 
 
-def set_clock(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def set_clock(device: Device, arguments: Arguments) -> None:
     """Set the clock to the sum of the arguments, since the unit's epoch."""
     reported_ns = round(float(arguments.get("unix") or 0.0) * NANOSECONDS)
     for name, nanoseconds in (("seconds", NANOSECONDS), ("milliseconds", 1_000_000), ("microseconds", 1_000)):
@@ -52,7 +51,7 @@ def set_clock(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -
     device.time.set_unix_ns(device.icd.conventions.unix_ns(reported_ns, device.time.unix_ns()))
 
 
-def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def set_parameters(device: Device, arguments: Arguments) -> None:
     """Set the parameters to which the fields of the row are bound, all or none."""
     changes: Mapping[str, Value] = arguments[PARAMETERS]
     try:
@@ -62,7 +61,7 @@ def set_parameters(device: Device, arguments: Arguments, _acknowledge: Acknowled
         raise Refused(ErrorCode.INVALID_PARAMETER, argument=culprit) from None
 
 
-def open_image(device: Device, arguments: Arguments, acknowledge: Acknowledge) -> None:
+def open_image(device: Device, arguments: Arguments) -> PendingAnswer[ErrorCode] | None:
     """Open an image for download in numbered chunks."""
     images = device.images
     if images.busy:
@@ -73,16 +72,13 @@ def open_image(device: Device, arguments: Arguments, acknowledge: Acknowledge) -
             raise Refused(ErrorCode.SEQUENCE)
         if not images.open_stored(edge):
             raise Refused(ErrorCode.INVALID_PARAMETER, argument="image_size")
-        return
-
-    def opened(found: bool) -> None:
-        acknowledge.end(ErrorCode.OK if found else ErrorCode.SEQUENCE)
-
-    acknowledge.continues = True
-    images.open_last(edge, opened)
+        return None
+    return images.open_last(edge).then(
+        lambda found: ErrorCode.OK if found else ErrorCode.SEQUENCE, accepted=True
+    )
 
 
-def load_image_chunk(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def load_image_chunk(device: Device, arguments: Arguments) -> None:
     """Load a chunk of the open image."""
     images = device.images
     if images.busy and images.download is None:
@@ -94,7 +90,7 @@ def load_image_chunk(device: Device, arguments: Arguments, _acknowledge: Acknowl
     images.frame = int(arguments["number"])
 
 
-def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def save_image(device: Device, arguments: Arguments) -> None:
     """Capture an image and store it."""
     if arguments["camera"] != "star":
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="camera")
@@ -105,13 +101,13 @@ def save_image(device: Device, arguments: Arguments, _acknowledge: Acknowledge) 
     device.images.save(edge_of(str(arguments["image_size"])))
 
 
-def set_mode(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def set_mode(device: Device, arguments: Arguments) -> None:
     """Change the mode."""
     if not device.command_mode(Mode(str(arguments["mode"]))):
         raise Refused(ErrorCode.SEQUENCE)
 
 
-def set_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def set_parameter(device: Device, arguments: Arguments) -> None:
     """Set one parameter and select it."""
     chosen = device.icd.parameters_by_id.get(int(arguments["parameter"]))
     if chosen is None:
@@ -123,7 +119,7 @@ def set_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledg
     device.selected_parameter = chosen.id
 
 
-def select_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def select_parameter(device: Device, arguments: Arguments) -> None:
     """Select the parameter that telemetry reports."""
     chosen = int(arguments["parameter"])
     if chosen not in device.icd.parameters_by_id:
@@ -131,32 +127,27 @@ def select_parameter(device: Device, arguments: Arguments, _acknowledge: Acknowl
     device.selected_parameter = chosen
 
 
-def save_parameters(device: Device, _arguments: Arguments, acknowledge: Acknowledge) -> None:
+def save_parameters(device: Device, _arguments: Arguments) -> PendingAnswer[ErrorCode]:
     """Store all parameters; answered once they are on disk or storing has failed."""
-
-    def done(error: EmulatorError | None) -> None:
-        acknowledge.end(ErrorCode.OK if error is None else ErrorCode.INTERNAL)
-
-    acknowledge.continues = True
-    device.save_parameters(done)
+    return device.save_parameters().then(lambda error: ErrorCode.OK if error is None else ErrorCode.INTERNAL)
 
 
-def restore_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def restore_parameters(device: Device, _arguments: Arguments) -> None:
     """Load the stored parameters."""
     device.restore_parameters()
 
 
-def default_parameters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def default_parameters(device: Device, _arguments: Arguments) -> None:
     """Set all parameters to their defaults."""
     device.parameters.set_defaults()
 
 
-def clear_counters(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def clear_counters(device: Device, _arguments: Arguments) -> None:
     """Clear the counters and flags of the links."""
     device.counters.clear()
 
 
-def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def subscribe(device: Device, arguments: Arguments) -> None:
     """Send telemetry rows unsolicited; the list replaces the previous one."""
     rate_hz = float(arguments["rate"])
     wanted = []
@@ -170,7 +161,7 @@ def subscribe(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -
     device.subscriptions.replace("request", wanted)
 
 
-def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def select_unsolicited(device: Device, arguments: Arguments) -> None:
     """Set the parameters for one unsolicited telemetry row and its rate."""
     row_id = int(arguments["telemetry"])
     if device.icd.telemetry_row(row_id) is None:
@@ -178,17 +169,17 @@ def select_unsolicited(device: Device, arguments: Arguments, _acknowledge: Ackno
     device.parameters.set({"unsolicited_selection": row_id, "unsolicited_rate": arguments["rate"]})
 
 
-def rewind_file_list(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def rewind_file_list(device: Device, _arguments: Arguments) -> None:
     """Go to the first file of the list."""
     device.files.rewind()
 
 
-def advance_file_list(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def advance_file_list(device: Device, _arguments: Arguments) -> None:
     """Go to the next file of the list."""
     device.files.advance()
 
 
-def erase_file(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def erase_file(device: Device, arguments: Arguments) -> None:
     """Erase one file or all."""
     if arguments["all"]:
         device.files.erase_all(formatting=False)
@@ -196,31 +187,31 @@ def erase_file(device: Device, arguments: Arguments, _acknowledge: Acknowledge) 
         raise Refused(ErrorCode.INVALID_PARAMETER, argument="file_counter")
 
 
-def format_card(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def format_card(device: Device, _arguments: Arguments) -> None:
     """Erase all files."""
     device.files.erase_all(formatting=True)
 
 
-def load_file_block(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def load_file_block(device: Device, arguments: Arguments) -> None:
     """Load a block of a file."""
     offset, length = int(arguments["offset"]), int(arguments["length"])
     if not device.files.load(str(arguments["file_type"]), int(arguments["file_counter"]), offset, length):
         raise Refused(ErrorCode.INVALID_PARAMETER)
 
 
-def start_burst(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> list[Reply]:
+def start_burst(device: Device, arguments: Arguments) -> list[Reply]:
     """Send the loaded block in packets."""
     if not device.files.ready:
         raise Refused(ErrorCode.SEQUENCE)
     return device.files.burst(ignore_hole_map=bool(arguments["ignore_hole_map"]))
 
 
-def next_packet(device: Device, _arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def next_packet(device: Device, _arguments: Arguments) -> None:
     """Go to the next packet of the last burst."""
     device.files.next_packet()
 
 
-def set_hole_map(device: Device, arguments: Arguments, _acknowledge: Acknowledge) -> None:
+def set_hole_map(device: Device, arguments: Arguments) -> None:
     """Report which packets have arrived."""
     device.files.arrived.set_part(int(arguments["section"]), bytes(arguments["map"]))
 
@@ -255,6 +246,3 @@ ACTIONS: Final[dict[str, Action]] = {
     )
 }
 """Name → function."""
-
-ANSWERED_WHEN_DONE: Final = frozenset({"save_parameters"})
-"""Actions whose telecommands are answered with the outcome instead of when they are accepted."""

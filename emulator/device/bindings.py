@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from starhil.emulator.device.actions import ACTIONS, ANSWERED_WHEN_DONE, PARAMETERS, Action
-from starhil.emulator.device.counters import Acknowledge
+from starhil.emulator.device.actions import ACTIONS, PARAMETERS, Action, Outcome
 from starhil.emulator.device.device import Device
 from starhil.emulator.device.quantities import Getter, getter_of
 from starhil.emulator.device.refusal import Refused
@@ -47,7 +46,7 @@ class TelemetryBinding:
                 values[name] = value
         data = self.row.encode(values, saturate=True)
         if self._after is not None:
-            self._after(device, self.row.arguments, device.acknowledge)
+            self._after(device, self.row.arguments)
         return data
 
 
@@ -121,7 +120,6 @@ class TelecommandBinding:
         name = row.action or "nothing"
         self._action = _action_of(name, icd)
         self._may_have_crc = icd.conventions.telecommand_crc
-        self.answered_when_done = name in ANSWERED_WHEN_DONE
         self._reported = any(
             field.telecommand == row.name for other in icd.telemetry.values() for field in other.fields
         )
@@ -147,8 +145,8 @@ class TelecommandBinding:
                 self._parameters.append((field.name, field.parameter))
                 self._index[field.parameter] = index
 
-    def execute(self, device: Device, data: bytes, acknowledge: Acknowledge) -> list[Reply]:
-        """Decode and execute the telecommand; return the messages that follow the answer.
+    def execute(self, device: Device, data: bytes) -> Outcome:
+        """Decode and execute the telecommand; return the messages that follow the answer, or the pending answer.
 
         Raises Refused or MessageError with the index of the invalid field.
         """
@@ -158,14 +156,14 @@ class TelecommandBinding:
             arguments[argument] = convert(values[name])
         arguments[PARAMETERS] = {parameter: values[name] for name, parameter in self._parameters}
         try:
-            replies = self._action(device, arguments, acknowledge)
+            outcome = self._action(device, arguments)
         except Refused as refused:
             if refused.argument is not None:
                 refused.index = self._index.get(refused.argument, 0)
             raise
         if self._reported:
             device.accepted[self.row.name] = values
-        return replies or []
+        return outcome
 
     def _without_crc(self, data: bytes) -> bytes:
         """Return the data without the CRC-8 that may follow them. Raises Refused if it is wrong."""
@@ -199,7 +197,7 @@ def _action_of(name: str, icd: InterfaceDefinition) -> Action:
 def _plugin_action(function: Callable[[Any, Mapping[str, Any]], Any]) -> Action:
     """Return a function of a plugin as an action; returned bytes become the data of one answer each."""
 
-    def action(device: Device, arguments: Mapping[str, Any], _acknowledge: Acknowledge) -> list[Reply]:
+    def action(device: Device, arguments: Mapping[str, Any]) -> list[Reply]:
         return [
             Reply(ReplyKind.ACK, None, item) if isinstance(item, bytes) else item
             for item in function(device, arguments) or ()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -57,15 +56,9 @@ class Acknowledge:
     processed: bool = True
     error: ErrorCode = ErrorCode.OK
     parameter_index: int = 0
-    continues: bool = False
-    """Whether the action continues in the background; it then calls `end` itself."""
-    on_end: Callable[[ErrorCode], None] | None = None
-    """Called with the outcome of a telecommand that is answered when it is done."""
 
     def end(self, error: ErrorCode = ErrorCode.OK, parameter_index: int = 0) -> None:
         """Record the outcome."""
         self.processed = True
         self.error = error
         self.parameter_index = parameter_index
-        if self.on_end is not None:
-            self.on_end(error)

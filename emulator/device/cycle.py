@@ -20,13 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
-from starhil.emulator.device.modes import Mode
+from starhil.emulator.device.measurement import Measurement, as_quaternion, as_triple
+from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.scheduler import Event, Scheduler
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.device.signals import Signals
+from starhil.emulator.device.surroundings import Surroundings
 from starhil.emulator.pipeline.imager import Imager, PipelineReply
 from starhil.emulator.pipeline.messages import (
     ZERO,
@@ -34,13 +36,11 @@ from starhil.emulator.pipeline.messages import (
     Failure,
     FrameRequest,
     FrameResult,
-    Quaternion,
     SolverSettings,
     Triple,
 )
-from starhil.emulator.profile import TimingConfig
-from starhil.emulator.truth.orbit import Orbit
-from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
+from starhil.emulator.profile import Profile
+from starhil.emulator.truth.source import TruthState
 from starid.attitude import Attitude, propagate
 
 log = logging.getLogger("starhil.device")
@@ -49,67 +49,6 @@ Argument = TypeVar("Argument")
 
 MAX_PENDING: Final = 2
 """Number of pending requests at which exposures are skipped; more if more fit into the modelled time."""
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """The published result of an exposure.
-
-    Attributes
-    ----------
-    counter
-        Number of published measurements since start-up, including this one.
-    mid_ns
-        Simulation time of mid-exposure, nanoseconds.
-    mid_unix_ns
-        Unix time of mid-exposure on the device's clock at publication, nanoseconds.
-    published_ns
-        Simulation time of publication, nanoseconds.
-    mode
-        Mode of the device at the exposure.
-    truth
-        True attitude and rate at mid-exposure.
-    result
-        Result of the pipeline.
-    valid, reason
-        Validity after the checks of the device, and the reason if not valid.
-    rate_rad_s, rate_valid
-        Estimated body rate in the sensor frame, rad/s, and its validity.
-    capture_s, detect_s, identify_s
-        Modelled times of the steps, seconds.
-    late
-        Whether the machine took longer than the modelled time.
-    """
-
-    counter: int
-    mid_ns: int
-    mid_unix_ns: int
-    published_ns: int
-    mode: Mode
-    truth: TruthState
-    result: FrameResult
-    valid: bool
-    reason: str
-    rate_rad_s: Triple = ZERO
-    rate_valid: bool = False
-    capture_s: float = 0.0
-    detect_s: float = 0.0
-    identify_s: float = 0.0
-    period_s: float = 0.0
-    late: bool = False
-
-    @property
-    def latency_s(self) -> float:
-        """Time from mid-exposure to publication, seconds of simulation time."""
-        return (self.published_ns - self.mid_ns) / NANOSECONDS
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """Conditions of the detector: temperature, °C, and particles per second."""
-
-    temperature_c: float | None = None
-    particles_s: float = 0.0
 
 
 @dataclass
@@ -134,32 +73,29 @@ class _Frame:
 
 
 class FrameCycle:
-    """Takes exposures while it is running.
-
-    Parameters
-    ----------
-    publish
-        Called with each measurement, in the order of the exposures.
-    """
+    """Takes exposures while it is running, and reports their results in the order of the exposures."""
 
     def __init__(
         self,
+        profile: Profile,
         scheduler: Scheduler,
         imager: Imager,
-        parameters: Parameters,
-        timing: TimingConfig,
         time: DeviceTime,
-        publish: Callable[[Measurement], None],
-        rate_window: int,
+        parameters: Parameters,
+        modes: Modes,
+        surroundings: Surroundings,
+        signals: Signals,
     ) -> None:
+        self._timing = profile.timing
+        self._rate_window = profile.device.rate_window
         self._scheduler = scheduler
         self._imager = imager
-        self._parameters = parameters
-        self._timing = timing
         self._time = time
         self._now_ns = time.clock.now_ns
-        self._publish = publish
-        self._rate_window = rate_window
+        self._parameters = parameters
+        self._modes = modes
+        self._surroundings = surroundings
+        self._signals = signals
         self._rates = RateEstimator()
         self._next: Event | None = None
         self._generation = 0
@@ -167,21 +103,9 @@ class FrameCycle:
         self._grid_ns = 0
         self._failure = ""
         """Error text of the last request if the pipeline failed, so that an error is logged only once."""
-        self.truth: TruthSource = FixedTruth(Attitude.identity())
-        self.orbit: Orbit | None = None
-        """True orbit, for truth sources without an orbit."""
-        self.start_unix_s = 0.0
-        """True date at simulation time zero, Unix time."""
-        self.sky_has_aberration = True
-        """Whether the sky has aberration."""
         self._warned_of_aberration = False
-        self.mode: Callable[[], Mode] = lambda: Mode.STANDBY
-        self.faults: Callable[[int], dict[str, Any]] = lambda _index: {}
-        self.conditions: Callable[[TruthState], Conditions] = lambda _truth: Conditions()
         self.upsets: tuple[CatalogUpset, ...] = ()
         """Bits flipped in the star catalogue since start-up."""
-        self.after_exposure: Callable[[], None] | None = None
-        """Called once, when the next exposure has been sent to the pipeline."""
         self.index = 0
         """Index of the next exposure; never reset, so that no two exposures have the same noise."""
         self.published = 0
@@ -196,11 +120,11 @@ class FrameCycle:
     @property
     def timing(self) -> FrameTiming:
         """Timing of the exposures, for the power model."""
-        tracking = self.mode() is Mode.TRACKING
+        tracking = self._modes.mode is Mode.TRACKING
         return FrameTiming(
             self.running,
             self._grid_ns + int(self._parameters["delay_time"]) * 1_000_000,
-            self._exposure_s() + self._processing_ns(tracking=tracking) / NANOSECONDS,
+            self.exposure_s + self._processing_ns(tracking=tracking) / NANOSECONDS,
             self._period_ns() / NANOSECONDS,
         )
 
@@ -242,12 +166,22 @@ class FrameCycle:
             start_ns = max(self._now_ns(), min(self._next.due_ns, self._grid_ns + self._period_ns()))
             self._next = self._scheduler.at(start_ns, self._start_exposure)
 
+    def upset_catalog(self, upset: CatalogUpset) -> None:
+        """Flip a bit in the star catalogue."""
+        self.upsets += (upset,)
+
+    def restore_catalog(self) -> None:
+        """Undo the flipped bits of the star catalogue."""
+        self.upsets = ()
+
     def has_fix(self, within_s: float) -> bool:
         """Return whether there is an attitude not older than `within_s`."""
         last = self._rates.last
         return last is not None and self._now_ns() - last[0] <= within_s * NANOSECONDS
 
-    def _exposure_s(self) -> float:
+    @property
+    def exposure_s(self) -> float:
+        """Exposure time, seconds."""
         return float(self._parameters["exposure"]) / 1000.0
 
     def _period_ns(self) -> int:
@@ -275,33 +209,31 @@ class FrameCycle:
         if self._imager.pending >= max(MAX_PENDING, self._processing_ns(tracking=True) / period_ns):
             self.skipped += 1
             return
-        exposure_s = self._exposure_s()
+        exposure_s = self.exposure_s
         start_ns = due_ns + int(self._parameters["delay_time"]) * 1_000_000
         end_ns = start_ns + round(exposure_s * NANOSECONDS)
         mid_ns = start_ns + round(exposure_s * NANOSECONDS / 2)
-        begun = (start_ns, mid_ns, self.mode(), exposure_s, period_ns / NANOSECONDS)
+        begun = (start_ns, mid_ns, self._modes.mode, exposure_s, period_ns / NANOSECONDS)
         self._scheduler.at(end_ns, self._until_stopped(lambda close_ns: self._end_exposure(close_ns, *begun)))
 
     def _end_exposure(
         self, end_ns: int, start_ns: int, mid_ns: int, mode: Mode, exposure_s: float, period_s: float
     ) -> None:
         """End an exposure and request its result from the pipeline."""
-        truth = self.true_state(mid_ns)
+        truth = self._surroundings.state(mid_ns)
         predicted = self._predict(mid_ns) if mode is Mode.TRACKING else None
         frame = _Frame(self.index, start_ns, mid_ns, mode, truth, exposure_s, period_s, predicted is not None)
-        request = self.request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
+        request = self._request(truth, exposure_s, predicted, self._assumed_velocity(mid_ns))
         self._in_flight.append(frame)
         ready_ns = end_ns + self._processing_ns(tracking=frame.tracking)
         self._imager.submit(request, self._until_stopped(partial(self._result_arrived, frame)))
         self._scheduler.at(ready_ns, self._until_stopped(partial(self._schedule_publication, frame)))
-        if self.after_exposure is not None:
-            then, self.after_exposure = self.after_exposure, None
-            then()
+        self._signals.exposed.emit(frame.index)
 
     def _assumed_velocity(self, mid_ns: int) -> NDArray[np.float64] | None:
         """Return the velocity with which the device corrects aberration; None if the sky has none."""
         velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
-        if velocity is None or self.sky_has_aberration:
+        if velocity is None or self._surroundings.has_aberration:
             return velocity
         if not self._warned_of_aberration:
             self._warned_of_aberration = True
@@ -310,47 +242,26 @@ class FrameCycle:
             )
         return None
 
-    def true_state(self, at_ns: int) -> TruthState:
-        """Return the truth with date and orbit at a simulation time in nanoseconds."""
-        t_s = at_ns / NANOSECONDS
-        state, unix_s = self.truth.state(t_s), self.start_unix_s + t_s
-        try:
-            return state.completed(unix_s, self.orbit)
-        except EmulatorError as error:
-            log.warning("%s; the run continues without an orbit", error)
-            self.orbit = None
-            return state.completed(unix_s, None)
+    def single_frame(self, mid_ns: int) -> FrameRequest:
+        """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""
+        return self._request(self._surroundings.state(mid_ns), self.exposure_s, None, None, solve=False)
 
-    def request(
+    def _request(
         self,
         truth: TruthState,
         exposure_s: float,
         predicted: Attitude | None,
-        velocity: NDArray[np.float64] | None = None,
+        velocity: NDArray[np.float64] | None,
         *,
         solve: bool = True,
     ) -> FrameRequest:
-        """Return the pipeline request for the next exposure.
-
-        Parameters
-        ----------
-        truth
-            True state at mid-exposure.
-        exposure_s
-            Exposure, seconds.
-        predicted
-            Attitude to track from; None: lost in space.
-        velocity
-            Velocity with which the device corrects aberration; None: no correction.
-        solve
-            False to render only.
-        """
+        """Return the request for the next exposure, tracked from a predicted attitude if there is one."""
         index = self.index
         self.index += 1
         parameters = self._parameters
         chosen: dict[str, Any] = {name: parameters[name] for name in _SETTINGS}
         settings = SolverSettings(**chosen)
-        conditions = self.conditions(truth)
+        conditions = self._surroundings.conditions(truth)
         return FrameRequest(
             index=index,
             attitude_xyzw=as_quaternion(truth.attitude),
@@ -360,7 +271,7 @@ class FrameCycle:
             solve=solve,
             predicted_xyzw=None if predicted is None else as_quaternion(predicted),
             settings=settings,
-            faults=self.faults(index),
+            faults=self._surroundings.faults,
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,
             upsets=self.upsets,
@@ -421,7 +332,7 @@ class FrameCycle:
         identify_s = self._identify_s(tracking=frame.tracking)
         valid, reason, rate = self._assess(frame, result, detect_s + identify_s)
         self.published += 1
-        self._publish(
+        self._signals.frame_published.emit(
             Measurement(
                 counter=self.published,
                 mid_ns=frame.mid_ns,
@@ -460,15 +371,3 @@ class FrameCycle:
 
 
 _SETTINGS: Final = tuple(SolverSettings.__dataclass_fields__)
-
-
-def as_quaternion(attitude: Attitude) -> Quaternion:
-    """Return the quaternion of an attitude as Python floats, scalar last."""
-    x, y, z, w = attitude.quaternion_xyzw.tolist()
-    return (x, y, z, w)
-
-
-def as_triple(vector: NDArray[np.float64]) -> Triple:
-    """Return a vector (3,) as Python floats."""
-    x, y, z = vector.tolist()
-    return (x, y, z)

@@ -8,25 +8,26 @@ from typing import Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
 from starhil.emulator.device.counters import Acknowledge, Counters
-from starhil.emulator.device.cycle import Conditions, FrameCycle, Measurement
+from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.file_download import FileDownload
 from starhil.emulator.device.images import ImageStore
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes, Transition
 from starhil.emulator.device.parameters import Parameters, ParameterValue
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.power import PowerModel, ThermalModel
 from starhil.emulator.device.scheduler import Event, Scheduler
+from starhil.emulator.device.signals import Signals
 from starhil.emulator.device.state_store import StateStore
 from starhil.emulator.device.subscriptions import Subscriptions
+from starhil.emulator.device.surroundings import Surroundings
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.guard import call_guarded, log_internal_error, one_line
+from starhil.emulator.guard import log_internal_error, one_line
 from starhil.emulator.output_file import Output
 from starhil.emulator.pipeline.imager import Imager
-from starhil.emulator.pipeline.messages import IDENTITY, FrameRequest, Quaternion
+from starhil.emulator.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
-from starhil.emulator.sky.radiation import particle_rate
-from starhil.emulator.sky.view import has_aberration
-from starhil.emulator.truth.orbit import Orbit
-from starhil.emulator.truth.source import TruthSource, TruthState
+from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.codec import Field
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
@@ -86,11 +87,6 @@ class Device:
         Source of the true attitude.
     background
         Runs slow writes.
-
-    Raises
-    ------
-    EmulatorError
-        A parameter in the profile is unknown or out of its limits.
     """
 
     def __init__(
@@ -106,46 +102,39 @@ class Device:
         self.profile = profile
         self.icd = icd
         self.clock = clock
+        self.store = store
+        self.signals = signals = Signals()
+        signals.frame_published.connect(self._frame_published)
+        signals.mode_changed.connect(self._mode_changed)
+        signals.parameters_changed.connect(self._parameters_changed)
         self.scheduler = Scheduler()
         self.time = DeviceTime(clock)
         try:
-            self.parameters = Parameters(icd, profile_defaults(profile, icd))
+            defaults = profile_defaults(profile, icd)
+            self.parameters = Parameters(icd, defaults, signals.parameters_changed.emit)
         except EmulatorError as error:
             raise EmulatorError(f"profile {profile.source}: {error}") from None
         self.counters = Counters()
         self.acknowledge = Acknowledge()
-        self.modes = Modes(self._mode_changed)
-        self.store = store
-        self.stored = Output("state")
-        """The writes to the store."""
-        self.cycle = FrameCycle(
-            self.scheduler,
-            imager,
-            self.parameters,
-            profile.timing,
-            self.time,
-            self._frame_published,
-            profile.device.rate_window,
-        )
-        self.cycle.truth = truth
-        self.cycle.conditions = self._conditions
+        self.modes = Modes(signals.mode_changed.emit)
         self.power = PowerModel(profile.power)
         self.thermal = ThermalModel(profile.thermal)
-        self.cycle.start_unix_s = profile.start_unix_s
-        self.cycle.sky_has_aberration = profile.images.used or bool(has_aberration(profile.sky))
-        self.cycle.orbit = orbit_of(profile)
-        self.cycle.mode = lambda: self.modes.mode
-        self.images = ImageStore(
+        self.surroundings = Surroundings(profile, truth, self.thermal, clock.now_ns)
+        self.cycle = FrameCycle(
+            profile,
             self.scheduler,
             imager,
-            self.cycle,
-            clock.now_ns,
-            self.time.unix_ns,
-            self._request_single_frame,
-            lambda: float(self.parameters["exposure"]) / 1000.0,
+            self.time,
+            self.parameters,
+            self.modes,
+            self.surroundings,
+            signals,
         )
+        self.images = ImageStore(self.scheduler, imager, self.cycle, self.time, signals)
         self.files = FileDownload(self.images, clock.now_ns)
-        self.subscriptions = Subscriptions(self.scheduler, clock.now_ns)
+        self.subscriptions = Subscriptions(icd, self.scheduler, self.parameters, clock.now_ns, signals)
+        self.stored = Output("state")
+        """The writes to the store."""
         self.latest: Measurement | None = None
         self.reported_quaternion: Quaternion = IDENTITY
         """The last valid quaternion that was reported, for the sign of the next one."""
@@ -161,11 +150,6 @@ class Device:
         self.started_ns = clock.now_ns()
         self.warm = False
         """Whether the pipeline is ready."""
-        self.on_frame: list[Callable[[Measurement], None]] = []
-        self.on_mode: list[Callable[[Transition], None]] = []
-        self.on_start: list[Callable[[], None]] = []
-        """Called at power-on and at each reset, after parameters and time have been set."""
-        self.on_reset: list[Callable[[], None]] = []
         self.unresponsive = False
         """Whether the device is unresponsive: requests are neither counted nor answered."""
         self.rate_fields = rate_fields(icd)
@@ -173,7 +157,6 @@ class Device:
         self._background = background
         self._boot_end: Event | None = None
         self._stored_parameters: dict[str, object] = {}
-        self.parameters.observe(self._parameters_changed)
 
     # --- power, boot and reset ---
 
@@ -189,8 +172,7 @@ class Device:
     def reset(self, cause: str) -> None:
         """Restart with a cause named in the enumeration `reset_cause`."""
         self._start_up(cause, self._persistent_state())
-        for observer in self.on_reset:
-            call_guarded("reset", observer)
+        self.signals.restarted.emit(cause)
 
     def _start_up(self, cause: str, state: Mapping[str, object]) -> None:
         count, stored = state.get("boot_count"), state.get("parameters")
@@ -213,8 +195,7 @@ class Device:
         self.thermal.start(self.started_ns, self.power.mean_power_w(self.cycle.timing))
         for name in self.parameters.restore(self._stored_parameters):
             log.warning("stored parameter %s: unknown or out of its limits; using the default", name)
-        for observer in self.on_start:
-            call_guarded("start", observer)
+        self.signals.started.emit(cause)
         self._persist()
         if self.store.corrupt:
             log.warning("the stored state is corrupt and was renamed; using the defaults")
@@ -246,23 +227,24 @@ class Device:
             self._end_boot()
 
     def _end_boot(self) -> None:
+        """Leave the boot mode for the start mode, unless a fault has already done so."""
+        if self.modes.mode is not Mode.BOOT:
+            return
         self.modes.booted()
-        if self.parameters["start_mode"] == "lost_in_space" and self.modes.mode is Mode.STANDBY:
+        if self.parameters["start_mode"] == "lost_in_space":
             self.modes.command(Mode.LOST_IN_SPACE, has_attitude=False)
 
     # --- persistent state ---
 
-    def save_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
-        """Store all parameters; `done` is called with None when they are on disk, or with the error."""
-        self._store_parameters(dict(self.parameters), done)
+    def save_parameters(self) -> PendingAnswer[EmulatorError | None]:
+        """Store all parameters; the result is None once they are on disk, or the error."""
+        return self._store_parameters(dict(self.parameters))
 
-    def forget_parameters(self, done: Callable[[EmulatorError | None], None]) -> None:
+    def forget_parameters(self) -> PendingAnswer[EmulatorError | None]:
         """Delete the stored parameters; current values apply until the next restart, then the defaults."""
-        self._store_parameters({}, done)
+        return self._store_parameters({})
 
-    def _store_parameters(
-        self, content: dict[str, ParameterValue], done: Callable[[EmulatorError | None], None]
-    ) -> None:
+    def _store_parameters(self, content: dict[str, ParameterValue]) -> PendingAnswer[EmulatorError | None]:
         before, stored = self._stored_parameters, dict[str, object](content)
         self._stored_parameters = stored
 
@@ -271,9 +253,10 @@ class Device:
                 self.parameters.mark_stored(content)
             elif self._stored_parameters is stored:  # no other save or restart has followed
                 self._stored_parameters = before
-            done(error)
 
-        self._persist(finish)
+        written = self._persist()
+        written.when_done(finish)
+        return written
 
     def restore_parameters(self) -> None:
         """Set all parameters to their stored values, or to their defaults if none are stored."""
@@ -285,15 +268,12 @@ class Device:
         if not self.parameters.flip_bit(name, bit):
             self.modes.fail("parameter_store")
 
-    def _persist(self, done: Callable[[EmulatorError | None], None] = lambda _error: None) -> None:
-        content = self._persistent_state()
-
-        def finish(error: EmulatorError | None) -> None:
-            if error is not None:
-                self.stored.fail(str(error))
-            done(error)
-
-        self._background(lambda: self.store.save(content), finish)
+    def _persist(self) -> PendingAnswer[EmulatorError | None]:
+        """Write the state to the store."""
+        content, written = self._persistent_state(), PendingAnswer[EmulatorError | None]()
+        written.when_done(lambda error: None if error is None else self.stored.fail(str(error)))
+        self._background(lambda: self.store.save(content), written.end)
+        return written
 
     def _persistent_state(self) -> dict[str, object]:
         """Return the state that survives a restart, including writes in progress."""
@@ -311,11 +291,6 @@ class Device:
         age_ns = self.clock.now_ns() - last.published_ns
         return last if age_ns <= limit_s * NANOSECONDS else None
 
-    def _request_single_frame(self, mid_ns: int) -> FrameRequest:
-        truth = self.cycle.true_state(mid_ns)
-        exposure_s = float(self.parameters["exposure"]) / 1000.0
-        return self.cycle.request(truth, exposure_s, None, solve=False)
-
     def _frame_published(self, measurement: Measurement) -> None:
         self.latest = measurement
         self.frames_valid += measurement.valid
@@ -325,8 +300,6 @@ class Device:
             tracked=measurement.mode is Mode.TRACKING,
             tracking_enabled=bool(self.parameters["tracking_enable"]),
         )
-        for observer in self.on_frame:
-            call_guarded("frame", observer, measurement)
 
     def _mode_changed(self, transition: Transition) -> None:
         log.info("mode %s -> %s (%s)", transition.before, transition.after, transition.cause)
@@ -338,8 +311,6 @@ class Device:
             self.images.cycle_stopped()
             self.latest = None
         self._power_changed()
-        for observer in self.on_mode:
-            call_guarded("mode", observer, transition)
 
     def command_mode(self, wanted: Mode) -> bool:
         """Change the mode by telecommand; return False if this is refused."""
@@ -354,17 +325,8 @@ class Device:
             self.cycle.retime()
             self._power_changed()
 
-    # --- surroundings ---
-
     def _power_changed(self) -> None:
         self.thermal.set_power(self.clock.now_ns(), self.power.mean_power_w(self.cycle.timing))
-
-    def _conditions(self, truth: TruthState) -> Conditions:
-        """Return the current conditions of the detector."""
-        radiation = self.profile.radiation
-        position_m = None if truth.orbit is None else truth.orbit.position_m
-        particles_s = particle_rate(radiation.quiet_s, radiation.anomaly_s, position_m, truth.unix_s)
-        return Conditions(self.thermal.temperature_c(self.clock.now_ns()), particles_s)
 
 
 def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
@@ -378,30 +340,8 @@ def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
     ]
 
 
-def orbit_of(profile: Profile) -> Orbit | None:
-    """Return the true orbit of a profile, or None.
-
-    Raises
-    ------
-    EmulatorError
-        The values do not describe an orbit.
-    """
-    if profile.orbit is None:
-        return None
-    try:
-        return profile.orbit.build(profile.start_unix_s)
-    except EmulatorError as error:
-        raise EmulatorError(f"profile {profile.source}: {error}") from None
-
-
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
-    """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`.
-
-    Raises
-    ------
-    EmulatorError
-        The table contains an unknown parameter.
-    """
+    """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`."""
     links = profile.links
     serial, unit_serial = links.serial, icd.link.serial
     baud = serial.baud if unit_serial is None or "baud" in serial.model_fields_set else unit_serial.baud

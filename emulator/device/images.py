@@ -13,12 +13,14 @@ from typing import Final
 
 import numpy as np
 
-from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.cycle import FrameCycle
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.device.signals import Signals
 from starhil.emulator.pipeline.binning import mean_over_squares
 from starhil.emulator.pipeline.imager import Imager, PipelineReply
-from starhil.emulator.pipeline.messages import IMAGE_EDGES, FrameRequest, ImageRequest, ImageResult
+from starhil.emulator.pipeline.messages import IMAGE_EDGES, ImageRequest, ImageResult
 from starhil.protocol.image_transfer import FRAME_SIZE, file_checksum
 
 STORE_S: Final = 0.1
@@ -81,41 +83,26 @@ class StoredImage:
 
 
 class ImageStore:
-    """Captures images, stores them and serves one for download.
-
-    Parameters
-    ----------
-    unix_ns
-        Returns the time of the device's clock.
-    single_frame
-        Returns the request for an unsolved exposure with a given simulation time of mid-exposure.
-    """
+    """Captures images, stores them and serves one for download."""
 
     def __init__(
-        self,
-        scheduler: Scheduler,
-        imager: Imager,
-        cycle: FrameCycle,
-        now_ns: Callable[[], int],
-        unix_ns: Callable[[], int],
-        single_frame: Callable[[int], FrameRequest],
-        exposure_s: Callable[[], float],
+        self, scheduler: Scheduler, imager: Imager, cycle: FrameCycle, time: DeviceTime, signals: Signals
     ) -> None:
         self._scheduler = scheduler
         self._imager = imager
         self._cycle = cycle
-        self._now_ns = now_ns
-        self._unix_ns = unix_ns
-        self._single_frame = single_frame
-        self._exposure_s = exposure_s
+        self._time = time
+        self._now_ns = time.clock.now_ns
         self._generation = 0
+        signals.exposed.connect(self._exposed)
         self.clear()
 
     def clear(self) -> None:
         """Discard everything, because the device restarts."""
         self._generation += 1
         self._count = 0
-        self._cycle.after_exposure = None
+        self._at_exposure: Callable[[], None] | None = None
+        """Called once, when the next exposure has been sent to the pipeline."""
         self.files: dict[int, StoredImage] = {}
         """The stored images by number, oldest first."""
         self.percent = 0
@@ -148,42 +135,53 @@ class ImageStore:
 
         self._capture(fetch)
 
-    def capture_full(self, done: Callable[[ImageResult | None], None]) -> None:
-        """Capture the next exposure in full size without storing it; `done` gets it, or None on failure."""
+    def capture_full(self) -> PendingAnswer[ImageResult | None]:
+        """Capture the next exposure in full size without storing it; the result is None on failure."""
+        captured = PendingAnswer[ImageResult | None]()
 
         def finish(answer: ImageResult | None) -> None:
             self.busy = False
-            done(answer)
+            captured.end(answer)
 
         self._capture(lambda: self._fetch_image(0, finish))
+        return captured
 
     def _capture(self, then: Callable[[], None]) -> None:
         """Call `then` when the next exposure has been sent to the pipeline; in standby, take one."""
         self.busy = True
         if self._cycle.running:
-            self._cycle.after_exposure = then
+            self._at_exposure = then
             return
-        start_ns, exposure_ns = self._now_ns(), round(self._exposure_s() * NANOSECONDS)
+        start_ns, exposure_ns = self._now_ns(), round(self._cycle.exposure_s * NANOSECONDS)
         generation = self._generation
 
         def expose(_due_ns: int) -> None:
             if generation == self._generation:
-                self._imager.submit(self._single_frame(start_ns + exposure_ns // 2), lambda _answer: None)
+                self._imager.submit(
+                    self._cycle.single_frame(start_ns + exposure_ns // 2), lambda _answer: None
+                )
                 then()
 
         self._scheduler.at(start_ns + exposure_ns, expose)
 
     def cycle_stopped(self) -> None:
         """Take an exposure for a pending capture, because the cycle takes no more."""
-        then, self._cycle.after_exposure = self._cycle.after_exposure, None
+        then, self._at_exposure = self._at_exposure, None
         if then is not None:
             self._capture(then)
+
+    def _exposed(self, _index: int) -> None:
+        then, self._at_exposure = self._at_exposure, None
+        if then is not None:
+            then()
 
     def _store(self, answer: ImageResult) -> None:
         """Store an image as the newest file; the oldest one is deleted if there are too many."""
         number = self._count = self._count % 255 + 1
         self.files.pop(number, None)
-        self.files[number] = StoredImage(answer.width, answer.pixels, answer.frame, number, self._unix_ns())
+        self.files[number] = StoredImage(
+            answer.width, answer.pixels, answer.frame, number, self._time.unix_ns()
+        )
         if len(self.files) > MAX_FILES:
             del self.files[next(iter(self.files))]
 
@@ -195,8 +193,9 @@ class ImageStore:
         self.frame = 0
         return True
 
-    def open_last(self, edge: int, done: Callable[[bool], None]) -> None:
-        """Open the last exposure for download; call `done` with whether there was one."""
+    def open_last(self, edge: int) -> PendingAnswer[bool]:
+        """Open the last exposure for download; the result is whether there was one."""
+        opened = PendingAnswer[bool]()
         self.busy = True
         self.download = None
 
@@ -206,9 +205,10 @@ class ImageStore:
             self.download = (
                 None if answer is None else StoredImage(answer.width, answer.pixels, answer.frame, 0)
             )
-            done(answer is not None)
+            opened.end(answer is not None)
 
         self._fetch_image(edge, take)
+        return opened
 
     def _fetch_image(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
         """Fetch an image from the pipeline; call `take` after `STORE_S` with it, or with None on failure."""

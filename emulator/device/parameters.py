@@ -81,20 +81,22 @@ class Parameters(Mapping[str, ParameterValue]):
         Interface definition, with names, types and limits.
     defaults
         Defaults of this device that differ from the definition.
-
-    Raises
-    ------
-    EmulatorError
-        A default is unknown or outside its limits.
+    on_change
+        Called after each change with the names of the changed parameters.
     """
 
-    def __init__(self, icd: InterfaceDefinition, defaults: Mapping[str, Value] | None = None) -> None:
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        defaults: Mapping[str, Value] | None = None,
+        on_change: Callable[[frozenset[str]], None] = lambda _names: None,
+    ) -> None:
         self._definitions = icd.device_parameters
         self._defaults: dict[str, ParameterValue] = {
             name: p.default for name, p in icd.device_parameters.items()
         }
         self._stored: dict[str, ParameterValue] = {}
-        self._observers: list[Callable[[frozenset[str]], None]] = []
+        self._on_change = on_change
         try:
             self._defaults.update(self._checked(self._defaults, defaults or {}))
         except MessageError as error:
@@ -121,10 +123,6 @@ class Parameters(Mapping[str, ParameterValue]):
     def default(self, name: str) -> ParameterValue:
         """Return the default of a parameter for this device."""
         return self._defaults[name]
-
-    def observe(self, observer: Callable[[frozenset[str]], None]) -> None:
-        """Call `observer` after each change, with the names of the changed parameters."""
-        self._observers.append(observer)
 
     def set(self, changes: Mapping[str, Value]) -> None:
         """Set parameters, all or none.
@@ -167,7 +165,7 @@ class Parameters(Mapping[str, ParameterValue]):
         """Set all parameters to stored values, or to their defaults; return the ignored names.
 
         Unknown parameters and invalid values are ignored. Contradictions are checked for all stored values
-        together, and observers are called once.
+        together, and the change is reported once.
         """
         allowed: dict[str, Value] = {}
         for name, value in stored.items():
@@ -210,5 +208,4 @@ class Parameters(Mapping[str, ParameterValue]):
         changed = frozenset(name for name, value in values.items() if self._values[name] != value)
         self._values.update(values)
         if changed:
-            for observer in self._observers:
-                observer(changed)
+            self._on_change(changed)

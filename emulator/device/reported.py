@@ -9,8 +9,8 @@ from functools import cache
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.cycle import as_quaternion
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from typing import TypeAlias
 
 from starhil.emulator.device.bindings import TelecommandBinding, TelemetryBinding
 from starhil.emulator.device.counters import Acknowledge
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
-from starhil.emulator.device.subscriptions import Subscription
-from starhil.emulator.guard import call_guarded, log_internal_error
+from starhil.emulator.guard import log_internal_error
 from starhil.protocol.codec import Row
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import MessageError
 
 log = logging.getLogger("starhil.device")
 
-BY_PARAMETERS = "parameters"
-"""Origin of the subscription made by the parameters unsolicited_selection and unsolicited_rate."""
+Answer: TypeAlias = list[Reply] | PendingAnswer[list[Reply]]
+"""Replies to a request; pending if it is answered when it is done."""
 
 
 class Requests:
@@ -32,17 +32,11 @@ class Requests:
     ----------
     device
         The device that executes the requests.
-
-    Attributes
-    ----------
-    unsolicited_receivers
-        Called with each unsolicited telemetry message; one per link.
     """
 
     def __init__(self, device: Device) -> None:
         icd = device.icd
         self.device = device
-        self.unsolicited_receivers: list[Callable[[Reply], None]] = []
         self.telemetry_bindings = {row.name: TelemetryBinding(row, icd) for row in icd.telemetry.values()}
         self.telecommand_bindings = {
             row.name: TelecommandBinding(row, icd) for row in icd.telecommands.values()
@@ -54,22 +48,10 @@ class Requests:
             item.role in ("ticks", "time") for item in serial.reply_header
         )
         """Whether replies contain the time."""
-        device.subscriptions.send = self._send_unsolicited
-        device.on_start.append(self._restart_subscriptions)
-        device.on_frame.append(lambda _measurement: device.subscriptions.frame_published())
-        device.parameters.observe(self._parameters_changed)
+        device.signals.row_due.connect(self._send_unsolicited)
 
-    def handle(self, request: Request, later: Callable[[Reply], None] | None = None) -> list[Reply] | None:
-        """Handle a request from a link; return the replies to send on the same link, in order.
-
-        Parameters
-        ----------
-        request
-            The request as received.
-        later
-            Called with the answer to a telecommand that is answered when it is done; `handle` then returns
-            None.
-        """
+    def handle(self, request: Request) -> Answer:
+        """Handle a request from a link; return the replies to send on the same link, in order."""
         device = self.device
         if device.unresponsive:
             return []
@@ -79,22 +61,15 @@ class Requests:
             return self._replies(request, row, self._answer_telemetry(request, row))
         row = self._telecommand_rows.get((request.klass, request.id))
         device.counters.telecommands = (device.counters.telecommands + 1) & 0xFFFF
-        code, replies = self._execute(request, row)
-        if code is not None:
-            answered = self._answers_with_data(request, replies) or self._replies(
-                request, row, self._answer(request, code)
-            )
-            following = [replace(item, destination=request.source) for item in replies if item.id is not None]
-            return answered + following
-        if later is not None:
-            device.acknowledge.on_end = partial(self._answer_later, request, row, later)
-        return None
-
-    def _answer_later(
-        self, request: Request, row: Row | None, later: Callable[[Reply], None], code: ErrorCode
-    ) -> None:
-        for reply in self._replies(request, row, self._answer(request, code)):
-            later(reply)
+        outcome = self._execute(request, row)
+        if isinstance(outcome, PendingAnswer):
+            return outcome.then(lambda code: self._replies(request, row, self._answer(request, code)))
+        code, replies = outcome
+        answered = self._answers_with_data(request, replies) or self._replies(
+            request, row, self._answer(request, code)
+        )
+        following = [replace(item, destination=request.source) for item in replies if item.id is not None]
+        return answered + following
 
     def count_fault(self, fault: LinkFault) -> None:
         """Count input on a link that was not a valid request."""
@@ -184,8 +159,10 @@ class Requests:
         uptime_ns = device.clock.now_ns() - device.started_ns
         return uptime_ns, device.icd.conventions.reported_ns(device.time.unix_ns())
 
-    def _execute(self, request: Request, row: Row | None) -> tuple[ErrorCode | None, Sequence[Reply]]:
-        """Execute a telecommand and record its outcome; the code is None while the outcome is pending."""
+    def _execute(
+        self, request: Request, row: Row | None
+    ) -> tuple[ErrorCode, Sequence[Reply]] | PendingAnswer[ErrorCode]:
+        """Execute a telecommand and record its outcome, at once or when it is done."""
         device = self.device
         if not device.acknowledge.processed:
             device.counters.overrun()
@@ -193,9 +170,8 @@ class Requests:
         if row is None:
             acknowledge.end(ErrorCode.INVALID_ID)
             return ErrorCode.INVALID_ID, []
-        binding = self.telecommand_bindings[row.name]
         try:
-            replies = binding.execute(device, request.data, acknowledge)
+            outcome = self.telecommand_bindings[row.name].execute(device, request.data)
         except (Refused, MessageError) as refused:
             acknowledge.end(refused.code, refused.index)
             return refused.code, []
@@ -203,27 +179,13 @@ class Requests:
             log_internal_error(f"telecommand {request.id}", error)
             acknowledge.end(ErrorCode.INTERNAL)
             return ErrorCode.INTERNAL, []
-        if not acknowledge.continues:
-            acknowledge.end()
-            return ErrorCode.OK, replies
-        if not binding.answered_when_done:
-            return ErrorCode.OK, []
-        return acknowledge.error if acknowledge.processed else None, []
-
-    def _parameters_changed(self, names: frozenset[str]) -> None:
-        if names & {"unsolicited_rate", "unsolicited_selection"}:
-            self._subscribe_by_parameters()
-
-    def _restart_subscriptions(self) -> None:
-        self.device.subscriptions.clear()
-        self._subscribe_by_parameters()
-
-    def _subscribe_by_parameters(self) -> None:
-        device = self.device
-        rate_hz = float(device.parameters["unsolicited_rate"])
-        row = device.icd.telemetry_row(int(device.parameters["unsolicited_selection"]))
-        wanted = [Subscription(row, rate_hz)] if row is not None and rate_hz > 0.0 else []
-        device.subscriptions.replace(BY_PARAMETERS, wanted)
+        if isinstance(outcome, PendingAnswer):
+            outcome.when_done(acknowledge.end)
+            if outcome.accepted:
+                return ErrorCode.OK, []
+            return (acknowledge.error, []) if outcome.done else outcome
+        acknowledge.end()
+        return ErrorCode.OK, outcome or []
 
     def _send_unsolicited(self, row: Row) -> None:
         device = self.device
@@ -243,5 +205,4 @@ class Requests:
             uptime_ns=uptime_ns,
             time_ns=time_ns,
         )
-        for receiver in self.unsolicited_receivers:
-            call_guarded("unsolicited telemetry", receiver, reply)
+        device.signals.unsolicited.emit(reply)

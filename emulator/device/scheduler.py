@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from starhil.emulator.signals import Signal
+
 Action: TypeAlias = Callable[[int], None]
 """Called with the simulation time at which the event was due, nanoseconds."""
 
@@ -36,8 +38,8 @@ class Scheduler:
     def __init__(self) -> None:
         self._queue: list[Event] = []
         self._order = itertools.count()
-        self.on_add: Callable[[], None] | None = None
-        """Called when an event has been added, so that a sleeping loop can wake up earlier."""
+        self.added = Signal[Event]("event added")
+        """An event was added, so that a sleeping loop may have to wake up earlier."""
 
     @property
     def count(self) -> int:
@@ -48,8 +50,7 @@ class Scheduler:
         """Schedule an action at a simulation time, nanoseconds."""
         event = Event(due_ns, next(self._order), action)
         heapq.heappush(self._queue, event)
-        if self.on_add is not None:
-            self.on_add()
+        self.added.emit(event)
         return event
 
     def next_due_ns(self) -> int | None:

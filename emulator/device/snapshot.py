@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from starhil.emulator.device.cycle import Measurement
 from starhil.emulator.device.device import Device
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.power import Phase
 from starhil.emulator.device.reported import Reported, reported
 from starhil.emulator.pipeline.messages import MatchedStar

@@ -7,8 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.device.scheduler import Event, Scheduler
+from starhil.emulator.device.signals import Signals
 from starhil.protocol.codec import Row
+from starhil.protocol.icd import InterfaceDefinition
 
 LONGEST_PERIOD_NS: Final = 1e18
 """Period of a row whose rate is hardly above zero, nanoseconds: longer than any run."""
@@ -23,20 +27,43 @@ class Subscription:
 
 
 class Subscriptions:
-    """Schedule of the rows that are sent unsolicited.
+    """Schedule of the rows that are sent unsolicited, by telecommand and by two parameters.
 
-    Attributes
-    ----------
-    send
-        Sends a row.
+    The parameters `unsolicited_selection` and `unsolicited_rate` select a row of their own.
     """
 
-    def __init__(self, scheduler: Scheduler, now_ns: Callable[[], int]) -> None:
+    def __init__(
+        self,
+        icd: InterfaceDefinition,
+        scheduler: Scheduler,
+        parameters: Parameters,
+        now_ns: Callable[[], int],
+        signals: Signals,
+    ) -> None:
+        self._icd = icd
         self._scheduler = scheduler
+        self._parameters = parameters
         self._now_ns = now_ns
+        self._send = signals.row_due.emit
         self._lists: dict[str, Sequence[Subscription]] = {}
         self._events: dict[tuple[str, int], Event] = {}
-        self.send: Callable[[Row], None] = lambda _row: None
+        signals.frame_published.connect(self._frame_published)
+        signals.parameters_changed.connect(self._parameters_changed)
+        signals.started.connect(self._restart)
+
+    def _parameters_changed(self, names: frozenset[str]) -> None:
+        if names & {"unsolicited_rate", "unsolicited_selection"}:
+            self._subscribe_by_parameters()
+
+    def _restart(self, _cause: str) -> None:
+        for origin in list(self._lists):
+            self.replace(origin, ())
+        self._subscribe_by_parameters()
+
+    def _subscribe_by_parameters(self) -> None:
+        rate_hz = float(self._parameters["unsolicited_rate"])
+        row = self._icd.telemetry_row(int(self._parameters["unsolicited_selection"]))
+        self.replace("parameters", [Subscription(row, rate_hz)] if row is not None and rate_hz > 0.0 else [])
 
     def replace(self, origin: str, subscriptions: Sequence[Subscription]) -> None:
         """Replace the list of one origin (a telecommand, or parameters) from now on."""
@@ -47,17 +74,12 @@ class Subscriptions:
             if subscription.rate_hz is not None:
                 self._schedule((origin, number), subscription.row, subscription.rate_hz, self._now_ns())
 
-    def clear(self) -> None:
-        """Discard all lists, because the device restarts."""
-        for origin in list(self._lists):
-            self.replace(origin, ())
-
-    def frame_published(self) -> None:
+    def _frame_published(self, _measurement: Measurement) -> None:
         """Send the rows that are due with each frame."""
         for subscriptions in list(self._lists.values()):
             for subscription in subscriptions:
                 if subscription.rate_hz is None:
-                    self.send(subscription.row)
+                    self._send(subscription.row)
 
     def _schedule(self, key: tuple[str, int], row: Row, rate_hz: float, due_ns: int) -> None:
         period_ns = max(1, round(min(NANOSECONDS / rate_hz, LONGEST_PERIOD_NS)))
@@ -65,6 +87,6 @@ class Subscriptions:
         def due(at_ns: int) -> None:
             missed = max(0, (self._now_ns() - at_ns) // period_ns)
             self._schedule(key, row, rate_hz, at_ns + (missed + 1) * period_ns)
-            self.send(row)
+            self._send(row)
 
         self._events[key] = self._scheduler.at(due_ns, due)

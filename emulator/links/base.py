@@ -7,15 +7,17 @@ import logging
 from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, Request
-from starhil.protocol.receiver import Receiver
+from starhil.protocol.serial_interface import Receiver
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
@@ -75,10 +77,10 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._timer: Event | None = None
         self._held_input: deque[Request | LinkFault] = deque()
         """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
-        self._pending_request: Request | None = None
+        self._pending: PendingAnswer[list[Reply]] | None = None
         self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
-        requests.unsolicited_receivers.append(self._send_unsolicited)
-        device.on_reset.append(self._reset_receiver)
+        device.signals.unsolicited.connect(self._send_unsolicited)
+        device.signals.restarted.connect(self._reset_receiver)
 
     @abstractmethod
     def _new_receiver(self) -> Receiver[Item, Request]:
@@ -117,7 +119,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._schedule_flush()
 
     def _dispatch_waiting(self) -> None:
-        while self._held_input and self._pending_request is None:
+        while self._held_input and self._pending is None:
             self._dispatch(self._held_input.popleft())
 
     def _dispatch(self, event: Request | LinkFault) -> None:
@@ -125,19 +127,20 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._requests.count_fault(event)
             return
         style = self._reply_style()  # a change of format is answered in the old format
-
-        def answer_later(reply: Reply) -> None:
-            self._answer(reply, style)
-            if self._pending_request is event:
-                self._pending_request = None
-                self._dispatch_waiting()
-
-        replies = self._requests.handle(event, answer_later)
-        if replies is None:
-            self._pending_request = event
+        answer = self._requests.handle(event)
+        if isinstance(answer, PendingAnswer):
+            self._pending = answer
+            answer.when_done(partial(self._answer_later, answer, style))
             return
+        for reply in answer:
+            self._answer(reply, style)
+
+    def _answer_later(self, answer: PendingAnswer[list[Reply]], style: Style, replies: list[Reply]) -> None:
         for reply in replies:
             self._answer(reply, style)
+        if self._pending is answer:
+            self._pending = None
+            self._dispatch_waiting()
 
     def _answer(self, reply: Reply, style: Style) -> None:
         """Send an answer, with the unit's code for an error."""
@@ -157,11 +160,11 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._requests.count_fault(fault)
         self._schedule_flush()
 
-    def _reset_receiver(self) -> None:
+    def _reset_receiver(self, _cause: str) -> None:
         """Discard incomplete and pending input, because the device has restarted."""
         self._receiver = self._new_receiver()
         self._held_input.clear()
-        self._pending_request = None
+        self._pending = None
 
     def _log_transport_error(self, error: ProtocolError) -> None:
         log.warning("%s", error)

@@ -75,7 +75,7 @@ class CanLink(DeviceLink[CanFrame, int]):
         self._waiting: deque[CanFrame] = deque()
         self._next: asyncio.TimerHandle | None = None
         self._address = BusAddress("address", "links.can.address")
-        self._device.parameters.observe(self._parameters_changed)
+        self._device.signals.parameters_changed.connect(self._parameters_changed)
 
     async def start(self) -> str:
         """Join the bus; return its description."""

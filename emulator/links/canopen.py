@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import ClassVar, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.cycle import Measurement
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Transition
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
@@ -19,13 +20,14 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.wire_faults import WireFaults
+from starhil.emulator.pipeline.messages import ImageResult
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
-from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
@@ -99,21 +101,21 @@ class DeviceApplication:
 
     def telecommand(self, row: Row, payload: bytes) -> Deferred | None:
         """Execute a telecommand, which is counted and acknowledged as on the other links."""
-        deferred = Deferred()
 
-        def done(reply: Reply) -> None:
-            refusal: SdoAbortError | None = None
+        def refusal(replies: list[Reply]) -> SdoAbortError | None:
             try:
-                check_status(reply.code, row.name)
+                for reply in replies:
+                    check_status(reply.code, row.name)
             except SdoAbortError as abort:
-                refusal = abort
-            self._finish_write(deferred, refusal)
+                return abort
+            return None
 
-        replies = self._requests.handle(self._device.icd.request(row, payload), done)
-        if replies is None:
-            return deferred
-        for reply in replies:
-            check_status(reply.code, row.name)
+        answer = self._requests.handle(self._device.icd.request(row, payload))
+        if isinstance(answer, PendingAnswer):
+            return self._deferred(answer.then(refusal))
+        abort = refusal(answer)
+        if abort is not None:
+            raise abort
         return None
 
     def parameter(self, name: str) -> Value:
@@ -141,40 +143,32 @@ class DeviceApplication:
         """Capture a full image; the write is answered when it is complete."""
         if self._device.images.busy:
             raise SdoAbortError(AbortCode.DEVICE_STATE, f"{name}: another image is being captured")
-        deferred = Deferred()
 
-        def done(image: GreyImage | None) -> None:
+        def captured(image: ImageResult | None) -> SdoAbortError | None:
             if image is None:
-                self._finish_write(deferred, SdoAbortError(AbortCode.HARDWARE, "no frame"))
-            else:
-                self._last_image = image
-                self._finish_write(deferred, None)
+                return SdoAbortError(AbortCode.HARDWARE, "no frame")
+            self._last_image = GreyImage(image.width, image.height, image.frame, image.pixels)
+            return None
 
-        self._device.images.capture_full(
-            lambda full: done(
-                None if full is None else GreyImage(full.width, full.height, full.frame, full.pixels)
-            )
-        )
-        return deferred
+        return self._deferred(self._device.images.capture_full().then(captured))
 
     def save(self) -> Deferred:
         """Save the parameters of the device (1010h); the write is answered when they are on disk."""
-        return self._deferred(self._device.save_parameters)
+        return self._deferred(self._device.save_parameters().then(_storage_refusal))
 
     def restore(self) -> Deferred:
         """Restore the defaults at the next restart (1011h)."""
-        return self._deferred(self._device.forget_parameters)
+        return self._deferred(self._device.forget_parameters().then(_storage_refusal))
 
-    def _deferred(self, work: Callable[[Callable[[EmulatorError | None], None]], None]) -> Deferred:
+    def _deferred(self, refusal: PendingAnswer[SdoAbortError | None]) -> Deferred:
+        """Return the write that is answered when it is known whether it is refused."""
         deferred = Deferred()
-
-        def done(error: EmulatorError | None) -> None:
-            self._finish_write(
-                deferred, None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error))
-            )
-
-        work(done)
+        refusal.when_done(partial(self._finish_write, deferred))
         return deferred
+
+
+def _storage_refusal(error: EmulatorError | None) -> SdoAbortError | None:
+    return None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error))
 
 
 class CanopenLink:
@@ -205,14 +199,17 @@ class CanopenLink:
     ) -> None:
         device = self._device = requests.device
         self.transport: Final = transport
-        dictionary = build_dictionary(device.icd)
         self.application = DeviceApplication(requests, self._finish_write)
-        dictionary.application = self.application
-        bit_rates = frozenset(dictionary.layout.bit_rates)
-        self.slave = CanopenSlave(dictionary, self._wanted_node, storage=storage, bit_rates=bit_rates)
-        self.slave.store.on_save = self.application.save
-        self.slave.store.on_restore = self.application.restore
-        self.slave.on_reset = self._reset_device
+        dictionary = build_dictionary(device.icd, self.application)
+        self.slave = CanopenSlave(
+            dictionary,
+            self._wanted_node,
+            storage=storage,
+            bit_rates=frozenset(dictionary.layout.bit_rates),
+            on_save=self.application.save,
+            on_restore=self.application.restore,
+            on_reset=self._reset_device,
+        )
         self._dictionary = dictionary
         self._actions: deque[Action] = deque()
         self._busy = False
@@ -228,10 +225,10 @@ class CanopenLink:
         self.wire: WireFaults[CanFrame] = WireFaults(
             transport.send, CanDamage(extended=False), device.clock, device.scheduler, seed
         )
-        device.on_frame.append(self._frame_published)
-        device.on_mode.append(self._mode_changed)
-        device.on_reset.append(self._device_reset)
-        device.parameters.observe(self._parameters_changed)
+        device.signals.frame_published.connect(self._frame_published)
+        device.signals.mode_changed.connect(self._mode_changed)
+        device.signals.restarted.connect(self._device_reset)
+        device.signals.parameters_changed.connect(self._parameters_changed)
 
     async def start(self) -> str:
         """Join the bus and send the boot-up message; return the description of the bus."""
@@ -295,9 +292,9 @@ class CanopenLink:
         if reconnects != self._reconnects:
             self._reconnects = reconnects
             self._run_action(
-                partial(self._raise_emergency, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION)
+                partial(self._raise_emergency, EmergencyCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION)
             )
-            self._run_action(partial(self._clear_emergency, ErrorCode.BUS_OFF_RECOVERED))
+            self._run_action(partial(self._clear_emergency, EmergencyCode.BUS_OFF_RECOVERED))
         self._run_action(self.slave.tick)
 
     def _raise_emergency(self, code: int, bits: int, now: float) -> list[CanFrame]:
@@ -368,7 +365,7 @@ class CanopenLink:
         keys = frozenset(placed[name] for name in names if name in placed)
         self._run_action(lambda now: self.slave.notify(keys, now))
 
-    def _device_reset(self) -> None:
+    def _device_reset(self, _cause: str) -> None:
         """Restart the node with the device, unless an NMT reset of the node caused the restart."""
         self._attitude_valid = False
         self.application.clear()

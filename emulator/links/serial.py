@@ -8,10 +8,10 @@ from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
+from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.messages import Reply, Request
-from starhil.protocol.receiver import Receiver
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
+from starhil.protocol.serial_interface import Dialect, Receiver
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports.paced import SerialTransport
 
 JUNK_BYTES: Final = 8
@@ -48,7 +48,7 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
-        self._device.parameters.observe(self._parameters_changed)
+        self._device.signals.parameters_changed.connect(self._parameters_changed)
 
     def _wanted_baud(self) -> int:
         return int(self._device.parameters["serial_baud"])

@@ -23,24 +23,12 @@ class ImageSource(Protocol):
     """A source of images."""
 
     def image(self, index: int) -> Counts:
-        """Return the image (h, w) of an exposure, uint8 or uint16.
-
-        Raises
-        ------
-        EmulatorError, StaridError
-            There is no such image; one line.
-        """
+        """Return the image (h, w) of an exposure, uint8 or uint16."""
         ...
 
 
 class FolderImages:
-    """The images in a folder in the order of their names, one for each exposure.
-
-    Raises
-    ------
-    EmulatorError
-        The folder does not exist or contains no images.
-    """
+    """The images in a folder in the order of their names, one for each exposure."""
 
     def __init__(self, folder: Path, *, repeat: bool) -> None:
         if not folder.is_dir():
@@ -64,13 +52,7 @@ class FolderImages:
 
 
 class CapturedImages:
-    """Images from a camera or a video, captured by OpenCV.
-
-    Raises
-    ------
-    EmulatorError
-        The camera or video cannot be opened.
-    """
+    """Images from a camera or a video, captured by OpenCV."""
 
     def __init__(self, capture: str) -> None:
         import cv2
@@ -105,19 +87,13 @@ class CheckedImages:
         if (width, height) != (self._camera.width, self._camera.height):
             raise EmulatorError(
                 f"images: {width}×{height} pixels, the camera of the profile has {self._camera.width}×"
-                f"{self._camera.height}; set [camera] to the camera that takes them (starhil calibrate writes it)"
+                f"{self._camera.height}; set [camera] to the camera that takes them (starid calibrate writes it)"
             )
         return image if self._excess is None else without_dark(image, self._excess)
 
 
 def open_images(settings: Mapping[str, Any], camera: Camera) -> ImageSource | None:
-    """Open the images named in `[images]` of a profile; None if there are none.
-
-    Raises
-    ------
-    EmulatorError, StaridError
-        The images cannot be opened.
-    """
+    """Open the images named in `[images]` of a profile; None if there are none."""
     folder, capture, dark = (str(settings.get(key, "")) for key in ("folder", "capture", "dark"))
     source: ImageSource
     if folder:

@@ -18,7 +18,7 @@ from starid.projection import back_project_kernel
 def kernel_cache_was_cold() -> bool:
     """Return whether this process had to compile the projection; the other kernels are then missing too."""
     kernel: Any = back_project_kernel
-    return bool(kernel.stats.cache_misses)
+    return bool(kernel.compilations)
 
 
 def start_helper() -> subprocess.Popen[bytes]:

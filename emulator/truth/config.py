@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias
@@ -29,6 +28,7 @@ from starhil.emulator.truth.source import (
     TruthSource,
 )
 from starid.attitude import Attitude
+from starid.earth import LATEST_UNIX_S, unix_time
 
 AxisRate: TypeAlias = Annotated[float, Field(ge=-MAX_RATE_DEG_S, le=MAX_RATE_DEG_S)]
 Rate: TypeAlias = Annotated[list[AxisRate], Field(min_length=3, max_length=3)]
@@ -38,32 +38,6 @@ Turn: TypeAlias = Annotated[float, Field(ge=-360.0, le=360.0)]
 """Right ascension or roll, degrees."""
 
 SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
-
-
-LATEST_UNIX_S: Final = 4_102_444_800.0
-"""2100-01-01; the 32-bit seconds of telemetry wrap six years later."""
-
-
-def unix_time(value: object) -> float:
-    """Return the Unix time of a date: a TOML date-time, ISO 8601 text, or Unix time; UTC without an offset.
-
-    Raises
-    ------
-    ValueError
-        The value is not a date from 1970 to 2100.
-    """
-    number = value
-    if isinstance(value, str):
-        try:
-            number = datetime.fromisoformat(value)
-        except ValueError:
-            number = None
-    if isinstance(number, datetime):
-        number = (number if number.tzinfo else number.replace(tzinfo=UTC)).timestamp()
-    if isinstance(number, bool) or not isinstance(number, (int, float)) or not 0.0 <= number <= LATEST_UNIX_S:
-        raise ValueError("must be a date from 1970 to 2100, e.g. 2026-03-20T12:00:00Z")
-    return float(number)
-
 
 Date: TypeAlias = Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S), BeforeValidator(unix_time)]
 """A date in UTC, stored as Unix time."""

@@ -2,42 +2,37 @@
 
 from __future__ import annotations
 
+import random
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from typing import Any, Final
 
-from starhil.hil_tests.conformance.can_probe import (
-    TELECOMMAND_SEGMENT,
-    CanProbe,
-    CanWire,
-    can_id_of,
-    segments,
-)
+from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import (
     Case,
     CaseArea,
     CaseFailed,
     CaseSkipped,
-    check,
     check_equal,
     rule,
 )
-from starhil.hil_tests.conformance.link_probe import LONG_PAUSE_S
-from starhil.hil_tests.conformance.row_cases import bad_values
-from starhil.hil_tests.conformance.wire_tables import Exchange, FlagRow, add_exchange_cases, add_flag_cases
-from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.codec import Row
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.messages import ErrorCode
+from starhil.hil_tests.conformance.link_probe import (
+    INVALID_ID,
+    INVALID_LENGTH,
+    INVALID_PARAMETER,
+    LONG_PAUSE_S,
+)
+from starhil.hil_tests.conformance.ports import CanFrame
+from starhil.hil_tests.conformance.row_cases import row_cases
+from starhil.hil_tests.conformance.wire_tables import Exchange, add_exchange_cases, filled
+from starhil.hil_tests.judge.can import TELECOMMAND_SEGMENT, can_id_of, segments
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.rows import Row
 
 SEGMENT_RULE: Final = "more than 8 bytes: 7 and a counter down to 0, no padding (libCubeObc)"
 TYPES: Final = "message types 0 to 12 (libCubeObc)"
 
 OTHER_HOST: Final = 0x4D
-COMBINED: Final = 211
-COMBINED_SIZE: Final = 54
 CUBESTAR: Final = frozenset({128, 230, 211, 200, 60, 103, 96, 2, 112, 37})
 """Rows, and gaps between them, that a case uses if they are suitable."""
 LONGEST: Final = 56
@@ -67,8 +62,8 @@ class CanRows:
         Telecommand with the most bytes.
     """
 
-    def __init__(self, icd: InterfaceDefinition) -> None:
-        telemetry, commands = list(icd.telemetry.values()), list(icd.telecommands.values())
+    def __init__(self, unit: Unit) -> None:
+        telemetry, commands = list(unit.telemetry.values()), list(unit.telecommands.values())
         bad = [(row, data) for row in commands for data in _bad_data(row) if len(data) <= 8]
         self.single = _first(row for row in telemetry if row.size <= 8)
         self.small = _first(row for row in telemetry if row.size < 8)
@@ -83,7 +78,7 @@ class CanRows:
         self.short = _first(row for row in commands if 2 <= row.size <= 8)
         self.longest = _first(sorted((row for row in commands if row.size > 8), key=lambda row: -row.size))
 
-    def texts(self, icd: InterfaceDefinition) -> dict[str, str]:
+    def texts(self, unit: Unit) -> dict[str, str]:
         """Return the texts for the names in braces in the table of frames; missing rows have none."""
         found = {name: f"{row.id:02X}" for name, row in vars(self).items() if isinstance(row, Row)}
         found |= {name: f"{number:02X}" for name, number in vars(self).items() if isinstance(number, int)}
@@ -96,13 +91,13 @@ class CanRows:
             if row is not None:
                 data = next(data for data in _bad_data(row)).hex().upper()
                 found |= {f"{name}_data": data, f"{name}_first": data[:14], f"{name}_rest": data[14:]}
-        for name in ("invalid_id", "invalid_length", "invalid_parameter"):
-            found[name] = f"{int(icd.error_number(ErrorCode[name.upper()])):02X}"
+        for name in (INVALID_ID, INVALID_LENGTH, INVALID_PARAMETER):
+            found[name] = f"{unit.code(name):02X}"
         return found
 
 
 def _bad_data(row: Row) -> list[bytes]:
-    return [data for field in row.named_fields.values() for _, data in bad_values(row, field)]
+    return [data for field in row.named.values() for _, data in row.bad_values(field)]
 
 
 def _first(rows: Iterable[Row]) -> Row | None:
@@ -117,15 +112,8 @@ def _gap(numbers: range, known: set[int]) -> int | None:
 
 
 FRAME_RULE: Final = "29-bit CAN ID: type[28:24] row[23:16] source[15:8] destination[7:0] (libCubeObc)"
-REPLY_SEGMENTS: Final = CaseArea[CanWire]("segments", SEGMENT_RULE)
-SEGMENTS: Final = CaseArea[CanWire]("segments", SEGMENT_RULE, intrusive=True)
-UNSOLICITED: Final = CaseArea[CanProbe](
-    "unsolicited", "types 10 to 12 (libCubeObc); their use: R20, docs/rules.md", intrusive=True
-)
-ERRORS: Final = CaseArea[CanProbe](
-    "errors", "configs/units/cubestar: communication_status 144, flag can_telecommand_error", intrusive=True
-)
-
+REPLY_SEGMENTS: Final = CaseArea[CanProbe]("segments", SEGMENT_RULE)
+SEGMENTS: Final = CaseArea[CanProbe]("segments", SEGMENT_RULE, intrusive=True)
 
 IGNORED: Final = ((2, "an acknowledge"), (3, "a telecommand refusal"), (5, "telemetry"), (6, "a telemetry refusal"),
                   (8, "a telemetry segment"), (9, "an event"), (10, "unsolicited telemetry, first"),
@@ -156,29 +144,21 @@ INTRUSIVE_EXCHANGES: Final = (
 )  # fmt: skip
 
 
-def _frame_cases(icd: InterfaceDefinition) -> list[Case[CanWire]]:
+def _frame_cases(unit: Unit) -> list[Case[CanProbe]]:
     """Return the cases of the tables of frames whose rows the unit has."""
-    texts = CanRows(icd).texts(icd)
-    area = CaseArea[CanWire]("frames", FRAME_RULE)
-    add_exchange_cases(area, _filled(EXCHANGES, texts))
-    add_exchange_cases(area, _filled(INTRUSIVE_EXCHANGES, texts), intrusive=True)
+    texts = CanRows(unit).texts(unit)
+    area = CaseArea[CanProbe]("frames", FRAME_RULE)
+    add_exchange_cases(area, filled(EXCHANGES, texts))
+    add_exchange_cases(area, filled(INTRUSIVE_EXCHANGES, texts), intrusive=True)
     area.case("askers", "each sender gets the answer at its own address")(askers)
     return area.cases
 
 
-def _filled(table: Iterable[Exchange], texts: dict[str, str]) -> Iterator[Exchange]:
-    """Yield the rows of a table with names in braces replaced by texts; skip rows with a missing text."""
-    for row in table:
-        with suppress(KeyError):
-            sent, answers = (tuple(text.format(**texts) for text in part) for part in (row.sent, row.answers))
-            name, title = row.id.format(**texts), row.title.format(**texts)
-            yield replace(row, id=name, title=title, sent=sent, answers=answers)
-
-
-def askers(probe: CanWire) -> None:
+def askers(probe: CanProbe) -> None:
     """Send requests from three addresses."""
     for source in (OTHER_HOST, probe.host, 0xFF):
-        probe.post_as(source, needed(CanRows(probe.icd).single, "telemetry of up to 8 bytes").id)
+        row = needed(CanRows(probe.unit).single, "telemetry of up to 8 bytes")
+        probe.post_as(source, probe.unit.request(row))
     seen = [probe.next_answer() for _ in range(3)]
     check_equal([(answer.kind, answer.other) for answer in seen], [("telemetry", OTHER_HOST), ("telemetry", probe.host), ("telemetry", 0xFF)], "answers to")  # fmt: skip
 
@@ -186,12 +166,12 @@ def askers(probe: CanWire) -> None:
 # --- segments of the answer ---
 
 
-def _segmented_reply(row: Row) -> Case[CanWire]:
+def _segmented_reply(row: Row) -> Case[CanProbe]:
     count = -(-row.size // 7)
     rest = row.size - 7 * (count - 1)
 
-    def run(probe: CanWire) -> None:
-        probe.post_as(probe.host, row.id)
+    def run(probe: CanProbe) -> None:
+        probe.post(row)
         frames = [probe.next_frame() for _ in range(count)]
         can_id = can_id_of(8, row.id, probe.device, probe.host)
         seen = [
@@ -210,9 +190,9 @@ def _segmented_reply(row: Row) -> Case[CanWire]:
 
 
 @REPLY_SEGMENTS.case("all-rows", "every row of up to 8 bytes is sent in one frame, longer rows in segments")
-def all_rows(probe: CanWire) -> None:
-    for row in probe.icd.telemetry.values():
-        probe.post_as(probe.host, row.id)
+def all_rows(probe: CanProbe) -> None:
+    for row in probe.unit.telemetry.values():
+        probe.post(row)
         frame = probe.next_frame()
         if frame is None:
             raise CaseFailed(f"an answer to {row.id}", "nothing")
@@ -222,28 +202,12 @@ def all_rows(probe: CanWire) -> None:
             probe.next_frame()
 
 
-@UNSOLICITED.case(
-    "segments", "an unsolicited long row is sent as first, body and last, with counters down to 0"
-)
-def unsolicited_segments(probe: CanProbe) -> None:
-    """star_tracker has 54 bytes, so 8 frames."""
-    probe.command("set_unsolicited", telemetry=COMBINED, rate=5.0)
-    try:
-        probe.receive_unsolicited(1.0)
-        seen = probe.unsolicited[:8]
-    finally:
-        probe.command("set_unsolicited", telemetry=COMBINED, rate=0.0)
-    check_equal([frame.id >> 24 for frame in seen], [10, *[11] * 6, 12], "types")
-    check_equal([frame.data[-1] if frame.data else -1 for frame in seen], list(range(7, -1, -1)), "counters")
-    check_equal(sum(len(frame.data) - 1 for frame in seen), COMBINED_SIZE, "bytes")
-
-
 # --- segments of telecommands ---
 
 
-def _unknown_frames(probe: CanWire, data: bytes, source: int | None = None) -> list[CanFrame]:
+def _unknown_frames(probe: CanProbe, data: bytes, source: int | None = None) -> list[CanFrame]:
     """Return the segments of an unknown telecommand, whose refusal shows that the message was complete."""
-    number = CanRows(probe.icd).unknown_telecommand
+    number = CanRows(probe.unit).unknown_telecommand
     if number is None:
         raise CaseSkipped("the unit has a telecommand for every ID")
     source = probe.host if source is None else source
@@ -258,7 +222,7 @@ def needed(row: Row | None, what: str) -> Row:
     return row
 
 
-def _send(probe: CanWire, frames: list[CanFrame]) -> None:
+def _send(probe: CanProbe, frames: list[CanFrame]) -> None:
     for frame in frames:
         probe.send(frame)
 
@@ -266,13 +230,13 @@ def _send(probe: CanWire, frames: list[CanFrame]) -> None:
 LONG: Final = bytes(range(30))
 
 
-def _expect_one_refusal(probe: CanWire) -> None:
-    probe.expect_answer("nack", "one refusal of an unknown telecommand", ErrorCode.INVALID_ID)
+def _expect_one_refusal(probe: CanProbe) -> None:
+    probe.expect_answer("nack", "one refusal of an unknown telecommand", INVALID_ID)
     probe.expect_silence("one message was sent")
 
 
 @SEGMENTS.case("lost", "a message with a lost segment has no effect, the next one is answered")
-def lost_segment(probe: CanWire) -> None:
+def lost_segment(probe: CanProbe) -> None:
     frames = _unknown_frames(probe, LONG)
     for lost in range(len(frames)):
         _send(probe, frames[:lost] + frames[lost + 1 :])
@@ -298,7 +262,7 @@ FAULTY: Final = (
 counter."""
 
 
-def _faulty_message(title: str, order: tuple[int, ...], probe: CanWire) -> None:
+def _faulty_message(title: str, order: tuple[int, ...], probe: CanProbe) -> None:
     frames = _unknown_frames(probe, LONG)
     _send(probe, [frames[place] for place in order] or [CanFrame(frames[0].id)])
     probe.expect_silence(title)
@@ -311,7 +275,7 @@ for _name, _title, _order in FAULTY:
 
 
 @SEGMENTS.case("half", "an incomplete message is dropped after a time-out", rule(2))
-def half_message(probe: CanWire) -> None:
+def half_message(probe: CanProbe) -> None:
     """The last segment arrives too late; the last two would form a message."""
     frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:-1])
@@ -323,7 +287,7 @@ def half_message(probe: CanWire) -> None:
 
 
 @SEGMENTS.case("pause", "a pause of 0.1 s between segments has no effect", rule(1))
-def pause_between(probe: CanWire) -> None:
+def pause_between(probe: CanProbe) -> None:
     for frame in _unknown_frames(probe, LONG):
         probe.send(frame)
         probe.sleep(0.1)
@@ -331,19 +295,19 @@ def pause_between(probe: CanWire) -> None:
 
 
 @SEGMENTS.case("restart", "a message may be restarted before its end", rule(8))
-def restarted_message(probe: CanWire) -> None:
+def restarted_message(probe: CanProbe) -> None:
     frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:2] + frames)
     _expect_one_refusal(probe)
 
 
 @SEGMENTS.case("two-hosts", "segments of two hosts are not mixed", FRAME_RULE)
-def two_hosts(probe: CanWire) -> None:
+def two_hosts(probe: CanProbe) -> None:
     ours, theirs = _unknown_frames(probe, LONG), _unknown_frames(probe, LONG, OTHER_HOST)
     for one, other in zip(ours, theirs, strict=True):
         _send(probe, [one, other])
     seen = [probe.next_answer() for _ in range(2)]
-    code = int(probe.icd.error_number(ErrorCode.INVALID_ID))
+    code = probe.unit.code(INVALID_ID)
     check_equal([(answer.kind, answer.code, answer.other) for answer in seen], [("nack", code, probe.host), ("nack", code, OTHER_HOST)], "answers")  # fmt: skip
 
 
@@ -352,7 +316,7 @@ def two_hosts(probe: CanWire) -> None:
     "a request between segments is answered at once and does not disturb the message",
     FRAME_RULE,
 )
-def request_between(probe: CanWire) -> None:
+def request_between(probe: CanProbe) -> None:
     frames = _unknown_frames(probe, LONG)
     _send(probe, frames[:2])
     probe.expect_alive()
@@ -361,7 +325,7 @@ def request_between(probe: CanWire) -> None:
 
 
 @SEGMENTS.case("overlong", "a message that is too long has no effect, the next one is answered", rule(4))
-def overlong(probe: CanWire) -> None:
+def overlong(probe: CanProbe) -> None:
     """The message has 1750 bytes; the buffer of the published host software has 512."""
     _send(probe, _unknown_frames(probe, bytes(250 * 7)))
     probe.expect_silence("the message was too long")
@@ -370,46 +334,33 @@ def overlong(probe: CanWire) -> None:
 
 
 @SEGMENTS.case("long", "a message of 500 bytes is received and refused for its length", rule(4))
-def long_message(probe: CanWire) -> None:
-    row = needed(CanRows(probe.icd).longest, "telecommand of more than 8 bytes")
-    probe.post_as(probe.host, row.id, bytes(500))
-    probe.expect_answer("nack", f"refusal of {row.name} for its length", ErrorCode.INVALID_LENGTH)
+def long_message(probe: CanProbe) -> None:
+    row = needed(CanRows(probe.unit).longest, "telecommand of more than 8 bytes")
+    probe.post(row, bytes(500))
+    probe.expect_answer("nack", f"refusal of {row.name} for its length", INVALID_LENGTH)
 
 
-# --- errors are flagged ---
-
-CAN_ERROR: Final = frozenset({"can_telecommand_error"})
-FLAGS: Final = (
-    FlagRow("type", "a message type that is not a request", ("0580HHDD#00",), CAN_ERROR),
-    FlagRow("swapped-kinds", "a telecommand frame with a telemetry ID", ("0180HHDD#",), CAN_ERROR),
-    FlagRow("sequence", "a segment out of order", ("073CHHDD#0001020304050602", "073CHHDD#0001020304050600"), CAN_ERROR),
-    FlagRow("begins-nothing", "a last segment without others", ("073CHHDD#00010203040500",), CAN_ERROR),
-    FlagRow("no-counter", "a segment without a counter", ("073CHHDD#",), CAN_ERROR),
-    FlagRow("half", "half a message", ("073CHHDD#0001020304050602",), CAN_ERROR, pause_s=LONG_PAUSE_S),
-)  # fmt: skip
-add_flag_cases(ERRORS, FLAGS)
+# --- noise ---
 
 
-@ERRORS.case("none", "good requests, and frames for others, set no flag")
-def no_flag(probe: CanProbe) -> None:
-    probe.command("clear_counters")
-    for text in ("0480HHFE#", "1F80HHFE#00", "480#0102", "0480HHDD#R", "073CHHFE#00"):
-        probe.send_text(text)
-    probe.expect_silence("they are not for the device")
-    _send(probe, _unknown_frames(probe, LONG))
-    _expect_one_refusal(probe)
-    status = probe.telemetry("communication_status")
-    check(not status["can_telecommand_error"], "no flag", "can_telecommand_error")
+def noise(probe: CanProbe) -> None:
+    rng = random.Random(7)  # noqa: S311 -- noise, not a secret
+    for _ in range(400):
+        kind = rng.choice((0, 2, 3, 5, 6, 9, 13, 20, 31))
+        can_id = can_id_of(kind, rng.randrange(256), probe.host, probe.device)
+        probe.send(CanFrame(can_id, rng.randbytes(rng.randrange(9))))
+    probe.sleep(probe.times.quiet_s)
+    probe.drain()
+    probe.expect_alive()
 
 
-def can_cases(icd: InterfaceDefinition, *, cubestar: bool) -> list[Case[Any]]:
-    """Return the cases for a unit with a CAN link; some are for CubeStar only."""
-    long = CanRows(icd).long
-    return [
-        *_frame_cases(icd),
-        *([] if long is None else [_segmented_reply(long)]),
-        *REPLY_SEGMENTS.cases,
-        *(UNSOLICITED.cases if cubestar else []),
-        *SEGMENTS.cases,
-        *(ERRORS.cases if cubestar else []),
-    ]
+def can_cases(unit: Unit) -> Iterator[Case[Any]]:
+    """Yield the cases for a unit with a CAN link."""
+    long = CanRows(unit).long
+    yield from _frame_cases(unit)
+    if long is not None:
+        yield _segmented_reply(long)
+    yield from REPLY_SEGMENTS.cases
+    yield from SEGMENTS.cases
+    yield from row_cases(unit)
+    yield Case("recovery.noise", "recovery", "after noise the next valid request is answered", rule(9), noise)

@@ -9,8 +9,7 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
-from starhil.hil_tests.conformance.ports import Port
-from starhil.protocol.can_framing import CanFrame
+from starhil.hil_tests.conformance.ports import CanFrame, Port
 
 NMT: Final = 0x000
 SYNC: Final = 0x080

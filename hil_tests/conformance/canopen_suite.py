@@ -20,8 +20,7 @@ from starhil.hil_tests.conformance import (
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
 from starhil.hil_tests.conformance.case import Case, cases_of
-from starhil.hil_tests.conformance.suites import is_cubestar
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.hil_tests.judge.definition import Unit
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
     cases_of(
@@ -41,12 +40,12 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
 """Cases of CiA 301, for any unit."""
 
 
-def canopen_suite(icd: InterfaceDefinition) -> tuple[Case[CanopenProbe], ...]:
-    """Return the cases for a unit on CANopen; the rows of CubeStar are tested over its other links.
+def canopen_suite(unit: Unit) -> tuple[Case[CanopenProbe], ...]:
+    """Return the cases for a unit on CANopen.
 
     Raises
     ------
     IcdError
         The unit has no CANopen node.
     """
-    return CANOPEN_CASES if is_cubestar(icd) else (*CANOPEN_CASES, *canopen_unit_cases(icd))
+    return (*CANOPEN_CASES, *canopen_unit_cases(unit))

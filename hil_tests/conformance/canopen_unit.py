@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from starhil.hil_tests.conformance.canopen_pdo import SYNCHRONOUS, send_sync
 from starhil.hil_tests.conformance.canopen_probe import (
@@ -19,12 +19,17 @@ from starhil.hil_tests.conformance.canopen_probe import (
 )
 from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
-from starhil.hil_tests.conformance.row_cases import bad_values
-from starhil.hil_tests.conformance.unit_cases import ATTITUDE_S, CLOCK_S, QUATERNION, clause_of_row, is_valid
-from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedMember, PlacedObject, read_layout
-from starhil.protocol.codec import Field, Row, Slot
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import SCALAR_SIZES, Value
+from starhil.hil_tests.conformance.row_cases import (
+    ATTITUDE_S,
+    CLOCK_S,
+    QUATERNION,
+    check_unit_length,
+    clause_of,
+    is_valid,
+)
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field, Row
 
 PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
 """CAN IDs of the first four RPDOs and TPDOs, to which the node ID is added (CiA 301 7.3.5)."""
@@ -34,6 +39,8 @@ EXPEDITED: Final = 4
 """Maximum number of bytes in an expedited SDO."""
 CHANGING: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
 """Prefixes of the names of quantities that change with each exposure."""
+UNUSED_ID: Final = 0x3E0
+"""CAN ID for a PDO that has none."""
 CLAUSE: Final = "[canopen]"
 
 Run = Callable[[CanopenProbe], None]
@@ -60,9 +67,9 @@ class Entry:
     name: str
     size: int
     row: Row | None = None
-    slot: Slot | None = None
+    slot: Field | None = None
     command: Row | None = None
-    part: Slot | None = None
+    part: Field | None = None
 
     @property
     def mapping(self) -> int:
@@ -70,48 +77,49 @@ class Entry:
         return self.index << 16 | self.subindex << 8 | 8 * self.size
 
 
-def entries(icd: InterfaceDefinition, layout: CanopenModel) -> Iterator[Entry]:
+def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
     """Yield the entries of the application."""
     for placed in layout.object:
         index, at = placed.index, f"{placed.index:04x}"
         if placed.telemetry is not None:
-            row = icd.telemetry[placed.telemetry]
-            command = None if placed.telecommand is None else icd.telecommands[placed.telecommand]
-            named = {field.slot.index for field in row.named_fields.values()}
-            for number, slot in enumerate([slot for slot in row.slots if slot.index in named], 1):
-                (name, *_) = [f.name for f in row.named_fields.values() if f.slot.index == slot.index]
+            row = unit.telemetry[placed.telemetry]
+            command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
+            for number, slot in enumerate(places(row), 1):
                 part = None if command is None else slot
-                yield Entry(index, number, f"{at}.{name}", slot.size, row, slot, command, part)
+                yield Entry(index, number, f"{at}.{slot.name}", slot.size, row, slot, command, part)
         elif placed.members:
             subindex = 0
             for member in placed.members:
                 subindex = member.subindex or subindex + 1
-                yield _entry(icd, member, index, subindex, f"{at}.{member.name.lower()}")
+                yield _entry(unit, member, index, subindex, f"{at}.{member.name.lower()}")
         elif placed.value is not None or placed.telecommand is not None:
-            yield _entry(icd, placed, index, 0, at)
+            yield _entry(unit, placed, index, 0, at)
         elif placed.parameters:
-            for number, parameter in sorted(icd.parameters_by_id.items()):
-                yield Entry(index, number, f"{at}.{parameter.name}", _bytes_of(parameter.type))
+            for parameter in unit.parameters.values():
+                yield Entry(index, parameter.id, f"{at}.{parameter.name}", _bytes_of(parameter.type))
         for number, packed in enumerate(placed.packed, 1):
             name = packed.name or packed.source.partition(".")[2]
             yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type))
 
 
-def _entry(
-    icd: InterfaceDefinition, placed: PlacedMember | PlacedObject, index: int, subindex: int, name: str
-) -> Entry:
+def _entry(unit: Unit, placed: Any, index: int, subindex: int, name: str) -> Entry:
     row, slot, size = None, None, 0
     if placed.value is not None:
         row_name, _, field = placed.value.partition(".")
-        row = icd.telemetry[row_name]
-        slot = row.named_fields[field].slot
-        size = 0 if row.named_fields[field].kind == "text" else slot.size
-    command = None if placed.telecommand is None else icd.telecommands[placed.telecommand]
+        row = unit.telemetry[row_name]
+        slot = row.named[field]
+        size = 0 if slot.kind == "text" else slot.size
+    command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
     if command is not None and not _is_text(command):
         size = size or command.size
-    if isinstance(placed, PlacedMember) and placed.parameter is not None:
-        size = _bytes_of(icd.parameters[placed.parameter].type)
+    if getattr(placed, "parameter", None) is not None:
+        size = _bytes_of(unit.parameters[placed.parameter].type)
     return Entry(index, subindex, name, size, row, slot, command)
+
+
+def places(row: Row) -> list[Field]:
+    """Return the first named field at each place of a row; fields of bits share one."""
+    return list({item.offset: item for item in reversed(list(row.named.values()))}.values())[::-1]
 
 
 def _is_text(command: Row) -> bool:
@@ -120,14 +128,15 @@ def _is_text(command: Row) -> bool:
 
 
 def _bytes_of(type_: str) -> int:
-    return SCALAR_SIZES.get(type_, 1)
+    """Return the bytes of a type; names end in the number of bits, but for `bool`."""
+    return int("".join(filter(str.isdigit, type_)) or 8) // 8
 
 
-def canopen_unit_cases(icd: InterfaceDefinition) -> list[Case[CanopenProbe]]:
+def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
     """Return the cases for a unit with CANopen."""
-    layout = read_layout(icd)
-    found = list(entries(icd, layout))
-    return [*_rows(icd, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
+    layout = unit.canopen
+    found = list(entries(unit, layout))
+    return [*_rows(unit, found), *_commands(found), *_records(found), *_limits(found), *_pdos(layout, found)]
 
 
 def _case(
@@ -140,7 +149,7 @@ def _case(
 # --- reading and writing ---
 
 
-def _with_byte_order(slot: Slot | None, data: bytes) -> bytes:
+def _with_byte_order(slot: Field | None, data: bytes) -> bytes:
     """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
     return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
 
@@ -156,9 +165,9 @@ def _read(probe: CanopenProbe, entry: Entry) -> bytes:
 
 def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
     """Read the entries of a row repeatedly, until no new sample has come in between."""
-    seen = [b"", row.encode()]
+    seen = [b"", bytes(row.size)]
     for _ in range(10):
-        data = bytearray(row.encode())
+        data = bytearray(bytes(row.size))
         for entry in found:
             if entry.row is row and entry.slot is not None:
                 data[entry.slot.offset : entry.slot.offset + entry.slot.size] = _read(probe, entry)
@@ -175,7 +184,7 @@ def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Va
 
 def _written(entry: Entry, command: Row, data: bytes) -> bytes:
     """Return the bytes to be written to an entry to execute a telecommand with this data."""
-    part = command.slots[0] if entry.part is None and len(command.slots) == 1 else entry.part
+    part = places(command)[0] if entry.part is None and len(places(command)) == 1 else entry.part
     if not data:
         return b"\x01"
     if _is_text(command):
@@ -188,40 +197,40 @@ def _identifying_stars(probe: CanopenProbe, found: list[Entry]) -> Iterator[None
     """Have the unit identify stars, if an entry can start this; restore the mode afterwards."""
     for entry in found:
         command, field = entry.command, _argument(entry, "mode")
-        if (
-            command is not None
-            and command.action == "set_mode"
-            and field is not None
-            and entry.row is not None
-        ):
-            before = probe.read(entry.index, entry.subindex)
+        reading = next(
+            (item for item in (entry, *found) if item.row is not None and _reports(item, "mode")), None
+        )
+        if command is not None and command.action == "set_mode" and field is not None and reading is not None:
+            before = _value(probe, reading) or 0
             _write(probe, entry, command, {field.name: "lost_in_space"})
             try:
                 yield
             finally:
-                probe.set(entry.index, entry.subindex, before)
+                _write(
+                    probe, entry, command, {field.name: "lost_in_space" if before == "tracking" else before}
+                )
             return
     yield
 
 
 def _argument(entry: Entry, name: str) -> Field | None:
-    fields = entry.command.named_fields.values() if entry.command is not None else ()
+    fields = entry.command.named.values() if entry.command is not None else ()
     return next((field for field in fields if field.argument == name), None)
 
 
 # --- telemetry ---
 
 
-def _rows(icd: InterfaceDefinition, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
-    for row in icd.telemetry.values():
+def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+    for row in unit.telemetry.values():
         if not any(entry.row is row for entry in found):
             continue
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
-        yield _case("rows", row.name, title, _values(row, found), clause_of_row(row), safe=True)
-        bound = {field.value: name for name, field in row.named_fields.items() if field.value}
+        yield _case("rows", row.name, title, _values(row, found), clause_of(row), safe=True)
+        bound = {field.value: name for name, field in row.named.items() if field.value}
         if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
             title = f"{row.name} has a quaternion of length 1 if it is valid"
-            yield _case("attitude", row.name, title, _unit_length(row, bound, found), clause_of_row(row))
+            yield _case("attitude", row.name, title, _unit_length(row, bound, found), clause_of(row))
 
 
 def _values(row: Row, found: list[Entry]) -> Run:
@@ -242,8 +251,7 @@ def _unit_length(row: Row, bound: dict[str, str], found: list[Entry]) -> Run:
                 if probe.port.now() > end:
                     raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
                 probe.wait_for(NOBODY, 0.1)
-        length = sum(float(seen[bound[name]]) ** 2 for name in QUATERNION) ** 0.5
-        check(abs(length - 1.0) < 1e-5, "a quaternion of length 1", f"{length:.7f}")
+        check_unit_length(row, seen, bound)
 
     return run
 
@@ -267,7 +275,7 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             title, run = f"{command.name} is accepted", _accepted(entry, command)
         else:
             continue
-        yield _case("commands", command.name, title, run, clause_of_row(command))
+        yield _case("commands", command.name, title, run, clause_of(command))
 
 
 def _accepted(entry: Entry, command: Row) -> Run:
@@ -298,8 +306,8 @@ def _value(probe: CanopenProbe, entry: Entry) -> Value | None:
 
 def _fields(entry: Entry) -> list[Field]:
     """Return the telemetry fields of an entry."""
-    fields = () if entry.row is None else entry.row.named_fields.values()
-    return [field for field in fields if entry.slot is not None and field.slot.index == entry.slot.index]
+    fields = () if entry.row is None else entry.row.named.values()
+    return [field for field in fields if entry.slot is not None and field.offset == entry.slot.offset]
 
 
 def _reports(entry: Entry, *quantities: str) -> bool:
@@ -309,12 +317,12 @@ def _reports(entry: Entry, *quantities: str) -> bool:
 
 def _reported(entry: Entry, command: Row) -> Run:
     """Write all values of an enumeration, or else both limits; restore the previous value."""
-    (name, field), *_ = command.named_fields.items()
+    (name, field), *_ = command.named.items()
     values: list[Value]
     if _is_text(command):
         values = ["s", "star"]
     else:
-        values = list(field.physical_limits) if field.enum is None else list(field.enum.values)
+        values = list(field.limits) if field.enum is None else list(field.enum)
 
     def run(probe: CanopenProbe) -> None:
         before = probe.read(entry.index, entry.subindex)
@@ -336,7 +344,7 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
-        yield _case("records", command.name, title, _keeps_values(command, members), clause_of_row(command))
+        yield _case("records", command.name, title, _keeps_values(command, members), clause_of(command))
 
 
 def _keeps_values(command: Row, members: list[Entry]) -> Run:
@@ -356,10 +364,10 @@ def _keeps_values(command: Row, members: list[Entry]) -> Run:
 
 def _limit(command: Row, entry: Entry, end: int) -> bytes:
     """Encode the lowest (0) or highest (1) values of the fields of an entry."""
-    values = dict(command.example())
-    for name, field in command.named_fields.items():
+    values = command.example()
+    for name, field in command.named.items():
         if field.kind in ("integer", "float", "bits") and entry.part is not None:
-            values[name] = field.physical_limits[end]
+            values[name] = field.limits[end]
     return _written(entry, command, command.encode(values))
 
 
@@ -368,13 +376,13 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         command = entry.command
         if command is None or entry.size > EXPEDITED:
             continue
-        for name, field in command.named_fields.items():
-            if entry.part is not None and entry.part.index != field.slot.index:
+        for name, field in command.named.items():
+            if entry.part is not None and entry.part.offset != field.offset:
                 continue
-            for why, data in bad_values(command, field):
+            for why, data in command.bad_values(field):
                 title = f"{entry.name}h with {name} {why} is refused"
                 run = _refused(entry, _written(entry, command, data))
-                yield _case("limits", f"{command.name}.{name}.{why}", title, run, clause_of_row(command))
+                yield _case("limits", f"{command.name}.{name}.{why}", title, run, clause_of(command))
 
 
 def _refused(entry: Entry, data: bytes) -> Run:
@@ -390,7 +398,7 @@ def _refused(entry: Entry, data: bytes) -> Run:
 # --- PDOs ---
 
 
-def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
+def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     by_name = {entry.name.lower(): entry for entry in found}
     for first, models in ((0x1400, layout.rpdo), (0x1800, layout.tpdo)):
         kind = "tpdos" if first == 0x1800 else "rpdos"
@@ -408,7 +416,7 @@ def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProb
                 first == 0x1800
                 and model.enabled
                 and not model.event_ms
-                and any(_reports(entry, *CHANGING) for entry in mapped)
+                and any(_reports(entry, *CHANGING) and not _fields(entry)[0].width for entry in mapped)
             ):
                 title = f"{label} is sent when frames are taken"
                 yield _case(kind, f"{number + 1}.frames", title, _sent_with_frames(index, model, found))
@@ -416,15 +424,15 @@ def _pdos(layout: CanopenModel, found: list[Entry]) -> Iterator[Case[CanopenProb
                 yield from _clock(index, model, mapped, found)
 
 
-def _can_id(probe: CanopenProbe, index: int, model: PdoModel) -> int:
+def _can_id(probe: CanopenProbe, index: int, model: Any) -> int:
     predefined = PREDEFINED[index & ~0x1FF]
     number = index & 0x1FF
     if model.can_id is None:
         return predefined[number] + probe.node if number < len(predefined) else 0
-    return model.can_id + (probe.node if model.relative else 0)
+    return int(model.can_id) + (probe.node if model.relative else 0)
 
 
-def _default(index: int, model: PdoModel, mapped: list[Entry]) -> Run:
+def _default(index: int, model: Any, mapped: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         at = f"{index:04X}h"
         flags = 0 if model.enabled else PDO_OFF
@@ -444,7 +452,7 @@ def _default(index: int, model: PdoModel, mapped: list[Entry]) -> Run:
 def _carries_values(index: int, mapped: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         probe.quiet()
-        can_id = probe.number(index, 1) & 0x7FF
+        can_id = probe.number(index, 1) & 0x7FF or UNUSED_ID
         probe.set(index, 2, SYNCHRONOUS, 1)
         probe.set(index, 1, NO_RTR | can_id)
         probe.command(START)
@@ -464,7 +472,7 @@ def _carries_values(index: int, mapped: list[Entry]) -> Run:
     return run
 
 
-def _sent_with_frames(index: int, model: PdoModel, found: list[Entry]) -> Run:
+def _sent_with_frames(index: int, model: Any, found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         with _identifying_stars(probe, found):
             probe.command(START)
@@ -476,9 +484,7 @@ def _sent_with_frames(index: int, model: PdoModel, found: list[Entry]) -> Run:
     return run
 
 
-def _clock(
-    index: int, model: PdoModel, mapped: list[Entry], found: list[Entry]
-) -> Iterator[Case[CanopenProbe]]:
+def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     """Yield the case for an RPDO that sets the clock, if an entry reads it."""
     clock = next((item for item in found if _reports(item, "clock.seconds")), None)
     (entry, *others) = mapped
@@ -508,4 +514,4 @@ def _clock(
         check(0 <= seen - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", seen)
 
     title = f"RPDO {(index & 0x1FF) + 1} ({model.name}) sets the clock"
-    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, clause_of_row(command))
+    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, clause_of(command))

@@ -67,6 +67,8 @@ class CaseArea(Generic[ProbeType]):
         Dotted name, the prefix of the case IDs.
     clause, intrusive
         Defaults for the cases.
+    links
+        Links on which a unit's own cases run.
     cases
         Cases in the order of their declaration.
     """
@@ -74,6 +76,7 @@ class CaseArea(Generic[ProbeType]):
     name: str
     clause: str
     intrusive: bool = False
+    links: tuple[str, ...] = ("serial", "can")
     cases: list[Case[ProbeType]] = field(default_factory=list)
 
     def case(

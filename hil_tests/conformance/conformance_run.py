@@ -11,7 +11,7 @@ from typing import Any, Final
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
-from starhil.hil_tests.conformance.ports import Port, live_can, live_serial
+from starhil.hil_tests.conformance.ports import live_can, live_serial
 from starhil.hil_tests.conformance.runner import (
     Outcome,
     Verdict,
@@ -21,17 +21,16 @@ from starhil.hil_tests.conformance.runner import (
     select_cases,
 )
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.suites import can_suite, is_cubestar, serial_suite
-from starhil.hil_tests.conformance.unit_can_probe import CanUnitProbe
-from starhil.hil_tests.conformance.unit_probe import SerialUnitProbe
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
+from starhil.hil_tests.judge.definition import Unit, read_unit
 from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.results import FAILED
 from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import IcdError
@@ -62,7 +61,7 @@ class ConformanceRequest:
     """Address of a console that shows the outcomes; `auto` with `start`: the started emulator's console."""
 
 
-def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Case[Any]]:
+def all_cases(request: ConformanceRequest) -> list[Case[Any]]:
     """Return the cases of all requested links, selected by pattern and safety.
 
     Raises
@@ -70,20 +69,21 @@ def all_cases(request: ConformanceRequest, icd: InterfaceDefinition) -> list[Cas
     BenchError
         No link is given, the unit does not have the dialect, or a pattern matches no case.
     """
+    unit = read_unit(request.unit or DEFAULT_UNIT)
     cases: list[Case[Any]] = []
     if request.dialect is not None:
         try:
-            chosen_dialect(icd, request.dialect)
+            chosen_dialect(load_unit(request.unit or DEFAULT_UNIT), request.dialect)
         except IcdError as error:
             raise BenchError(f"--dialect {request.dialect}: {error}") from None
     if request.serial is not None:
-        cases += serial_suite(icd)
-    if request.can is not None and (icd.link.can is not None or request.canopen_node is None):
-        cases += can_suite(icd)
+        cases += serial_suite(unit)
+    if request.can is not None and (unit.can is not None or request.canopen_node is None):
+        cases += can_suite(unit)
     if request.canopen_node is not None:
         from starhil.hil_tests.conformance.canopen_suite import canopen_suite
 
-        cases += canopen_suite(icd)
+        cases += canopen_suite(unit)
     if not cases:
         raise BenchError("no link: use --serial DEV, --can CHANNEL, --canopen NODE, or --start")
     return select_cases(cases, request.patterns, safe_only=request.safe_only)
@@ -109,8 +109,8 @@ def run_conformance(
     BenchError, ProtocolError
         A port, a bus or the emulator is not available.
     """
-    icd = load_unit(request.unit or DEFAULT_UNIT)
-    cases = all_cases(request, icd)
+    unit = read_unit(request.unit or DEFAULT_UNIT)
+    cases = all_cases(request)
     outcomes: list[Outcome] = []
     complete = False
 
@@ -128,7 +128,7 @@ def run_conformance(
             if request.view is not None:
                 address = console_address(request.view, emulator)
                 shown = _shown_on_console(address, f"{serial or ''} {can or ''}", len(cases), stack, record)
-            _run_on_links(request, icd, cases, serial, can, shown)
+            _run_on_links(request, unit, cases, serial, can, shown)
             complete = True
     except EmulatorProcessError as error:
         if not complete:
@@ -170,7 +170,7 @@ def _shown_on_console(
 
 def _run_on_links(
     request: ConformanceRequest,
-    icd: InterfaceDefinition,
+    unit: Unit,
     cases: Sequence[Case[Any]],
     serial: str | None,
     can: str | None,
@@ -184,30 +184,22 @@ def _run_on_links(
             baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
             if baud is not None:  # the bit rate of the line does not change
                 baud = round(baud / request.speed)
-            run_cases(_serial_probe(request, icd, port, baud), mine, on_outcome, port=serial)
+            own, dialect = settings_of(unit), request.dialect
+            probe = SerialProbe(port, unit, dialect=dialect, baud=baud, times=request.times, settings=own)
+            run_cases(probe, mine, on_outcome, port=serial)
         mine = [item for item in cases if item.id.startswith("can.")]
         if mine and can is not None:
             bus = stack.enter_context(live_can(can, request.speed))
             addresses = {"host": request.host_address, "device": request.device_address}
-            new_probe = CanProbe if is_cubestar(icd) else CanUnitProbe
             run_cases(
-                new_probe(bus, icd, times=request.times, **addresses),
+                CanProbe(bus, unit, times=request.times, settings=settings_of(unit), **addresses),
                 mine,
                 on_outcome,
                 port=f"{can} at address {request.device_address}",
             )
         mine = [item for item in cases if item.id.startswith("canopen.")]
         if mine and can is not None:
-            _run_canopen(request, icd, can, mine, on_outcome)
-
-
-def _serial_probe(
-    request: ConformanceRequest, icd: InterfaceDefinition, port: Port[bytes], baud: int | None
-) -> SerialProbe | SerialUnitProbe:
-    style = chosen_dialect(icd, request.dialect)
-    if is_cubestar(icd):
-        return SerialProbe(port, icd, dialect=style or "b", baud=baud, times=request.times)
-    return SerialUnitProbe(port, icd, style=style, times=request.times)
+            _run_canopen(request, can, mine, on_outcome)
 
 
 def _outcome_of_early_end(error: EmulatorProcessError) -> Outcome:
@@ -247,7 +239,6 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
 
 def _run_canopen(
     request: ConformanceRequest,
-    icd: InterfaceDefinition,
     can: str,
     cases: Sequence[Case[Any]],
     on_outcome: Callable[[Outcome], None],
@@ -259,7 +250,7 @@ def _run_canopen(
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
     node = int(request.canopen_node or 0)
-    text = _eds_text(request.eds, icd)
+    text = _eds_text(request)
     with temporary_folder("starhil-eds-") as folder:
         path = folder / "unit.eds"
         path.write_text(text, encoding="utf-8")
@@ -272,11 +263,12 @@ def _run_canopen(
         run_cases(probe, cases, on_outcome, port=f"{can} at node {node}")
 
 
-def _eds_text(path: Path | None, icd: InterfaceDefinition) -> str:
+def _eds_text(request: ConformanceRequest) -> str:
+    path = request.eds
     if path is None:
         from starhil.protocol.canopen import build_dictionary, build_eds
 
-        return build_eds(build_dictionary(icd))
+        return build_eds(build_dictionary(load_unit(request.unit or DEFAULT_UNIT)))
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:

@@ -13,6 +13,8 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports import Transport, open_can, open_serial
 
+__all__ = ["CanFrame", "LivePort", "Port", "live_can", "live_serial"]
+
 Item = TypeVar("Item")
 
 

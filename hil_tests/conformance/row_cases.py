@@ -1,13 +1,13 @@
-"""Conformance to the interface definition, row by row: row IDs, lengths, values, limits."""
+"""Conformance to the rows of a definition, on serial and CAN: IDs, lengths, values, limits, settings, the clock."""
 
 from __future__ import annotations
 
-import math
-import struct
-from collections.abc import Iterator
+import random
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, CaseArea, check, check_equal, rule
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -15,236 +15,351 @@ from starhil.hil_tests.conformance.link_probe import (
     LinkProbe,
     checked_values,
 )
-from starhil.hil_tests.conformance.unit_settings import LINK_PARAMETERS
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.values import Parameter
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field, Row
 
-CODES: Final = "published error codes 0 to 4 (AlbertaSat, CTS)"
-PARTNERS: Final = {
-    "max_star_pixels": ("min_star_pixels", 1.0),
-    "min_star_pixels": ("max_star_pixels", 255.0),
-    "update_rate": ("exposure", 1.0),
-    "exposure": ("update_rate", 0.01),
-    "delay_time": ("update_rate", 0.01),
-}
-"""Parameters that limit each other → the other parameter, and its value that allows the full range."""
+FLOOD: Final = 200
+SUBSCRIBED_S: Final = 3.0
+ATTITUDE_S: Final = 20.0
+SETTLING_S: Final = 1.0
+"""Time after which a unit that identifies stars has an attitude."""
+RESTING: Final = 5
+"""Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
-UNSET: Final = frozenset({"unsolicited_rate"})
-"""Parameters whose largest value would flood the line."""
+CLOCK_S: Final = 1_700_000_000
+QUATERNION: Final = ("attitude.x", "attitude.y", "attitude.z", "attitude.w")
+PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
+
+Run = Callable[[LinkProbe], None]
 
 
-IDENTIFIERS: Final = CaseArea[LinkProbe](
-    "identifiers", "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
-)
+def row_cases(
+    unit: Unit, *, lengths: bool = True, marks: bytes = b"", highest_id: int = 255
+) -> Iterator[Case[LinkProbe]]:
+    """Yield the cases for the rows of a unit.
+
+    Parameters
+    ----------
+    unit
+        Definition of the unit.
+    lengths
+        Whether a message of a wrong length can be sent on the link.
+    marks
+        Bytes that are special on the link; settings are made of them.
+    highest_id
+        Highest ID that a message can carry.
+    """
+    yield from _identifiers(unit, highest_id)
+    if lengths:
+        yield from _lengths(unit)
+    for row in unit.telemetry.values():
+        yield from _telemetry(unit, row)
+    for row in unit.telecommands.values():
+        for index, (name, item) in enumerate(row.named.items()):
+            for why, data in row.bad_values(item):
+                title = f"{row.name} with {name} {why} is refused, and the refused field named"
+                run = _refused(row, data, INVALID_PARAMETER, index)
+                yield _case("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
+    yield from _agreement(unit)
+    yield from _settings(unit, marks)
+    yield from _subscriptions(unit)
+    yield _case(
+        "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
+    )
 
 
 def clause_of(row: Row) -> str:
     """Return the source of a row."""
-    return f"configs/units/cubestar {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
+    return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
 
 
-def row_cases(icd: InterfaceDefinition) -> list[Case[LinkProbe]]:
-    """Return the cases for a definition."""
-    cases: list[Case[LinkProbe]] = list(IDENTIFIERS.cases)
-    cases.extend(_telemetry_case(row) for row in icd.telemetry.values())
-    for row in icd.telecommands.values():
-        cases.extend(_length_cases(row))
-        cases.extend(_field_cases(row))
-    for parameter in icd.parameters.values():
-        cases.extend(_parameter_cases(parameter))
-    return cases
+def _case(
+    area: str, name: str, title: str, run: Run, clause: str | Row, *, intrusive: bool = False
+) -> Case[LinkProbe]:
+    return Case(
+        f"{area}.{name}",
+        area,
+        title,
+        clause_of(clause) if isinstance(clause, Row) else clause,
+        run,
+        intrusive,
+    )
 
 
 # --- row IDs ---
 
 
-@IDENTIFIERS.case("telemetry", "each unknown telemetry ID is refused with code 1")
-def unknown_telemetry(probe: LinkProbe) -> None:
-    for row_id in range(128, 256):
-        if row_id not in probe.icd.telemetry_by_id:
-            probe.expect_refusal(row_id, b"", INVALID_ID)
+def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
+    """Yield a case for each class, or for each kind where IDs tell them apart."""
+    groups: dict[str, tuple[str, range]] = {
+        item.name: (item.name, range(highest + 1)) for item in unit.classes if item.code is not None
+    }
+    if not groups and unit.first_telemetry_id is not None:
+        first = unit.first_telemetry_id
+        groups = {"telemetry": ("", range(first, highest + 1)), "telecommands": ("", range(first))}
+    for name, (klass, numbers) in (groups or {"unknown": ("", range(highest + 1))}).items():
+        known = {row.id for row in unit.rows if row.klass == klass or not klass}
+        unknown = [number for number in numbers if number not in known]
+        if klass:  # every class has all numbers: those beside its rows, and both ends
+            near = {row_id + step for row_id in known for step in (-1, 1)} | {0, highest}
+            unknown = sorted(near & set(unknown))
+
+        def run(probe: LinkProbe, klass: str = klass, unknown: list[int] = unknown) -> None:
+            for row_id in unknown:
+                probe.expect_refusal(row_id, b"", INVALID_ID, klass)
+
+        title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
+        yield _case("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
-@IDENTIFIERS.case("telecommands", "each unknown telecommand is refused with code 1", intrusive=True)
-def unknown_telecommands(probe: LinkProbe) -> None:
-    for row_id in range(128):
-        if row_id not in probe.icd.telecommands_by_id:
-            probe.expect_refusal(row_id, b"", INVALID_ID)
-            probe.expect_refusal(row_id, b"\x01\x02", INVALID_ID)
+def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    def with_data(probe: LinkProbe) -> None:
+        for row in probe.unit.telemetry.values():
+            if probe.distinguishes_refusal(row):
+                probe.expect_refusal(row, b"\x00", INVALID_LENGTH)
+
+    title = "a telemetry request with data is refused for its length"
+    yield _case("identifiers", "telemetry-with-data", title, with_data, rule(5))
+    beyond = b"\0\0" if unit.telecommand_crc else b"\0"
+    for row in unit.telecommands.values():
+        whole = row.encode()
+        tried = {
+            "long": whole + beyond,
+            "short": whole[:-1] if row.size else None,
+            "empty": b"" if row.size > 1 else None,
+        }
+        for why, data in tried.items():
+            if data is not None:
+                title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
+                run = _refused(row, data, INVALID_LENGTH)
+                yield _case("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
 
 
-@IDENTIFIERS.case("telemetry-with-data", "a telemetry request with data is refused for its length", rule(5))
-def telemetry_with_data(probe: LinkProbe) -> None:
-    for row in probe.icd.telemetry.values():
-        if probe.tells_refusal(row):
-            probe.expect_refusal(row.id, b"\x00", INVALID_LENGTH)
+def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run:
+    def run(probe: LinkProbe) -> None:
+        probe.expect_refusal(row, data, error)
+        probe.check_reported(row.id, error, index)
+
+    return run
 
 
 # --- telemetry ---
 
 
-def _telemetry_case(row: Row) -> Case[LinkProbe]:
-    def run(probe: LinkProbe) -> None:
+def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
+    def read_twice(probe: LinkProbe) -> None:
         for _ in range(2):
-            checked_values(row, probe.data_of(row))
+            probe.values(row)
 
     title = f"{row.name} has {row.size} bytes and values within their limits"
-    return Case(f"telemetry.{row.name}", "telemetry", title, clause_of(row), run)
+    yield _case("telemetry", row.name, title, read_twice, row)
+    bound = {item.value: name for name, item in row.named.items() if item.value}
+    if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
+        title = f"{row.name} has a quaternion of length 1 if it is valid"
+        changes_mode = any(item.action == "set_mode" for item in unit.telecommands.values())
+        yield _case("attitude", row.name, title, _unit_length(unit, row, bound), row, intrusive=changes_mode)
 
 
-# --- telecommands: length ---
-
-
-def _length_cases(row: Row) -> Iterator[Case[LinkProbe]]:
-    whole = row.encode(row.example())
-
-    def refused(data: bytes, why: str) -> Case[LinkProbe]:
-        def run(probe: LinkProbe) -> None:
-            probe.expect_refusal(row.id, data, INVALID_LENGTH)
-            acknowledge = probe.telemetry("acknowledge")
-            check_equal(acknowledge["last_telecommand"], row.id, "last telecommand")
-            check_equal(acknowledge["error"], "invalid_length", "its error")
-
-        title = f"{row.name} with {len(data)} bytes ({why}) is refused with code 2"
-        return Case(
-            f"lengths.{row.name}.{why}", "lengths", title, f"{CODES}; {clause_of(row)}", run, intrusive=True
-        )
-
-    yield refused(whole + b"\0\0", "long")
-    if row.size > 0:
-        yield refused(whole[:-1], "short")
-    if row.size > 1:
-        yield refused(b"", "empty")
-
-
-# --- telecommands: fields ---
-
-
-def _field_cases(row: Row) -> Iterator[Case[LinkProbe]]:
-    for index, (name, field) in enumerate(row.named_fields.items()):
-        for why, data in bad_values(row, field):
-            yield _bad_field_case(row, name, index, why, data)
-
-
-def bad_values(row: Row, field: Field) -> Iterator[tuple[str, bytes]]:
-    """Yield data of a telecommand with one field outside its limits."""
-    good = bytearray(row.encode(row.example()))
-
-    def with_raw(raw: bytes) -> bytes:
-        return bytes(good[: field.offset] + raw + good[field.offset + field.size :])
-
-    if field.kind == "float":
-        form = field.slot.format
-        yield "nan", with_raw(struct.pack(form, math.nan))
-        yield "infinite", with_raw(struct.pack(form, math.inf))
-        low, high = field.physical_limits
-        step = max(abs(low), abs(high), 1.0)
-        if field.minimum is not None:
-            yield "low", with_raw(struct.pack(form, low - 0.1 * step))
-        if field.maximum is not None:
-            yield "high", with_raw(struct.pack(form, high + 0.1 * step))
-    elif field.kind == "enum" and not field.width:
-        known = field.enum.values.values() if field.enum is not None else ()
-        unknown = next(number for number in range(255, -1, -1) if number not in known)
-        yield "unknown", with_raw(unknown.to_bytes(field.size, field.slot.order))
-    elif field.kind == "integer":
-        signed = field.type.startswith("i")
-        low_raw, high_raw = field.raw_limits
-        bits = 8 * field.size
-        least, greatest = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
-        if low_raw > least:
-            yield "low", with_raw((low_raw - 1).to_bytes(field.size, field.slot.order, signed=signed))
-        if high_raw < greatest:
-            yield "high", with_raw((high_raw + 1).to_bytes(field.size, field.slot.order, signed=signed))
-
-
-def _bad_field_case(row: Row, name: str, index: int, why: str, data: bytes) -> Case[LinkProbe]:
+def _unit_length(unit: Unit, row: Row, bound: dict[str, str]) -> Run:
     def run(probe: LinkProbe) -> None:
-        probe.expect_refusal(row.id, data, INVALID_PARAMETER)
-        acknowledge = probe.telemetry("acknowledge")
-        check_equal(acknowledge["error"], "invalid_parameter", "error in acknowledge")
-        check_equal(acknowledge["parameter_index"], index, "index of the refused field")
+        with identifying_stars(probe, unit):
+            end = probe.now() + ATTITUDE_S
+            while not is_valid((seen := probe.values(row))[bound["attitude.valid"]]):
+                if probe.now() > end:
+                    raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
+                probe.sleep(0.1)
+        check_unit_length(row, seen, bound)
 
-    title = f"{row.name} with {name} {why} is refused with code 3 and the index of the field"
-    clause = f"{CODES}; {clause_of(row)}"
-    return Case(f"fields.{row.name}.{name}.{why}", "fields", title, clause, run, intrusive=True)
-
-
-# --- parameters ---
+    return run
 
 
-def _parameter_cases(parameter: Parameter) -> Iterator[Case[LinkProbe]]:
-    clause = f"configs/units/cubestar parameter {parameter.name}; {rule(19)}"
+def check_unit_length(row: Row, seen: dict[str, Value], bound: dict[str, str]) -> None:
+    """Fail the case unless the quaternion of a row has length 1, to the resolution of its fields."""
+    step = max(abs(row.named[bound[name]].scale) for name in QUATERNION)
+    length = sum(float(seen[bound[name]]) ** 2 for name in QUATERNION) ** 0.5
+    tolerance = 1e-5 + (2.0 * step if step < 1.0 else 0.0)
+    check(abs(length - 1.0) < tolerance, "a quaternion of length 1", f"{length:.7f}")
 
-    def limits(probe: LinkProbe) -> None:
-        seen = probe.parameter(parameter.name)
-        check_equal(seen["parameter"], parameter.id, "number")
-        for key, wanted in (("minimum", parameter.minimum), ("maximum", parameter.maximum)):
-            check_equal(seen[key], float(wanted), key)
-        value = float(seen["value"])
-        check(
-            _within(value, parameter), f"a value within {parameter.minimum:g} to {parameter.maximum:g}", value
+
+def is_valid(value: Value) -> bool:
+    """Return whether a field reports a valid attitude: a flag or a number."""
+    return str(value).lower() in ("true", "1")
+
+
+@contextmanager
+def identifying_stars(probe: LinkProbe, unit: Unit) -> Iterator[None]:
+    """Have the unit identify stars, if a telecommand starts this; restore the mode afterwards."""
+    found = [
+        (row, name, str(reported.name), key)
+        for row in unit.telecommands.values()
+        for name, item in row.named.items()
+        if row.action == "set_mode" and item.argument == "mode"
+        for reported in unit.telemetry.values()
+        for key, field in reported.named.items()
+        if field.value == "mode"
+    ]
+    if not found:
+        yield
+        return
+    command, field_name, reporting, key = found[0]
+    before = probe.telemetry(reporting)[key]
+    probe.command(command.name, **{field_name: "lost_in_space"})
+    try:
+        yield
+    finally:
+        probe.command(command.name, **{field_name: "lost_in_space" if before == "tracking" else before})
+
+
+# --- quantities in several rows ---
+
+
+def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    """Yield the case for numbers that several fields report: the layouts differ, the values must not."""
+    places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
+    for row in unit.telemetry.values():
+        for name, item in row.named.items():
+            if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
+                places.setdefault((item.value, item.unit), []).append((row, name))
+    shared = {
+        quantity: found for quantity, found in places.items() if len({_layout(*place) for place in found}) > 1
+    }
+    if not shared:
+        return
+
+    def run(probe: LinkProbe) -> None:
+        with identifying_stars(probe, unit):
+            probe.sleep(SETTLING_S)
+            for (quantity, _unit), (first, *others) in shared.items():
+                for other in others:
+                    _compare(probe, quantity, first, other)
+
+    title = "numbers that several fields report agree within the resolution of the fields"
+    yield _case(
+        "agreement", "rows", title, run, "[[telemetry]]: fields with the same `value`", intrusive=True
+    )
+
+
+def _layout(row: Row, name: str) -> tuple[object, ...]:
+    item = row.named[name]
+    return item.type, item.order, item.scale, item.bias, item.width
+
+
+def _compare(probe: LinkProbe, quantity: str, one: tuple[Row, str], other: tuple[Row, str]) -> None:
+    """Compare two fields between two readings of the first that agree; skip a quantity that never rests."""
+    for _ in range(RESTING):
+        before, seen, after = (probe.values(row)[name] for row, name in (one, other, one))
+        if before == after:
+            break
+    else:
+        return
+    first, second = (row.named[name] for row, name in (one, other))
+    whole = "float" not in (first.kind, second.kind)
+    alike = whole and (first.scale, first.bias) == (second.scale, second.bias)
+    numbers = (first, float(after)), (second, float(seen))
+    margin = 0.0 if alike else sum(_resolution(item, number) for item, number in numbers)
+    what = f"{quantity} in {other[0].name}.{other[1]} and {one[0].name}.{one[1]} alike, to {margin:.2g}"
+    # a number beyond the limits of one field is sent as the nearest limit, and known only from the other
+    for (item, number), (against, found) in (numbers, numbers[::-1]):
+        low, high = item.limits
+        if low < number < high:
+            nearest = min(max(number, against.limits[0]), against.limits[1])
+            check(abs(found - nearest) <= margin, what, f"{float(seen):.9g} and {float(after):.9g}")
+
+
+def _resolution(item: Field, number: float) -> float:
+    return F32_ROUNDING * abs(number) if item.kind == "float" else 0.51 * abs(item.scale)
+
+
+# --- telecommands ---
+
+
+def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
+    own = unit.plugin.actions if unit.plugin is not None else ()
+    for row in unit.telecommands.values():
+        if row.action in (None, "nothing") or row.action in own:
+            title = f"{row.name} is accepted"
+            yield _case("commands", row.name, title, _accepted(row), row, intrusive=True)
+    for row in unit.telemetry.values():
+        source = next((item.telecommand for item in row.named.values() if item.telecommand), None)
+        if source is not None and unit.telecommands[source].action in (None, "nothing"):
+            title = f"{row.name} reports the bytes set by {source}"
+            run = _read_back(unit.telecommands[source], row, marks)
+            yield _case("settings", row.name, title, run, row, intrusive=True)
+
+
+def _accepted(row: Row) -> Run:
+    """Send plain values, and both limits of each number if the row has no effect."""
+
+    def run(probe: LinkProbe) -> None:
+        probe.send_command(row, row.encode())
+        for name, item in row.named.items() if row.action == "nothing" else ():
+            for limit, given in zip(
+                item.limits if item.kind in ("integer", "float") else (),
+                (item.minimum, item.maximum),
+                strict=False,
+            ):
+                if given is not None:
+                    probe.send_command(row, row.encode({name: limit}))
+
+    return run
+
+
+def _read_back(command: Row, row: Row, marks: bytes) -> Run:
+    def run(probe: LinkProbe) -> None:
+        before = probe.data_of(row)
+        rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
+        for turn in range(3):
+            data = command.encode(
+                {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
+            )
+            probe.send_command(command, data)
+            check_equal(probe.data_of(row), data, f"the bytes of {command.name}")
+        probe.send_command(command, before)
+
+    return run
+
+
+# --- subscriptions and floods ---
+
+
+def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    for row in unit.telecommands.values():
+        fields = [name for name, item in row.named.items() if (item.argument or "").startswith("telemetry[")]
+        klass = str(row.arguments.get("class", ""))
+        offered = [item for item in unit.telemetry.values() if klass in ("", item.klass)][:2]
+        if row.action == "subscribe" and fields and offered:
+            title = f"{row.name} starts and stops unsolicited telemetry"
+            yield _case(
+                "subscriptions", row.name, title, _subscribed(row, fields, offered), row, intrusive=True
+            )
+
+
+def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
+    none = dict.fromkeys(fields, 0)
+
+    def run(probe: LinkProbe) -> None:
+        chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
+        probe.send_command(command, command.encode(chosen))
+        seen = probe.receive_unsolicited(SUBSCRIBED_S)
+        probe.send_command(command, command.encode(none))
+        probe.sleep(0.5)
+        wanted = {(row.id, row.size) for row in offered[: len(fields)]}
+        check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
+        check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
+        check_equal(
+            {answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes"
         )
+        for answer in seen:
+            checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
+        check_equal(len(probe.receive_unsolicited(2.0)), 0, "messages after the end of the subscription")
 
-    def refusals(probe: LinkProbe) -> None:
-        before = probe.value_of(parameter.name)
-        row = probe.icd.telecommands["set_parameter"]
-        for bad in _outside(parameter):
-            data = row.encode({"parameter": parameter.id, "value": bad}, check=False)
-            answer = probe.ask(row.id, data)
-            if answer.kind == "ack":
-                probe.set_parameter(parameter.name, before)
-            refused = answer.kind == "nack" and answer.code == INVALID_PARAMETER
-            check(refused, f"{bad:g} refused with code 3", answer)
-            check_equal(probe.value_of(parameter.name), before, "unchanged value")
-
-    def values(probe: LinkProbe) -> None:
-        partner, room = PARTNERS.get(parameter.name, (parameter.name, None))
-        with probe.parameters_kept(parameter.name, partner):
-            if room is not None:
-                probe.set_parameter(partner, room)
-            for good in _inside(parameter, probe.value_of(parameter.name)):
-                probe.set_parameter(parameter.name, good)
-                seen = float(probe.telemetry("parameter")["value"])
-                same = abs(seen - good) <= F32_ROUNDING * max(abs(good), 1e-30)
-                check(same, f"{parameter.name} {good!r}", f"{seen!r}")
-
-    name = parameter.name
-    for check_name, title, run in (
-        ("limits", f"{name} reports its ID and limits", limits),
-        ("refusals", f"{name} outside its limits is refused and unchanged", refusals),
-        ("values", f"{name} accepts its smallest and largest value", values),
-    ):
-        yield Case(f"parameters.{name}.{check_name}", "parameters", title, clause, run, intrusive=True)
+    return run
 
 
-def _within(value: float, parameter: Parameter) -> bool:
-    slack = F32_ROUNDING * max(abs(parameter.minimum), abs(parameter.maximum))
-    return parameter.minimum - slack <= value <= parameter.maximum + slack
-
-
-def _whole(parameter: Parameter) -> bool:
-    return parameter.type not in ("f32", "f64")
-
-
-def _outside(parameter: Parameter) -> list[float]:
-    """Yield values that a parameter must refuse."""
-    step = 1.0 if _whole(parameter) else max(1.0, abs(parameter.maximum)) * 0.01
-    bad = [parameter.minimum - step, parameter.maximum + step, math.nan, math.inf, -math.inf]
-    if _whole(parameter):
-        bad.append(parameter.minimum + 0.5)
-    if parameter.enum is not None:
-        numbers = range(int(parameter.minimum), int(parameter.maximum))
-        bad += [float(gap) for gap in sorted(set(numbers) - set(parameter.enum.values.values()))]
-    return bad
-
-
-def _inside(parameter: Parameter, present: float) -> list[float]:
-    """Yield values that a parameter must accept."""
-    if parameter.name in LINK_PARAMETERS:
-        return [present]
-    if parameter.enum is not None:
-        return [float(number) for number in parameter.enum.values.values()]
-    greatest = [] if parameter.name in UNSET else [parameter.maximum]
-    return [parameter.minimum, *greatest, parameter.to_number(parameter.default)]
+def _flood(probe: LinkProbe) -> None:
+    rows = sorted(probe.unit.telemetry.values(), key=lambda row: row.size)[:2]
+    for number in range(FLOOD):
+        probe.post(rows[number % len(rows)])
+    for number in range(FLOOD):
+        probe.expect_telemetry(rows[number % len(rows)], 2.0)

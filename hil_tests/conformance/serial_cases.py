@@ -1,180 +1,402 @@
-"""Serial conformance: framing, stuffing, reply formats, time-outs and pace."""
+"""Conformance on the serial line: framing, check, header, echoes, pace and recovery, for the link of any unit.
+
+The cases of a CubeSpace line are a table of bytes; those of a composed line change one part of a message that the
+judge has written.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+import random
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, Final
 
-from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal, rule
-from starhil.hil_tests.conformance.link_probe import (
-    INVALID_ID,
-    INVALID_LENGTH,
-    INVALID_PARAMETER,
-    LONG_PAUSE_S,
+from starhil.hil_tests.conformance.case import (
+    Case,
+    CaseArea,
+    CaseFailed,
+    CaseSkipped,
+    check,
+    check_equal,
+    rule,
 )
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
+from starhil.hil_tests.conformance.row_cases import CLOCK_S, clause_of, row_cases
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.wire_tables import (
-    Exchange,
-    FlagRow,
-    add_exchange_cases,
-    add_flag_cases,
-    check_flags,
-)
+from starhil.hil_tests.conformance.wire_tables import Exchange, add_exchange_cases, filled
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.headers import Header
+from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.serial import Headed, SerialLine
 
+CLAUSE: Final = "[link.serial]"
+CUBESPACE: Final = "serial framing 1F 7F … 1F FF (libCubeObc, AlbertaSat adcs_io.c)"
+STUFFING: Final = "1F in the data is doubled (libCubeObc, CTS)"
 REPLIES: Final = "reply formats: a AlbertaSat, b RADSAT, c libCubeObc"
-
+DEFAULT_MAX_SIZE: Final = 512
+"""Longest message that a receiver accepts, unless the definition or a row asks for more."""
 SHORT_PAUSE_S: Final = 0.1
 CLOCK_GRAIN_S: Final = 1e-4
-LONGEST_MESSAGE: Final = 512
 
-FRAMING: Final = CaseArea[SerialProbe](
-    "framing", "serial framing 1F 7F … 1F FF (libCubeObc, AlbertaSat adcs_io.c)"
-)
-STUFFING: Final = CaseArea[SerialProbe](
-    "stuffing", "1F in the data is doubled (libCubeObc, CTS)", intrusive=True
-)
-ERRORS: Final = CaseArea[SerialProbe](
-    "errors",
-    "configs/units/cubestar: communication_status 144, link errors are flagged and otherwise ignored",
-    intrusive=True,
-)
-TIMING: Final = CaseArea[SerialProbe]("timing", "8N1: ten bits a byte")
+Run = Callable[[SerialProbe], None]
 
-READ: Final = "1F 7F 80 1F FF"
-"""Request for identification."""
 
+def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
+    """Yield the cases for a unit with a serial link."""
+    line = SerialLine(unit)
+    yield from _framing(line)
+    highest = 255
+    if line.dialect is not None:
+        yield from _cubespace(unit)
+    envelope = line.envelope
+    if isinstance(envelope, Headed):
+        yield from _check(envelope)
+        yield from _header(unit, envelope)
+        yield from _clock(unit, envelope.replies)
+        highest = _highest_id(unit)
+    yield from _echoes(unit)
+    yield _case(
+        "timing", "pace", "a long reply takes at least its time on the line", pace, "8N1: ten bits a byte"
+    )
+    yield from row_cases(
+        unit, lengths=unit.serial.framing.kind != "fixed", marks=line.framing.marks, highest_id=highest
+    )
+    yield _case("recovery", "noise", "after noise and a pause the next request is answered", noise, rule(9))
+
+
+def _case(
+    area: str, name: str, title: str, run: Run, clause: str = CLAUSE, *, intrusive: bool = False
+) -> Case[SerialProbe]:
+    return Case(f"{area}.{name}", area, title, clause, run, intrusive)
+
+
+def _highest_id(unit: Unit) -> int:
+    """Return the highest ID that the bits of the request header hold, or 255."""
+    bits = [bit.width for item in unit.serial.request_header for bit in item.bits if bit.role == "id"]
+    return (1 << bits[0]) - 1 if bits else 255
+
+
+# --- framing ---
+
+
+def _asked(probe: SerialProbe, times: int = 1) -> bytes:
+    """Return the bytes of a request for the lively row, which is expected to be answered."""
+    request = probe.unit.request(probe.lively)
+    for _ in range(times):
+        probe.line.expect(request)
+    return probe.line.encode(request) * times
+
+
+def _answered(probe: SerialProbe, times: int = 1) -> None:
+    for _ in range(times):
+        probe.expect_telemetry(probe.lively)
+    probe.expect_silence("no more was requested")
+
+
+def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
+    marks = line.framing.marks
+    plain = bytes(byte for byte in range(0x20, 0x60) if byte not in marks)
+    clause = CLAUSE if line.dialect is None else CUBESPACE
+
+    def one(probe: SerialProbe) -> None:
+        probe.send(_asked(probe))
+        _answered(probe)
+
+    def two(probe: SerialProbe) -> None:
+        probe.send(_asked(probe, 2))
+        _answered(probe, 2)
+
+    def bytewise(probe: SerialProbe) -> None:
+        for byte in _asked(probe):
+            probe.send(bytes((byte,)))
+            probe.sleep(0.005)
+        _answered(probe)
+
+    def junk(probe: SerialProbe) -> None:
+        probe.send(plain[:9])
+        probe.sleep_past_timeout()
+        probe.drain()
+        one(probe)
+
+    def half(probe: SerialProbe) -> None:
+        whole = probe.line.encode(probe.unit.request(probe.lively))
+        probe.send(whole[: len(whole) // 2])
+        probe.sleep_past_timeout()
+        probe.send(whole[len(whole) // 2 :])
+        probe.expect_silence("the message has timed out")
+        probe.sleep_past_timeout()
+        probe.expect_alive()
+
+    def overlong(probe: SerialProbe) -> None:
+        size = probe.unit.serial.max_size or max(DEFAULT_MAX_SIZE, *(row.size for row in probe.unit.rows))
+        request = replace(probe.unit.request(probe.lively), data=plain[:1] * (size + 64))
+        probe.send(probe.line.encode(request))
+        probe.expect_silence("the message was too long")
+        probe.sleep_past_timeout()
+        probe.expect_alive()
+
+    def form(probe: SerialProbe) -> None:
+        sent = _asked(probe)
+        probe.send(sent)
+        answer = probe.expect_telemetry(probe.lively)
+        probe.sleep(probe.times.quiet_s)
+        echo = sent if "echo" in probe.lively.answers else b""
+        whole = echo + probe.line.framing.encode(answer.body)
+        if probe.dialect == "c":
+            whole = whole.replace(b"\x1f\x7f", b"\x1f\x07", 1)
+        end = (
+            marks[:1] if probe.unit.serial.framing.kind == "slip" else b""
+        )  # which may be omitted before a frame
+        check_equal(probe.raw.strip(end), whole.strip(end), "bytes")
+
+    yield _case("framing", "one", "a request is answered once", one, clause)
+    yield _case("framing", "reply-form", "a reply is one frame without extra bytes", form, clause)
+    yield _case(
+        "framing", "two-at-once", "two requests sent together are both answered, in order", two, clause
+    )
+    yield _case("framing", "byte-by-byte", "a request may be sent byte by byte", bytewise, clause)
+    yield _case("framing", "junk", "bytes that are not a message are ignored", junk, clause)
+    yield _case("framing", "half", "an incomplete message is dropped after a time-out", half, rule(2))
+    yield _case(
+        "framing",
+        "overlong",
+        "a message that is too long is dropped, and the next one answered",
+        overlong,
+        rule(4),
+    )
+
+
+READ: Final = "1F 7F {row} 1F FF"
+"""Request for the lively row; {id} is its ID as a decimal number, {other} and {other_id} another one's."""
 
 EXCHANGES: Final = (
-    Exchange("one", "a request is answered once", (READ,), ("128",)),
-    Exchange("two-at-once", "two requests sent together are both answered, in order", (READ + "1F 7F E6 1F FF",), ("128", "230")),
-    Exchange("twenty-at-once", "twenty requests sent together are all answered", (READ * 20,), ("128",) * 20),
-    Exchange("byte-by-byte", "a request may be sent byte by byte", ("1F", "7F", "80", "1F", "FF"), ("128",), pause_s=0.005),
-    Exchange("cut-in-escape", "a request may be split after 1F", ("1F", "7F 80 1F", "FF"), ("128",), pause_s=0.02),
-    Exchange("pause", "a pause of 0.1 s within a request has no effect", ("1F 7F", "80 1F FF"), ("128",), pause_s=SHORT_PAUSE_S, clause=rule(1)),
-    Exchange("junk-before", "bytes before a request are ignored", ("00 55 AA FF" + READ,), ("128",)),
-    Exchange("junk-between", "bytes between requests are ignored", (READ + "00 FF 7F" + READ,), ("128", "128")),
-    Exchange("junk-after", "bytes after a request do not affect the next one", (READ + "42", READ), ("128", "128"), pause_s=0.02),
-    Exchange("escape-before", "a single 1F before a request is ignored", ("1F" + READ,), ("128",)),
-    Exchange("escapes-before", "several 1F before a request are ignored", ("1F 1F 1F" + READ,), ("128",)),
-    Exchange("junk-escape", "1F and a meaningless byte before a request are ignored", ("1F 00" + READ,), ("128",)),
+    Exchange("two-rows", "requests for two rows sent together are answered in order", (READ + "1F 7F {other} 1F FF",), ("{id}", "{other_id}")),
+    Exchange("twenty-at-once", "twenty requests sent together are all answered", (READ * 20,), ("{id}",) * 20),
+    Exchange("cut-in-escape", "a request may be split after 1F", ("1F", "7F {row} 1F", "FF"), ("{id}",), pause_s=0.02),
+    Exchange("pause", "a pause of 0.1 s within a request has no effect", ("1F 7F", "{row} 1F FF"), ("{id}",), pause_s=SHORT_PAUSE_S, clause=rule(1)),
+    Exchange("junk-before", "bytes before a request are ignored", ("00 55 AA FF" + READ,), ("{id}",)),
+    Exchange("junk-between", "bytes between requests are ignored", (READ + "00 FF 7F" + READ,), ("{id}", "{id}")),
+    Exchange("junk-after", "bytes after a request do not affect the next one", (READ + "42", READ), ("{id}", "{id}"), pause_s=0.02),
+    Exchange("escape-before", "a single 1F before a request is ignored", ("1F" + READ,), ("{id}",)),
+    Exchange("escapes-before", "several 1F before a request are ignored", ("1F 1F 1F" + READ,), ("{id}",)),
+    Exchange("junk-escape", "1F and a meaningless byte before a request are ignored", ("1F 00" + READ,), ("{id}",)),
     Exchange("end-alone", "an end mark without a start is not answered", ("1F FF",)),
-    Exchange("end-before", "an end mark before a request is ignored", ("1F FF" + READ,), ("128",)),
+    Exchange("end-before", "an end mark before a request is ignored", ("1F FF" + READ,), ("{id}",)),
     Exchange("start-alone", "a start mark alone is not answered", ("1F 7F",)),
-    Exchange("starts", "a second start mark restarts the message", ("1F 7F" + READ,), ("128",)),
-    Exchange("cut-off", "a message interrupted by another is dropped, and the other answered", ("1F 7F E6" + READ,), ("128",)),
-    Exchange("cut-off-data", "a message with data that is interrupted by another is dropped", ("1F 7F 02 11 22 33" + READ,), ("128",)),
+    Exchange("starts", "a second start mark restarts the message", ("1F 7F" + READ,), ("{id}",)),
+    Exchange("cut-off", "a message interrupted by another is dropped, and the other answered", ("1F 7F {other}" + READ,), ("{id}",)),
+    Exchange("cut-off-data", "a message with data that is interrupted by another is dropped", ("1F 7F 02 11 22 33" + READ,), ("{id}",)),
     Exchange("empty", "a message without an ID is not answered", ("1F 7F 1F FF",)),
-    Exchange("empty-then-good", "a request after an empty message is answered", ("1F 7F 1F FF" + READ,), ("128",)),
-    Exchange("bad-escape", "a bad escape within a message aborts it without effect", ("1F 7F 80 1F 00",), clause=rule(3)),
-    Exchange("bad-escape-then-good", "a request after a bad escape is answered", ("1F 7F 80 1F 00" + READ,), ("128",), clause=rule(3)),
-    Exchange("start-of-ack", "1F 07 is the start of a reply, not of a request", ("1F 07 80 1F FF",), clause=REPLIES),
-    Exchange("start-of-nack", "1F 0F is the start of a reply, not of a request", ("1F 0F 80 1F FF",), clause=REPLIES),
-    Exchange("start-of-event", "1F 2F is the start of an event, not of a request", ("1F 2F 80 1F FF",), clause=REPLIES),
-    Exchange("start-of-unsolicited", "1F 4F is the start of unsolicited telemetry, not of a request", ("1F 4F 80 1F FF",), clause=REPLIES),
-    Exchange("half", "an incomplete message is dropped after a time-out", ("1F 7F 80", "1F FF"), pause_s=LONG_PAUSE_S, clause=rule(2)),
-    Exchange("overlong", "a message that is too long is dropped, and the next one answered", ("1F 7F 80" + "00" * 4 * LONGEST_MESSAGE + "1F FF",), clause=rule(4)),
+    Exchange("empty-then-good", "a request after an empty message is answered", ("1F 7F 1F FF" + READ,), ("{id}",)),
+    Exchange("bad-escape", "a bad escape within a message aborts it without effect", ("1F 7F {row} 1F 00",), clause=rule(3)),
+    Exchange("bad-escape-then-good", "a request after a bad escape is answered", ("1F 7F {row} 1F 00" + READ,), ("{id}",), clause=rule(3)),
+    Exchange("start-of-ack", "1F 07 is the start of a reply, not of a request", ("1F 07 {row} 1F FF",), clause=REPLIES),
+    Exchange("start-of-nack", "1F 0F is the start of a reply, not of a request", ("1F 0F {row} 1F FF",), clause=REPLIES),
+    Exchange("start-of-event", "1F 2F is the start of an event, not of a request", ("1F 2F {row} 1F FF",), clause=REPLIES),
+    Exchange("start-of-unsolicited", "1F 4F is the start of unsolicited telemetry, not of a request", ("1F 4F {row} 1F FF",), clause=REPLIES),
     Exchange("noise", "noise is not answered", ("FF" * 64 + "00" * 64 + "7F" * 64,)),
     Exchange("escapes", "a run of 1F is not answered", ("1F" * 200,)),
     Exchange("ends", "a run of end marks is not answered", ("1F FF" * 100,)),
 )  # fmt: skip
-add_exchange_cases(FRAMING, EXCHANGES)
 
 
-@FRAMING.case("reply-form", "an answer has the format of its dialect, byte for byte", REPLIES)
-def reply_form(probe: SerialProbe) -> None:
-    probe.send(bytes.fromhex(READ))
-    probe.expecting(128)
-    data = probe.expect_telemetry(128)
-    body = data if probe.dialect == "b" else b"\x80" + data
-    start = b"\x1f\x07" if probe.dialect == "c" else b"\x1f\x7f"
-    whole = start + body.replace(b"\x1f", b"\x1f\x1f") + b"\x1f\xff"
-    seen = "".join(entry.split(" <- ")[1].replace(" ", "") for entry in probe.log if " <- " in entry)
-    check_equal(seen, whole.hex().upper(), "bytes")
+def _cubespace(unit: Unit) -> Iterator[Case[SerialProbe]]:
+    """Yield the cases of the framing `1F 7F … 1F FF` at its limits."""
+    first, second, *_ = sorted(unit.telemetry.values(), key=lambda row: row.size)
+    texts = {
+        "row": f"{first.id:02X}",
+        "id": str(first.id),
+        "other": f"{second.id:02X}",
+        "other_id": str(second.id),
+    }
+    area = CaseArea[SerialProbe]("framing", CUBESPACE)
+    add_exchange_cases(area, filled(EXCHANGES, texts))
+    yield from area.cases
+    title = "a message of 512 bytes is received and refused for its length"
+    yield _case("framing", "longest", title, longest, rule(4))
+    title = "ID 1F doubled is ID 31, which does not exist"
+    yield _case(
+        "stuffing",
+        "id",
+        title,
+        lambda probe: _refuses_31(probe, "1F 7F 1F 1F 1F FF"),
+        STUFFING,
+        intrusive=True,
+    )
+    # sent with data, because some senders stuff only the data
+    clause = "flight software differs: AlbertaSat, RADSAT"
+    run: Run = lambda probe: _refuses_31(probe, "1F 7F 1F 00 01 1F FF")  # noqa: E731
+    yield _case("stuffing", "id-single", "ID 1F not doubled is ID 31, too", run, clause, intrusive=True)
 
 
-@FRAMING.case("longest", "a message of 512 bytes is received and refused for its length", rule(4))
 def longest(probe: SerialProbe) -> None:
-    probe.expect_refusal(0x80, bytes(LONGEST_MESSAGE - 1), INVALID_LENGTH)
+    row = next(row for row in probe.unit.telemetry.values() if probe.distinguishes_refusal(row))
+    probe.expect_refusal(row, bytes(DEFAULT_MAX_SIZE - 1), INVALID_LENGTH)
 
 
-# --- stuffing ---
-
-
-def _expect_refusal_of(probe: SerialProbe, row_id: int, text: str, code: int) -> None:
+def _refuses_31(probe: SerialProbe, text: str) -> None:
     probe.send_text(text)
-    probe.expecting(row_id)
+    probe.expecting("31")
     answer = probe.next_answer()
+    code = probe.unit.code(INVALID_ID)
     check(answer.kind == "nack" and answer.code == code, f"refusal with code {code}", answer)
 
 
-@STUFFING.case("id", "ID 1F doubled is ID 31, which does not exist")
-def stuffed_id(probe: SerialProbe) -> None:
-    _expect_refusal_of(probe, 0x1F, "1F 7F 1F 1F 1F FF", INVALID_ID)
+# --- check ---
 
 
-@STUFFING.case(
-    "id-single",
-    "ID 1F not doubled is ID 31, too",
-    "flight software differs: AlbertaSat, RADSAT",
-)
-def single_id(probe: SerialProbe) -> None:
-    """Sent with data, because some senders stuff only the data."""
-    _expect_refusal_of(probe, 0x1F, "1F 7F 1F 00 01 1F FF", INVALID_ID)
+def _body(probe: SerialProbe) -> bytes:
+    return probe.line.envelope.body(probe.unit.request(probe.lively))
 
 
-@STUFFING.case("taken-out", "a doubled 1F is one byte of data")
-def unstuffed(probe: SerialProbe) -> None:
-    """Parameter 31 does not exist, so the device refuses its ID, not the length."""
-    row = probe.icd.telecommands["select_parameter"]
-    _expect_refusal_of(probe, row.id, f"1F 7F {row.id:02X} 1F 1F 1F FF", INVALID_PARAMETER)
+def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
+    size = envelope.check_size
+    if not size:
+        return
+
+    def silent(change: Callable[[bytes], Iterator[bytes]]) -> Run:
+        def run(probe: SerialProbe) -> None:
+            for body in change(_body(probe)):
+                probe.send(probe.line.framing.encode(body))
+            probe.expect_silence("the check is wrong")
+            probe.sleep_past_timeout()  # a length that was changed may announce more bytes
+            probe.drain()
+            probe.expect_alive()
+
+        return run
+
+    def flipped(body: bytes, bits: range) -> Iterator[bytes]:
+        for bit in bits:
+            damaged = bytearray(body)
+            damaged[bit // 8] ^= 1 << bit % 8
+            yield bytes(damaged)
+
+    def wrong(body: bytes) -> Iterator[bytes]:
+        return flipped(body, range(8 * (len(body) - size), 8 * len(body)))
+
+    def damaged(body: bytes) -> Iterator[bytes]:
+        return flipped(body, range(8 * (len(body) - size)))
+
+    def swapped(body: bytes) -> Iterator[bytes]:
+        yield body[:-size] + body[-size:][::-1]
+
+    def missing(body: bytes) -> Iterator[bytes]:
+        yield body[:-size]
+
+    yield _case("check", "wrong", "a message with a bit of the check flipped is not answered", silent(wrong))
+    if "header" in envelope.covers:
+        yield _case("check", "damaged", "a message with a bit flipped is not answered", silent(damaged))
+    yield _case("check", "missing", "a message without the check is not answered", silent(missing))
+    if size > 1:
+        title = "a check with its bytes in the other order is not accepted"
+        yield _case("check", "swapped", title, silent(swapped))
 
 
-@STUFFING.case("not-a-mark", "1F 1F FF within data is a byte 1F and a byte FF, not an end")
-def not_a_mark(probe: SerialProbe) -> None:
-    """The device refuses the length: three bytes instead of one for select_parameter."""
-    row = probe.icd.telecommands["select_parameter"]
-    _expect_refusal_of(probe, row.id, f"1F 7F {row.id:02X} 1F 1F FF 00 1F FF", INVALID_LENGTH)
+# --- header ---
 
 
-# --- errors are flagged ---
-
-PROTOCOL_ERROR: Final = frozenset({"uart_protocol_error"})
-INCOMPLETE: Final = frozenset({"uart_incomplete"})
-OVERLONG: Final = "1F 7F 80" + "00" * 600 + "1F FF"
-FLAGS: Final = (
-    FlagRow("junk", "bytes outside a message", ("00 55 AA",), PROTOCOL_ERROR),
-    FlagRow("empty", "a message without an ID", ("1F 7F 1F FF",), PROTOCOL_ERROR),
-    FlagRow("bad-escape", "a bad escape within a message", ("1F 7F 80 1F 00",), PROTOCOL_ERROR),
-    FlagRow("overlong", "a message that is too long", (OVERLONG,), PROTOCOL_ERROR),
-    FlagRow("cut-off", "a message interrupted by another", ("1F 7F 02 11 22",), INCOMPLETE, pause_s=None),
-    FlagRow("half", "an incomplete message", ("1F 7F 02 11 22",), INCOMPLETE, pause_s=LONG_PAUSE_S),
-)
-
-add_flag_cases(ERRORS, FLAGS)
+def _header(unit: Unit, envelope: Headed) -> Iterator[Case[SerialProbe]]:
+    for item in unit.serial.request_header:
+        if item.role == "address":
+            own = item.const if item.const is not None else item.default or 0
+            top = 1 << 8 * envelope.requests.place(item, "")[1] - 1 if item.classes is None else 1
+            values = [own ^ 1, own ^ top, 0 if own else 1]
+            yield _silent_header(envelope, "address", item, values, "another address")
+        elif item.role == "class":
+            codes = {klass.code for klass in unit.classes}
+            values = [code for code in range(256) if code not in codes][:8]
+            yield _silent_header(envelope, "class", item, values, "a class that the unit does not have")
+        elif item.role is None and item.const is not None:
+            yield _silent_header(envelope, "constant", item, [item.const ^ 1], "another constant")
 
 
-@ERRORS.case("none", "valid requests set no flag")
-def no_flag(probe: SerialProbe) -> None:
-    probe.command("clear_counters")
-    for _ in range(20):
+def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], what: str) -> Case[SerialProbe]:
+    def run(probe: SerialProbe) -> None:
+        klass = probe.lively.klass
+        header = _body(probe)[: envelope.requests.size(klass)]
+        offset, size = envelope.requests.place(item, klass)
+        for value in values:
+            piece = value.to_bytes(size, item.order or probe.unit.byte_order)
+            changed = header[:offset] + piece + header[offset + size :]
+            probe.send(probe.line.framing.encode(envelope.closed(changed, b"")))
+        probe.expect_silence(what)
+        probe.drain()
         probe.expect_alive()
-    probe.expecting(*[128] * 5)
-    probe.send(bytes.fromhex(READ) * 5)
-    for _ in range(5):
-        probe.expect_telemetry(128)
-    check_flags(probe, frozenset())
+
+    return _case("header", name, f"a message with {what} is not answered", run)
 
 
-# --- time ---
+def _clock(unit: Unit, replies: Header) -> Iterator[Case[SerialProbe]]:
+    row = next((row for row in unit.telemetry.values() if "time" in replies.roles(row.klass)), None)
+    for command in unit.telecommands.values():
+        names = {item.argument: name for name, item in command.named.items()}
+        if command.action == "set_clock" and "microseconds" in names and row is not None:
+            title = "the times in replies follow the clock after it was set"
+            run = _clock_runs(command, names["microseconds"], row)
+            yield _case("clock", command.name, title, run, clause_of(command), intrusive=True)
 
 
-@TIMING.case("pace", "a long reply takes at least its time on the line")
+def _clock_runs(command: Row, name: str, row: Row) -> Run:
+    def run(probe: SerialProbe) -> None:
+        def time_s() -> float:
+            probe.post(row)
+            return probe.expect_telemetry(row).time_s
+
+        def set_clock(seconds: float) -> None:
+            probe.command(command.name, **{name: command.named[name].physical(round(seconds * 1e6))})
+
+        before, began = time_s(), probe.now()
+        set_clock(CLOCK_S)
+        first = time_s()
+        probe.sleep(0.5)
+        second = time_s()
+        set_clock(before + probe.now() - began)
+        check(0 <= first - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", f"{first:.6f} s")
+        check(0.4 <= second - first <= 1.5, "half a second more", f"{second - first:.6f} s")
+
+    return run
+
+
+# --- echoes, time, noise ---
+
+
+def _echoes(unit: Unit) -> Iterator[Case[SerialProbe]]:
+    for row in unit.rows:
+        if "echo" in row.answers:
+            title = f"{row.name} is echoed byte for byte before any other answer"
+            yield _case("echo", row.name, title, _echoed(row), clause_of(row), intrusive=not row.is_telemetry)
+
+
+def _echoed(row: Row) -> Run:
+    def run(probe: SerialProbe) -> None:
+        data = b"" if row.is_telemetry else row.encode()
+        sent = probe.line.encode(probe.unit.request(row, data))
+        probe.ask(row, data)
+        check_equal(probe.raw[: len(sent)] or None, sent, "the echo")
+
+    return run
+
+
 def pace(probe: SerialProbe) -> None:
     if probe.baud is None:
         raise CaseSkipped("the pace is checked only with --baud, the bit rate of the line")
+    row = max(probe.unit.telemetry.values(), key=lambda row: row.size)
     begin = probe.now()
-    probe.post(211)
-    data = probe.expect_telemetry(211)
-    least = (len(data) + 4) * 10 / probe.baud
+    probe.post(row)
+    probe.expect_telemetry(row)
     seconds = probe.now() - begin
+    least = len(probe.raw) * 10 / probe.baud
     if seconds < least - CLOCK_GRAIN_S:
         raise CaseFailed(f"at least {least * 1e3:.2f} ms at {probe.baud} baud", f"{seconds * 1e3:.2f} ms")
+
+
+def noise(probe: SerialProbe) -> None:
+    rng = random.Random(7)  # noqa: S311 -- noise, not a secret
+    # without its start byte, bytes are no CubeSpace message; in other framings any mark may end or begin one
+    left_out = probe.line.framing.marks[1:2] if probe.dialect is not None else probe.line.framing.marks
+    for _ in range(20):
+        probe.send(bytes(byte for byte in rng.randbytes(200) if byte not in left_out))
+        probe.sleep(0.01)
+    probe.sleep_past_timeout()
+    probe.drain()
+    probe.expect_alive()

@@ -1,221 +1,159 @@
-"""The tester's side of a device on a serial line, in any of the three reply dialects."""
+"""The tester's side of a unit on a serial line."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from typing import Final
 
-from starhil.hil_tests.conformance.case import CaseFailed
-from starhil.hil_tests.conformance.link_probe import (
-    BURST_ID,
-    FIRST_TELEMETRY,
-    Answer,
-    LinkProbe,
-    ProbeTimes,
-    SerialWire,
-)
+from starhil.hil_tests.conformance.case import check
+from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
 from starhil.hil_tests.conformance.ports import Port
-from starhil.protocol.codec import Row
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Answer, Request
+from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.serial import SerialLine
 
-BURST_BODY: Final = 23
-"""Size of an ID, a packet number and 20 bytes of data."""
-
-GENERATION_2: Final = {0x07: "ack", 0x0F: "nack", 0x2F: "event", 0x4F: "unsolicited"}
-
-
-def framed(row_id: int, data: bytes = b"") -> bytes:
-    """Frame a request: 1F 7F, ID and data with each 1F doubled, 1F FF."""
-    return b"\x1f\x7f" + (bytes([row_id]) + data).replace(b"\x1f", b"\x1f\x1f") + b"\x1f\xff"
+PAUSE: Final = 1.6
+"""Silence after which a message has certainly timed out, as a multiple of the time-out."""
+SHOWN_BYTES: Final = 48
+"""Number of bytes shown in a line of the log."""
 
 
-class SerialProbe(SerialWire, LinkProbe):
-    """Talks to CubeStar over a serial port.
+class SerialProbe(LinkProbe):
+    """Talks to a unit over a serial port.
 
     Parameters
     ----------
     port
         The port.
-    icd
-        Rows and names.
+    unit
+        Definition of the unit.
     dialect
-        `a`, `b` or `c`.
+        Dialect of the answers, of a unit that has several.
     baud
-        Bit rate of the line, for the cases on its pace; None if unknown.
+        Bit rate of the line, for the case on its pace; None if unknown.
+
+    Attributes
+    ----------
+    raw
+        All bytes received since the last drain.
     """
+
+    link = "serial"
 
     def __init__(
         self,
         port: Port[bytes],
-        icd: InterfaceDefinition,
+        unit: Unit,
         *,
-        dialect: str = "b",
+        dialect: str | None = None,
         baud: int | None = None,
         times: ProbeTimes | None = None,
+        settings: Settings | None = None,
     ) -> None:
-        super().__init__(port, icd, times)
-        self.dialect = dialect
+        super().__init__(port, unit, times, settings)
+        self.line = SerialLine(unit, dialect)
+        self.dialect = self.line.dialect
         self.baud = baud
-        self._buffer = bytearray()
-        self._asked: list[int] = []
+        self.has_unsolicited = self.line.envelope.has_unsolicited
+        self.has_codes = self.line.envelope.has_codes
+        self.raw = b""
+        self._answers: deque[Answer] = deque()
+        self._unsolicited: list[Answer] = []
 
-    def answers(self, row_id: int) -> bool:
-        """Return whether the definition has an answer to a request on the serial line."""
-        row = self.icd.row_by_id(row_id)
-        serial = self.icd.link.serial
-        framing = None if serial is None else serial.framing
-        return row is None or row.name not in getattr(framing, "unanswered", ())
+    # --- the line ---
 
-    def tells_refusal(self, row: Row) -> bool:
-        """Return whether a refusal differs from the data, which in dialects a and b may be one byte as well."""
-        return self.dialect == "c" or row.size != 1
-
-    def post(self, row_id: int, data: bytes = b"") -> None:
-        """Send a request without waiting."""
-        if self.answers(row_id):
-            self.expecting(row_id)
-        self.send(framed(row_id, data))
-
-    def expecting(self, *answers: str | int) -> None:
-        """Record the requested rows in order, because answers in dialect b contain no ID."""
-        self._asked.extend(map(int, answers))
-
-    def expect_exactly(self, answer: str) -> None:
-        """Take the next answer, which must be the telemetry of the row with this ID."""
-        self.expect_telemetry(int(answer))
+    def send(self, data: bytes) -> None:
+        """Send raw bytes."""
+        self._note("->", data)
+        self.port.send(data)
 
     def send_text(self, text: str) -> None:
         """Send bytes written in hexadecimal."""
         self.send(bytes.fromhex(text))
+
+    def _note(self, way: str, data: bytes) -> None:
+        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
+        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
 
     def _receive(self, timeout_s: float) -> bool:
         data = self.port.receive(timeout_s)
         if data is None:
             return False
         self._note("<-", data)
-        self._buffer += data
+        self.raw += data
+        for answer in self.line.feed(data):
+            (self._unsolicited if answer.kind == "unsolicited" else self._answers).append(answer)
         return True
 
     def drain(self) -> None:
-        """Discard everything received."""
+        """Discard everything received and expected."""
         super().drain()
-        self._buffer.clear()
-        self._asked.clear()
+        self.raw = b""
+        self.line.clear()
+        self._answers.clear()
+        self._unsolicited.clear()
+
+    def sleep_past_timeout(self) -> None:
+        """Wait until an incomplete message has timed out."""
+        self.sleep(PAUSE * float(self.unit.serial.timeout))
+
+    # --- answers ---
+
+    def answers(self, row: Row) -> Sequence[str]:
+        """Return the answers of a row on the serial line."""
+        return () if row.name in self.unit.unanswered else row.answers
+
+    def can_refuse(self, klass: str) -> bool:
+        """Return whether answers of a class can express a refusal."""
+        return self.line.envelope.can_refuse(klass)
+
+    def distinguishes_refusal(self, row: Row) -> bool:
+        """Return whether a refusal differs from the data, which in dialects a and b may be one byte as well."""
+        return self.dialect not in ("a", "b") or row.size != 1
+
+    def expecting(self, *answers: str) -> None:
+        """Record the requested rows, given by their IDs, in order."""
+        for row_id in answers:
+            self.line.expect(self.unit.request(int(row_id)))
+
+    def expect_exactly(self, answer: str) -> None:
+        """Take the next answer, which must be the telemetry of the row with this ID."""
+        row = self.unit.row(self.unit.request(int(answer)))
+        check(row is not None, f"a row with ID {answer}", "none")
+        if row is not None:
+            self.expect_telemetry(row)
+
+    def post_request(self, request: Request, *, answered: bool = True) -> None:
+        """Send a request without waiting."""
+        row = self.unit.row(request)
+        if answered and (row is None or self.answers(row)):
+            self.line.expect(request)
+        self.send(self.line.encode(request))
+
+    def next_answer(self, timeout_s: float | None = None) -> Answer:
+        """Return the next unread answer; bytes without an end are a malformed one."""
+        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        while not self._answers and (left := end - self.now()) > 0:
+            self._receive(left)
+        return self._answers.popleft() if self._answers else self._rest()
+
+    def _rest(self) -> Answer:
+        """Return the bytes without an end, after which no answer is awaited any more."""
+        data = bytes(self.line.received)
+        self.line.clear()
+        return Answer("malformed", data=data) if data else Answer("none")
 
     def unexpected_answer(self, quiet_s: float) -> Answer:
         """Return an unexpected answer."""
         self.sleep(quiet_s)
-        while (packet := self._packet()) is not None:
-            answer = self._answer(*packet)
-            if answer.kind != "unsolicited":
-                return answer
-        return self._malformed() if self._buffer else Answer("none")
+        if self._answers:
+            return self._answers.popleft()
+        return self._rest() if self.line.received else Answer("none")
 
     def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that arrive within a time.
-
-        Anything else fails the case.
-        """
+        """Return the messages of unsolicited telemetry that arrive within a time."""
+        self._unsolicited.clear()
         self.sleep(seconds)
-        found = []
-        while (packet := self._packet()) is not None:
-            answer = self._answer(*packet)
-            if answer.kind != "unsolicited":
-                raise CaseFailed("nothing but unsolicited telemetry", str(answer))
-            found.append(answer)
-        return found
-
-    def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next unread answer."""
-        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
-        while True:
-            if (packet := self._packet()) is not None:
-                answer = self._answer(*packet)
-                if answer.kind != "unsolicited":
-                    return answer
-                continue
-            if len(self._buffer) >= 2 and not self._starts_well():
-                return self._malformed()
-            left = end - self.now()
-            if left <= 0 or not self._receive(left):
-                self._asked.clear()
-                return self._malformed() if self._buffer else Answer("none")
-
-    def _starts_well(self) -> bool:
-        starts = (0x7F, *GENERATION_2) if self.dialect == "c" else (0x7F,)
-        return self._buffer[0] == 0x1F and self._buffer[1] in starts
-
-    def _malformed(self) -> Answer:
-        data = bytes(self._buffer)
-        self._buffer.clear()
-        return Answer("malformed", data=data)
-
-    def _packet(self) -> tuple[int, bytes] | None:
-        """Remove a complete packet from the buffer; return its start byte and unstuffed body, or None."""
-        if len(self._buffer) < 2 or not self._starts_well():
-            return None
-        body = bytearray()
-        position = 2
-        while position < len(self._buffer):
-            byte = self._buffer[position]
-            if byte != 0x1F:
-                body.append(byte)
-                position += 1
-                continue
-            if position + 1 >= len(self._buffer):
-                return None
-            follower = self._buffer[position + 1]
-            if follower == 0xFF:
-                start = self._buffer[1]
-                del self._buffer[: position + 2]
-                return start, bytes(body)
-            if follower != 0x1F:
-                return -1, self._malformed().data
-            body.append(0x1F)
-            position += 2
-        return None
-
-    def _answer(self, start: int, body: bytes) -> Answer:
-        if start < 0 or (not body and self.dialect != "b"):
-            return Answer("malformed", data=body)
-        if start == 0x7F and len(body) == BURST_BODY and body[0] == BURST_ID and not self._expects(len(body)):
-            return Answer("burst", data=body[1:], row_id=BURST_ID)
-        if self.dialect == "c":
-            return self._answer_generation_2(start, body)
-        if self.dialect == "b":
-            if not self._asked:
-                return Answer("malformed", data=body)
-            return self._answer_generation_1(self._asked.pop(0), body, None)
-        if self._asked and self._asked[0] == body[0]:
-            self._asked.pop(0)
-        return self._answer_generation_1(body[0], body[1:], body[0])
-
-    def _expects(self, size: int) -> bool:
-        """Return whether the requested row has the size of a burst packet, in dialect b."""
-        row = self.icd.telemetry_by_id.get(self._asked[0]) if self._asked and self.dialect == "b" else None
-        return row is not None and row.size == size
-
-    def _answer_generation_1(self, row_id: int, data: bytes, seen: int | None) -> Answer:
-        """Interpret an answer of generation 1: telemetry, or one byte for an acknowledge or refusal."""
-        row = self.icd.telemetry_by_id.get(row_id)
-        if row is not None and len(data) == row.size:
-            return Answer("telemetry", data=data, row_id=seen)
-        is_telecommand = row_id < FIRST_TELEMETRY
-        if len(data) != 1:
-            return Answer("malformed" if is_telecommand else "telemetry", data=data, row_id=seen)
-        if data[0] == 0:
-            return Answer("ack" if is_telecommand else "malformed", data=data, row_id=seen)
-        return Answer("nack", code=data[0], row_id=seen)
-
-    def _answer_generation_2(self, start: int, body: bytes) -> Answer:
-        row_id, data = body[0], body[1:]
-        match GENERATION_2.get(start):
-            case "ack" if row_id >= FIRST_TELEMETRY:
-                return Answer("telemetry", data=data, row_id=row_id)
-            case "ack" if not data:
-                return Answer("ack", row_id=row_id)
-            case "nack" if len(data) == 1 and data[0]:
-                return Answer("nack", code=data[0], row_id=row_id)
-            case "unsolicited" | "event":
-                return Answer("unsolicited", data=data, row_id=row_id)
-            case _:
-                return Answer("malformed", data=body)
+        return list(self._unsolicited)

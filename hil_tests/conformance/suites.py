@@ -1,68 +1,88 @@
-"""All cases of a link, with IDs that begin with the name of the link."""
+"""All cases of a link: those that the definition of a unit yields, and the unit's own.
+
+A unit's own cases are Python files `*_cases.py` beside its definition. Each defines areas (`CaseArea`), whose cases
+get the probe of the link; `settings`, if a file defines it, makes the object that records and restores the settings
+of the unit around a run. A case whose ID the definition yields too replaces that case.
+"""
 
 from __future__ import annotations
 
+import runpy
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Any, Final
+from functools import cache
+from pathlib import Path
+from typing import Any
 
-from starhil.hil_tests.conformance import behaviour_cases, image_cases, serial_cases, traffic_cases
 from starhil.hil_tests.conformance.can_cases import can_cases
-from starhil.hil_tests.conformance.case import Case, cases_of
-from starhil.hil_tests.conformance.row_cases import row_cases
-from starhil.hil_tests.conformance.unit_cases import unit_cases, unit_row_cases
+from starhil.hil_tests.conformance.case import Case, CaseArea
+from starhil.hil_tests.conformance.link_probe import ReadableSettings, Settings
+from starhil.hil_tests.conformance.serial_cases import serial_cases
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.icd import InterfaceDefinition
-
-CUBESTAR_ROWS: Final = frozenset(
-    {"identification", "communication_status", "acknowledge", "device_status", "parameter"}
-)
-"""Telemetry rows that the cases for CubeStar need."""
+from starhil.hil_tests.judge.definition import Unit
 
 
-def is_cubestar(icd: InterfaceDefinition) -> bool:
-    """Return whether a unit has the rows that the cases for CubeStar need; other units get derived cases."""
-    return icd.telemetry.keys() >= CUBESTAR_ROWS
-
-
-def serial_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on a serial line: CubeStar's, or cases derived from its definition.
+def serial_suite(unit: Unit) -> tuple[Case[Any], ...]:
+    """Return the cases for a unit on a serial line.
 
     Raises
     ------
     BenchError
         The unit has no serial link.
     """
-    if icd.link.serial is None:
-        raise BenchError(f"unit {icd.name}: has no serial link")
-    if is_cubestar(icd):
-        return _named("serial", cases_of(serial_cases), _common(icd))
-    return _named("serial", unit_cases(icd))
+    if unit.serial is None:
+        raise BenchError(f"unit {unit.name}: has no serial link")
+    return _suite(unit, "serial", serial_cases(unit))
 
 
-def can_suite(icd: InterfaceDefinition) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on CAN: CubeStar's, or cases derived from its definition.
+def can_suite(unit: Unit) -> tuple[Case[Any], ...]:
+    """Return the cases for a unit on CAN.
 
     Raises
     ------
     BenchError
         The unit has no CAN link.
     """
-    if icd.link.can is None:
-        raise BenchError(f"unit {icd.name}: has no CAN link")
-    cubestar = is_cubestar(icd)
-    rows = _common(icd) if cubestar else unit_row_cases(icd, clause="[link.can]")
-    return _named("can", can_cases(icd, cubestar=cubestar), rows)
+    if unit.can is None:
+        raise BenchError(f"unit {unit.name}: has no CAN link")
+    return _suite(unit, "can", can_cases(unit))
 
 
-def _common(icd: InterfaceDefinition) -> list[Case[Any]]:
-    return [*row_cases(icd), *cases_of(behaviour_cases, image_cases, traffic_cases)]
+def settings_of(unit: Unit) -> Settings:
+    """Return what records and restores the settings of a unit: its own object, or one for any unit."""
+    for contents in _own_files(unit.folder):
+        if "settings" in contents:
+            own: Settings = contents["settings"]()
+            return own
+    return ReadableSettings()
 
 
-def _named(link: str, *tables: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:
-    """Prefix case ID and area with the link; the area is the first part of the ID."""
+def _suite(unit: Unit, link: str, derived: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:
+    """Return derived and own cases, with IDs and areas that begin with the link."""
+    found = {item.id: item for item in derived}
+    for contents in _own_files(unit.folder):
+        for area in contents.values():
+            if isinstance(area, CaseArea) and link in area.links:
+                found |= {item.id: item for item in area.cases}
     return tuple(
         replace(item, id=f"{link}.{item.id}", area=f"{link}.{item.id.split('.', 1)[0]}")
-        for table in tables
-        for item in table
+        for item in found.values()
     )
+
+
+@cache
+def _own_files(folder: Path | None) -> tuple[dict[str, Any], ...]:
+    """Run the files with a unit's own cases.
+
+    Raises
+    ------
+    BenchError
+        A file fails; the text names it.
+    """
+    found = []
+    for path in sorted(folder.glob("*_cases.py")) if folder is not None else ():
+        try:
+            found.append(runpy.run_path(str(path), run_name=path.stem))
+        except Exception as error:
+            raise BenchError(f"{path}: {type(error).__name__}: {error}") from error
+    return tuple(found)

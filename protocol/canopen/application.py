@@ -8,7 +8,7 @@ from typing import Protocol
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.codec import Row
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import LengthError, MessageError, Value
 

@@ -13,7 +13,7 @@ from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.dictionary import Dictionary, encode
 from starhil.protocol.canopen.pdo_mapping import FIRST_DUMMY, LAST_DUMMY
-from starhil.protocol.export.quoting import Scope, eds_text
+from starhil.protocol.quoting import Scope, eds_text
 
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
 MANUFACTURER: Final = range(0x2000, 0x6000)

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from starhil.protocol.icd import InterfaceDefinition, RawTable
+from starhil.protocol.definition import InterfaceDefinition, RawTable
 from starhil.protocol.link_schema import HEX
 from starhil.protocol.values import IcdError
 

@@ -7,8 +7,8 @@ from importlib import import_module
 from types import MappingProxyType, ModuleType
 from typing import Final, cast
 
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 
 FORMATS: Final[Mapping[str, str]] = MappingProxyType(
     {

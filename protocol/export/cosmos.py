@@ -7,14 +7,13 @@ byte of the ID. COSMOS truncates computed raw values, so a scaled parameter may 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Final
 
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
-from starhil.protocol.export.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
 from starhil.protocol.values import EnumDefinition
 
 TARGET: Final = "STARHIL"
@@ -85,7 +84,7 @@ def _field(row: Row, field: Field, name: str, start: int) -> Iterator[str]:
     ):  # COSMOS counts bits from the most significant one, and takes a bit field's order from its bytes
         byte, bit = field.place(field.width - 1)
         offset = start + 8 * byte + 7 - bit
-    said = replace(field, doc=field.doc or (f"{field.name}." if field.name else "Unused."))
+    said = field.changed(doc=field.doc or (f"{field.name}." if field.name else "Unused."))
     yield f"  {keyword} {name} {offset} {field.bit_count} {_type(field)}{limits} {cosmos_string(meaning(row, said))}{endian}"
     if field.enum is not None:
         yield from states(field.enum, f"{row.kind} {row.name}: field {field.name}")

@@ -8,15 +8,15 @@ have been joined, as is usual in DBC files for transport protocols.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
 from starhil.protocol.codec import Field, Row, Slot
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
-from starhil.protocol.export.quoting import Scope, dbc_string
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.quoting import Scope, dbc_string
 from starhil.protocol.values import EnumDefinition, IcdError
 
 EXTENDED: Final = 0x80000000
@@ -85,12 +85,14 @@ def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:
     to_device = (row.id, host, device)
     to_host = (row.id, device, host)
-    signals = tuple(replace(field, doc=meaning(row, field)) for field in row.named_fields.values())
+    signals = tuple(field.changed(doc=meaning(row, field)) for field in row.named_fields.values())
     scope = Scope("DBC")
     for field in signals:
         for name in _names(field):
             scope.claim(name, f"{row.kind} {row.name}: field {field.name}")
-    code = (Field("error", "enum", Slot(0, "u8", 0, 1), enum=_error_codes(icd), doc="Error code."),)
+    code = (
+        Field(name="error", kind="enum", slot=Slot(0, "u8", 0, 1), enum=_error_codes(icd), doc="Error code."),
+    )
     long = row.size > MAX_FRAME_DATA
     if row.kind == "telemetry":
         request_type, reply_type = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
@@ -115,7 +117,7 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
 def _error_codes(icd: InterfaceDefinition) -> EnumDefinition:
     """Return the error codes: the unit's, or the published ones if it has none."""
     published = {code.name.lower(): int(code) for code in ErrorCode}
-    return icd.enums.get("error_code") or EnumDefinition("error_code", "", published)
+    return icd.enums.get("error_code") or EnumDefinition(name="error_code", doc="", values=published)
 
 
 def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:

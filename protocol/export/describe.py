@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.unit_examples import Exchange, exchanges
 from starhil.protocol.values import EnumDefinition, Parameter, Section, Value
 
@@ -156,9 +156,9 @@ def enum_text(enum: EnumDefinition) -> str:
 def reference(icd: InterfaceDefinition) -> Iterator[Section]:
     """The parameters and the enumerations."""
     parameters = tuple(parameter_cells(parameter) for parameter in icd.parameters.values())
-    yield Section("Parameters", (), PARAMETER_COLUMNS, parameters)
+    yield Section(heading="Parameters", paragraphs=(), columns=PARAMETER_COLUMNS, rows=parameters)
     enums = tuple((enum.name, enum_text(enum), enum.doc) for enum in icd.enums.values())
-    yield Section("Enumerations", (), ("Name", "Numbers", "Meaning"), enums)
+    yield Section(heading="Enumerations", paragraphs=(), columns=("Name", "Numbers", "Meaning"), rows=enums)
 
 
 def sections(icd: InterfaceDefinition) -> Iterator[tuple[str, list[Row]]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 
 
 def render(icd: InterfaceDefinition) -> str:

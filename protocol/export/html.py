@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
-from starhil.protocol.export.quoting import html_text
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.quoting import html_text
 from starhil.protocol.values import Section
 
 _STYLE: Final = """

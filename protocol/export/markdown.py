@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
-from starhil.protocol.export.quoting import markdown, one_line
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.quoting import markdown, one_line
 from starhil.protocol.values import Section
 
 

@@ -6,12 +6,11 @@ A packet begins with the key of its row: the row ID and, if the link carries a c
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from typing import Final
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.messages import MessageClass
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.link_schema import MessageClass
 from starhil.protocol.values import IcdError
 
 CLASS_SHIFT: Final = 8
@@ -74,4 +73,4 @@ def _pieces(row: Row, field: Field, language: str) -> Iterator[Field]:
         )
     for byte in range(field.shift // 8, -(-end // 8)):
         first = max(field.shift, 8 * byte)
-        yield replace(field, shift=first, width=min(end, 8 * byte + 8) - first)
+        yield field.changed(shift=first, width=min(end, 8 * byte + 8) - first)

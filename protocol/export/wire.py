@@ -9,11 +9,12 @@ from pydantic import BaseModel
 
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
 from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, read_layout
-from starhil.protocol.conventions import EPOCHS
-from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, Order, SerialLinkModel
+from starhil.protocol.conventions import EPOCHS, Order
+from starhil.protocol.cubespace_serial import encode_reply, encode_request
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import serial_answers
 from starhil.protocol.values import Section
 
@@ -92,7 +93,7 @@ def _conventions(icd: InterfaceDefinition) -> Section:
     if commands and icd.device_parameters["start_mode"].default == "standby":
         text = "the unit boots to standby, in which no attitude is valid: send a mode that takes images with"
         rows.append(("first attitude", f"{text} {' or '.join(commands)}"))
-    return Section("Conventions", (), ("Convention", "Value"), tuple(rows))
+    return Section(heading="Conventions", paragraphs=(), columns=("Convention", "Value"), rows=tuple(rows))
 
 
 def _classes(icd: InterfaceDefinition) -> Section:
@@ -105,7 +106,12 @@ def _classes(icd: InterfaceDefinition) -> Section:
         unsolicited = reply if item.unsolicited is None else item.unsolicited
         rows.append((item.name, item.kind.value, code(item.code), code(reply), code(unsolicited)))
     columns = ("Class", "Rows", "Code in a request", "In a reply", "In unsolicited telemetry")
-    return Section("Classes", ("Class and ID together select a row.",), columns, tuple(rows))
+    return Section(
+        heading="Classes",
+        paragraphs=("Class and ID together select a row.",),
+        columns=columns,
+        rows=tuple(rows),
+    )
 
 
 def _has_error_codes(icd: InterfaceDefinition) -> bool:
@@ -122,7 +128,7 @@ def _has_error_codes(icd: InterfaceDefinition) -> bool:
 def _errors(icd: InterfaceDefinition) -> Section:
     numbers = {code.name.lower(): int(icd.error_number(code)) for code in ErrorCode}
     rows = tuple((f"{number} ({number:02X}h)", name) for name, number in numbers.items())
-    return Section("Error codes", (), ("Code", "Error"), rows)
+    return Section(heading="Error codes", paragraphs=(), columns=("Code", "Error"), rows=rows)
 
 
 def _composed(link: SerialLinkModel, order: Order) -> Section:
@@ -132,10 +138,10 @@ def _composed(link: SerialLinkModel, order: Order) -> Section:
         f"where it begins and ends. Framing: {_settings(link.framing)}. Check: {_settings(link.check)}."
     )
     return Section(
-        "Serial line",
-        (text,),
-        ("Message", "Header field", "Type", "Value", "Meaning"),
-        tuple(
+        heading="Serial line",
+        paragraphs=(text,),
+        columns=("Message", "Header field", "Type", "Value", "Meaning"),
+        rows=tuple(
             (message, *cells)
             for message, header in messages
             for field in header
@@ -215,10 +221,10 @@ def _serial(icd: InterfaceDefinition) -> Section:
     silent = [f"`{row.name}` ({row.id})" for row in rows if not serial_answers(icd, row)]
     silence = f"On this line, {' or '.join(silent)} is neither acknowledged nor refused."
     return Section(
-        "Serial line",
-        (text, choice, silence) if silent else (text, choice),
-        ("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
-        tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
+        heading="Serial line",
+        paragraphs=(text, choice, silence) if silent else (text, choice),
+        columns=("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
+        rows=tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
     )
 
 
@@ -235,16 +241,16 @@ def _format_message(message: bytes) -> str:
 
 def _can() -> Section:
     return Section(
-        "CAN",
-        (
+        heading="CAN",
+        paragraphs=(
             (
                 "29-bit CAN IDs: type (bits 28 to 24), row ID (23 to 16), source address (15 to 8), destination "
                 "address (7 to 0). By default the device has address 4 and the OBC 1 (parameters can_address and host_address)."
             ),
             f"A message of more than 8 bytes is sent in segments: up to {SEGMENT_DATA} bytes of data, then the number of remaining segments.",
         ),
-        ("Type", "Message"),
-        tuple(
+        columns=("Type", "Message"),
+        rows=tuple(
             (str(int(kind)), kind.name.lower().replace("_", " ").replace("extended", "segment"))
             for kind in MessageType
             if kind
@@ -254,15 +260,15 @@ def _can() -> Section:
 
 def _objects(layout: CanopenModel) -> Section:
     return Section(
-        "CANopen objects",
-        (
+        heading="CANopen objects",
+        paragraphs=(
             (
                 "The rows, fields and parameters of this definition as objects; types, sub-indices and limits are in the EDS. "
                 "Objects below 2000h are defined by CiA 301."
             ),
         ),
-        ("Index", "Name", "Content"),
-        tuple((f"{placed.index:04X}h", placed.name, _content(placed)) for placed in layout.object),
+        columns=("Index", "Name", "Content"),
+        rows=tuple((f"{placed.index:04X}h", placed.name, _content(placed)) for placed in layout.object),
     )
 
 
@@ -295,10 +301,10 @@ def _pdos(layout: CanopenModel) -> Section:
     rows = [("TPDO", number, pdo) for number, pdo in enumerate(layout.tpdo, 1)]
     rows += [("RPDO", number, pdo) for number, pdo in enumerate(layout.rpdo, 1)]
     return Section(
-        "CANopen PDOs",
-        ("The default mapping; all PDOs can be remapped while the node is running.",),
-        ("PDO", "Name", "At start", "Transmission type", "Mapped"),
-        tuple((f"{kind} {number}", *_pdo(pdo)) for kind, number, pdo in rows),
+        heading="CANopen PDOs",
+        paragraphs=("The default mapping; all PDOs can be remapped while the node is running.",),
+        columns=("PDO", "Name", "At start", "Transmission type", "Mapped"),
+        rows=tuple((f"{kind} {number}", *_pdo(pdo)) for kind, number, pdo in rows),
     )
 
 

@@ -11,10 +11,10 @@ from typing import Final
 from xml.etree import ElementTree as ET
 
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
-from starhil.protocol.export.quoting import Scope, one_line, xtce_name
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.quoting import Scope, one_line, xtce_name
 
 NAMESPACE: Final = "http://www.omg.org/spec/XTCE/20180204"
 PACKET: Final = "Packet"

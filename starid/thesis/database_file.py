@@ -99,7 +99,7 @@ def read_header(path: Path) -> dict[str, Any]:
             start = file.read(len(MAGIC) + _LENGTH.size)
             if start[: len(MAGIC)] != MAGIC:
                 raise DatabaseError(
-                    f"database: {path} is not a feature database; build one with `starhil database build`"
+                    f"database: {path} is not a feature database; build one with `starid database build`"
                 )
             if len(start) < len(MAGIC) + _LENGTH.size:
                 raise DatabaseError(f"database: {path} has a truncated header; build it again")

@@ -4,7 +4,7 @@ Nearest neighbour, LASSO and density-based clustering follow their equations. Th
 (`starid.thesis.cell_search`, `.lasso`, `.matlab_lasso`, `.fsf`) gives the same answers a hundred times
 faster; the tests compare the two. Read this module to see what the thesis does, or use it to check an answer
 of the compiled code with `LostInSpace(database, solver="sklearn")`, `solver = "sklearn"` in the table
-`[identifier]` of a profile, the solver `lsi-sklearn` of `starhil bench identify`, or `ReferenceFilter` as the
+`[identifier]` of a profile, the solver `lsi-sklearn` of `starid bench`, or `ReferenceFilter` as the
 filter of `starid.thesis.rsi`.
 """
 
@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array, Indices
+from starid.errors import StaridError
 from starid.thesis.database import FeatureDatabase
 from starid.thesis.false_stars import FilterResult, ObservedFrame
 from starid.thesis.features import FeatureVector
@@ -67,7 +68,12 @@ class ReferenceSearch:
     """
 
     def __init__(self, database: FeatureDatabase) -> None:
-        from sklearn.neighbors import NearestNeighbors
+        try:
+            from sklearn.neighbors import NearestNeighbors
+        except ModuleNotFoundError:
+            raise StaridError(
+                "solver = 'sklearn' needs scikit-learn; run: pip install 'starhil[lab]'"
+            ) from None
 
         self._database = database
         self._cells = np.flatnonzero(database.theta != NO_STAR)

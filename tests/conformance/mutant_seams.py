@@ -76,7 +76,7 @@ def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]
 
     def damage(unit: SimulatedUnit) -> None:
         device, requests, handle = unit.device, unit.requests, unit.requests.handle
-        requests.handle = lambda request, later=None: change(device, request, lambda r: handle(r, later))
+        requests.handle = lambda request: change(device, request, handle)
 
     return damage
 

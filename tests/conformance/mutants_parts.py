@@ -18,7 +18,7 @@ from tests.conformance.simulated import SimulatedUnit
 
 @mutant("boots are not counted", "both", "reset.acknowledged")
 def boots_not_counted(unit: SimulatedUnit) -> None:
-    unit.device.on_start.append(lambda: setattr(unit.device, "boot_count", 1))
+    unit.device.signals.started.connect(lambda _cause: setattr(unit.device, "boot_count", 1))
 
 
 @mutant("attitudes stay valid in standby", "both", "modes.standby")

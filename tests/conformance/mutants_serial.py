@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+from starhil.protocol.cubespace_serial import DeviceReceiver
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect
+from starhil.protocol.serial_interface import Dialect
 from tests.conformance.mutant_seams import (
     enter,
     events,
@@ -120,7 +121,7 @@ def talkative(unit: SimulatedUnit) -> None:
     def say(reply: Reply) -> None:
         unit.link._send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY), Dialect.B)
 
-    unit.requests.unsolicited_receivers[:] = [say]
+    unit.device.signals.unsolicited.observers[:] = [say]
 
 
 def _answering(row_id: int):

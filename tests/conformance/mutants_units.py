@@ -300,7 +300,7 @@ def mutants() -> Iterator[UnitMutant]:
         "replies carry another class": ("serial.framing.one", replies(class_changed)),
         "unknown classes are answered": ("serial.header.class", any_class),
         "a wrong length gets another code": ("serial.lengths.set_camera.short", with_code(ErrorCode.INVALID_LENGTH, ErrorCode.BUSY)),
-        "limits are not checked": ("serial.limits.set_camera.focal_length.nan", handling(without_limits)),
+        "limits are not checked": ("serial.fields.set_camera.focal_length.nan", handling(without_limits)),
         "a setting is acknowledged and forgotten": ("serial.settings.camera", handling(setting_forgotten)),
         "a subscription does not end": ("serial.subscriptions.set_subscription", handling(subscription_deaf)),
         "the clock is not set": ("serial.clock.set_time", handling(clock_stays)),
@@ -332,10 +332,10 @@ def gen2(link: str = "serial") -> Iterator[UnitMutant]:
         "replies come twice": (one, outgoing(twice)),
         "replies are missing": ("recovery.flood", every_fifth_missing()),
         "the last byte of telemetry is missing": ("telemetry.identification", telemetry_data(lambda data, _row: data[:-1])),
-        "unknown identifiers are accepted": ("identifiers.unknown", with_code(ErrorCode.INVALID_ID, None)),
+        "unknown identifiers are accepted": ("identifiers.telecommands", with_code(ErrorCode.INVALID_ID, None)),
         "data of any length are taken": (length, handling(cut_to_size)),
         "a wrong length gets another code": (length, with_code(ErrorCode.INVALID_LENGTH, ErrorCode.BUSY)),
-        "limits are not checked": ("limits.set_unix_time.nanoseconds.high", handling(without_limits)),
+        "limits are not checked": ("fields.set_unix_time.nanoseconds.high", handling(without_limits)),
         "a setting is acknowledged and forgotten": (setting, only_acknowledged(112)),
     }  # fmt: skip
     if link == "serial":
@@ -351,7 +351,7 @@ def gen2(link: str = "serial") -> Iterator[UnitMutant]:
 
 def _as_replies(unit: SimulatedUnit) -> None:
     send = unit.link._send_unsolicited
-    unit.requests.unsolicited_receivers[:] = [
+    unit.device.signals.unsolicited.observers[:] = [
         lambda reply: send(dataclasses.replace(reply, kind=ReplyKind.TELEMETRY))
     ]
 

@@ -25,14 +25,12 @@ from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.suites import is_cubestar
-from starhil.hil_tests.conformance.unit_can_probe import CanUnitProbe
-from starhil.hil_tests.conformance.unit_probe import SerialUnitProbe
+from starhil.hil_tests.conformance.suites import settings_of
+from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.canopen import build_dictionary, build_eds
 from starhil.protocol.icd import load_unit
-from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
-from starhil.protocol.transports.paced import PacedWriter
+from starhil.protocol.transports.paced import PacedWriter, PacingSchedule
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
@@ -177,6 +175,7 @@ class SimulatedUnit:
         self.loop = SimulatedLoop()
         self.kind = link
         self.dialect = dialect
+        self.unit = unit
         self.icd = load_unit(unit)
         self._served = self.icd if served is None else load_unit(served)
         self._damage = damage
@@ -186,21 +185,20 @@ class SimulatedUnit:
         self.loop.run_until_complete(self._start())
         port = SimulatedPort(self)
         times = ProbeTimes(answer_s=0.5, quiet_s=0.1, boot_s=5.0, image_s=10.0)
-        self.probe: SerialProbe | CanProbe | SerialUnitProbe | CanUnitProbe | CanopenProbe
+        self.probe: SerialProbe | CanProbe | CanopenProbe
         if self.kind == "canopen":
             node = int(self.icd.parameters["canopen_node"].default)
             eds = build_eds(build_dictionary(self.icd))
             self.probe = CanopenProbe(port, node, import_eds(eds, node), eds)
             self.loop.run_until_complete(asyncio.sleep(1.0))
             return self
-        if not is_cubestar(self.icd):
-            self.probe = (SerialUnitProbe if self.kind == "serial" else CanUnitProbe)(
-                port, self.icd, times=times
+        unit = read_unit(self.unit)
+        if self.kind == "serial":
+            self.probe = SerialProbe(
+                port, unit, dialect=self.dialect, baud=BAUD, times=times, settings=settings_of(unit)
             )
-        elif self.kind == "serial":
-            self.probe = SerialProbe(port, self.icd, dialect=self.dialect, baud=BAUD, times=times)
         else:
-            self.probe = CanProbe(port, self.icd, times=times)
+            self.probe = CanProbe(port, unit, times=times, settings=settings_of(unit))
         self.probe.sleep(1.0)
         return self
 
@@ -208,7 +206,7 @@ class SimulatedUnit:
         self.imager = DirectImager(TruthImager().handle)
         attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
         links = {"serial": {"dialect": self.dialect}}
-        starts = not is_cubestar(self.icd) and self.kind != "canopen"
+        starts = self.unit != DEFAULT_UNIT and self.kind != "canopen"
         parameters = {"start_mode": "lost_in_space"} if starts else {}
         profile = Profile.model_validate({"links": links, "parameters": parameters})
         self.store = MemoryStore()

@@ -6,11 +6,11 @@ import pytest
 
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
-from starhil.protocol.icd import load_unit
+from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.simulated import SimulatedUnit
 
-ICD = load_unit()
-SUITES = {"serial": serial_suite(ICD), "can": can_suite(ICD)}
+UNIT = read_unit("cubestar")
+SUITES = {"serial": serial_suite(UNIT), "can": can_suite(UNIT)}
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from starhil.configs.units.cubestar.controls import parameter, reset, set_parameter
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.runner import run_cases
@@ -83,19 +84,19 @@ def test_a_run_stops_when_the_unit_falls_silent_within_it(monkeypatch):
 def set_up(unit: SimulatedUnit) -> None:
     """Put a unit into the state that a user left it in."""
     for name, value in FOUND.items():
-        unit.probe.set_parameter(name, value)
+        set_parameter(unit.probe, name, value)
     unit.probe.command("save_parameters")
     unit.probe.wait_for("device_status", {"parameters_changed": False}, 2.0)
-    unit.probe.set_parameter("exposure", IN_USE["exposure"])
+    set_parameter(unit.probe, "exposure", IN_USE["exposure"])
     unit.probe.command("set_mode", mode="lost_in_space")
 
 
 def assert_as_found(unit: SimulatedUnit) -> None:
     """Check parameters in use, mode and, by a reset, the stored parameters."""
     assert unit.probe.telemetry("device_status")["mode"] in ("lost_in_space", "tracking")
-    assert {name: unit.probe.parameter(name)["value"] for name in FOUND} == FOUND | IN_USE
-    unit.probe.reset()
-    assert {name: unit.probe.parameter(name)["value"] for name in FOUND} == FOUND
+    assert {name: parameter(unit.probe, name)["value"] for name in FOUND} == FOUND | IN_USE
+    reset(unit.probe)
+    assert {name: parameter(unit.probe, name)["value"] for name in FOUND} == FOUND
 
 
 @pytest.mark.parametrize("link", ["serial", "can"])
@@ -112,7 +113,7 @@ def test_cases_pass_with_any_settings_and_restore_them(link):
 
 def test_an_interrupted_run_leaves_the_unit_as_it_was():
     def interrupted(probe):
-        probe.set_parameter("exposure", 77)
+        set_parameter(probe, "exposure", 77)
         probe.command("save_parameters")
         raise Interrupted(15)
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.conformance.canopen_suite import canopen_suite
+from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, canopen_suite
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.errors import BenchError
-from starhil.protocol.icd import load_unit
+from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.mutant_seams import Damage
 from tests.conformance.mutants_oresat import DAMAGES, DEFINITION_MUTANTS, DefinitionMutant
 from tests.conformance.mutants_units import UnitMutant, gen2, mutants
@@ -18,7 +18,7 @@ from tests.conformance.test_mutants import MUTANTS
 GEN2 = "cubestar-gen2"
 UNITS = ("sagitta", "nos3", "st16", GEN2)
 SUITES = {"serial": serial_suite, "can": can_suite}
-ON_CAN = {case.id: case for case in can_suite(load_unit(GEN2))}
+ON_CAN = {case.id: case for case in can_suite(read_unit(GEN2))}
 MUTANTS_ON_CAN = [
     *(
         (item.name, item.caught_by, item.damage)
@@ -32,7 +32,7 @@ MUTANTS_ON_CAN = [
 
 @pytest.mark.parametrize(("unit", "link"), [*((unit, "serial") for unit in UNITS), (GEN2, "can")])
 def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str) -> None:
-    cases = SUITES[link](load_unit(unit))
+    cases = SUITES[link](read_unit(unit))
     with SimulatedUnit(link, unit=unit) as simulated:
         outcomes = run_cases(simulated.probe, cases)
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
@@ -42,7 +42,7 @@ def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str
 
 @pytest.mark.parametrize("mutant", list(mutants()), ids=lambda mutant: f"{mutant.unit}: {mutant.name}")
 def test_a_mutant_of_a_unit_is_caught_by_its_case(mutant: UnitMutant) -> None:
-    cases = {case.id: case for case in serial_suite(load_unit(mutant.unit))}
+    cases = {case.id: case for case in serial_suite(read_unit(mutant.unit))}
     with SimulatedUnit("serial", mutant.damage, unit=mutant.unit) as simulated:
         outcome = run_case(simulated.probe, cases[mutant.caught_by])
     assert outcome.status == "failed", f"{mutant.caught_by} passed on a {mutant.unit} where {mutant.name}"
@@ -63,7 +63,7 @@ def test_a_mutant_of_a_unit_on_can_is_caught_by_its_case(caught_by: str, damage:
 
 def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
     with SimulatedUnit("canopen", unit="oresat") as simulated:
-        outcomes = run_cases(simulated.probe, canopen_suite(load_unit("oresat")))
+        outcomes = run_cases(simulated.probe, canopen_suite(read_unit("oresat")))
     assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status == "failed"] == []
     assert {o.id: o.seen for o in outcomes if o.status == "skipped"} == {
         "canopen.design.attitude": "the EDS has no object named sequence"
@@ -71,8 +71,16 @@ def test_a_unit_on_canopen_passes_every_case_that_its_dictionary_has() -> None:
     assert len(outcomes) >= 175
 
 
+def test_the_rows_of_a_unit_with_three_links_pass_on_canopen_too() -> None:
+    cases = [case for case in canopen_suite(read_unit("cubestar")) if case not in CANOPEN_CASES]
+    with SimulatedUnit("canopen") as simulated:
+        outcomes = run_cases(simulated.probe, cases)
+    assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status != "passed"] == []
+    assert len(outcomes) >= 35
+
+
 def caught_on_canopen(simulated: SimulatedUnit, case: str) -> None:
-    cases = {item.id: item for item in canopen_suite(load_unit("oresat"))}
+    cases = {item.id: item for item in canopen_suite(read_unit("oresat"))}
     with simulated:
         outcome = run_case(simulated.probe, cases[f"canopen.{case}"])
     assert outcome.status == "failed", f"{case} passed"
@@ -94,6 +102,6 @@ def test_a_mutant_of_a_unit_on_canopen_is_caught_by_its_case(name: str) -> None:
 
 def test_a_unit_without_cases_for_a_link_is_named() -> None:
     with pytest.raises(BenchError, match="unit oresat: has no serial link"):
-        serial_suite(load_unit("oresat"))
+        serial_suite(read_unit("oresat"))
     with pytest.raises(BenchError, match="unit sagitta: has no CAN link"):
-        can_suite(load_unit("sagitta"))
+        can_suite(read_unit("sagitta"))

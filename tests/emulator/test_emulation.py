@@ -9,17 +9,17 @@ import pytest
 from starhil.emulator.clock import SteppedClock
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile, RunConfig, configs_folder
+from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
-from tests.emulator.runs import CAMERA, Control, FakeImager, command, read
+from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 
 def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
@@ -31,7 +31,7 @@ def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
     async def scenario(emulation, _line):
         truth.unlink()
         await emulation.stepper.step(7.0)
-        return emulation.device.cycle.truth.state(7.0).attitude
+        return emulation.device.surroundings.truth.state(7.0).attitude
 
     options = RunOptions(scenario=str(path))
     with pytest.raises(EmulatorError, match="truth file"):
@@ -122,7 +122,7 @@ def test_a_truth_log_can_be_replayed(run, tmp_path):
         await emulation.stepper.step(1.0)
         command(emulation, "set_mode", mode="lost_in_space")
         await emulation.stepper.step(5.0)
-        wanted.append(emulation.device.cycle.truth.state(2.4))
+        wanted.append(emulation.device.surroundings.truth.state(2.4))
 
     run(scenario, options=RunOptions(truth_log=path), truth=rate)
     replayed = read_truth_file(path).state(2.4)
@@ -148,10 +148,13 @@ def test_scenario_events_happen_at_their_simulation_times(run, tmp_path):
         await emulation.stepper.step(1.99)
         assert not emulation.device.unresponsive
         await emulation.stepper.step(0.02)
-        assert run.launched.faults.describe() == {"optical": {"false_stars": 3}, "device": {"stuck": True}}
+        assert run.first_head().faults.describe() == {
+            "optical": {"false_stars": 3},
+            "device": {"stuck": True},
+        }
         await emulation.stepper.step(1.0)
-        assert run.launched.faults.describe() == {}
-        assert emulation.device.cycle.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
+        assert run.first_head().faults.describe() == {}
+        assert emulation.device.surroundings.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
 
     run(scenario, options=RunOptions(scenario=str(path)))
 
@@ -191,7 +194,7 @@ def test_a_truth_file_of_a_scenario_is_read_at_the_start_and_starts_at_its_time(
     async def scenario(emulation, _line):
         table.unlink()
         await emulation.stepper.step(4.0)
-        return emulation.device.cycle.truth.state(3.5).attitude.ra_deg
+        return emulation.device.surroundings.truth.state(3.5).attitude.ra_deg
 
     assert run(scenario, options=RunOptions(scenario=str(path))) == pytest.approx(15.0)
 
@@ -318,7 +321,7 @@ def test_a_symlink_in_use_is_rejected_and_stays(run, tmp_path):
 
     async def scenario(_emulation, _line):
         first = link.readlink()
-        second = Emulation(Profile.model_validate({"run": {"clock": "stepped"}, "links": links}))
+        second = Run([Profile.model_validate({"run": {"clock": "stepped"}, "links": links})])
         with pytest.raises(EmulatorError, match="in use by another emulator"):
             await second.open()
         await second.close()
@@ -344,13 +347,14 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
     assert profile.run == RunConfig(clock="stepped")
 
     async def scenario():
-        emulation = Emulation(profile)
-        assert isinstance(emulation.imager, ProcessImager)
-        assert isinstance(emulation.clock, SteppedClock)
+        run = Run([profile])
+        assert isinstance(run.clock, SteppedClock)
         try:
-            await emulation.open()
-            emulation.begin()
-            await emulation.ready()
+            await run.open()
+            run.begin()
+            await run.ready()
+            emulation = FirstHead(run)
+            assert isinstance(emulation.imager, ProcessImager)
             await emulation.stepper.step(1.0)
             command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)
@@ -367,7 +371,7 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
             await emulation.stepper.step(2.0)
             assert emulation.device.latest.valid
         finally:
-            await emulation.close()
+            await run.close()
 
     asyncio.run(scenario())
 
@@ -447,8 +451,8 @@ def test_an_observer_that_fails_stops_neither_the_frames_nor_the_other_observers
     async def scenario(emulation, _line):
         device = emulation.device
         seen = []
-        device.on_frame[:0] = [lambda _measurement: 1 / 0]
-        device.on_frame.append(seen.append)
+        device.signals.frame_published.observers.insert(0, lambda _measurement: 1 / 0)
+        device.signals.frame_published.connect(seen.append)
         if emulation.stepper:
             await emulation.stepper.step(1.0)  # the boot
         assert command(emulation, "set_mode", mode="lost_in_space") is ErrorCode.OK

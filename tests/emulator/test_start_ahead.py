@@ -21,7 +21,7 @@ main()
 BLAS = """
 import sys
 import numpy as np
-import starid.jit
+import starid.kernel_library
 from numba import njit
 print("scipy.linalg" in sys.modules)
 @njit

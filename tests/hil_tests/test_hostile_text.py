@@ -8,10 +8,10 @@ from xml.etree import ElementTree as ET
 import pytest
 from rich.console import Console
 
-from starhil.emulator.cli.app import exit_for_bad_input
 from starhil.hil_tests.conformance.report import print_outcome, write_junit_report
 from starhil.hil_tests.conformance.runner import Outcome
 from starhil.hil_tests.results import FAILED, TestCase, write_junit
+from starid.cli.command_line import exit_for_bad_input
 from tests.emulator.cli.command_line import run_command_line
 
 HOSTILE = "a\x1b]0;b\x07\x00\x9b2J\u202ec\ufffe\ud800"
@@ -67,5 +67,5 @@ def test_title_and_steps_of_a_session_are_shown_with_their_control_characters_es
 
 def test_an_error_is_shown_with_its_control_characters_escaped(capsys):
     with pytest.raises(SystemExit):
-        exit_for_bad_input(HOSTILE[:-1])
+        exit_for_bad_input(HOSTILE[:-1], "starhil")
     assert capsys.readouterr().err == f"starhil: {SHOWN.removesuffix(chr(92) + 'ud800')}\n"

@@ -12,8 +12,8 @@ from typing import Any, Self
 import pytest
 
 from starhil.hil_tests.client import ObcClient
-from starhil.protocol.export.quoting import cosmos_state
 from starhil.protocol.icd import load_unit
+from starhil.protocol.quoting import cosmos_state
 from starhil.protocol.serial_stack import serial_answers
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import same

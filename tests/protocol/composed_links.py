@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from starhil.protocol.composed_stack import ComposedStack
-from starhil.protocol.link_schema import SerialLinkModel
+from starhil.protocol.link_schema import MessageClass, SerialLinkModel
 from starhil.protocol.messages import (
     ErrorCode,
     FaultKind,
     LinkFault,
-    MessageClass,
     Reply,
     ReplyKind,
     Request,
@@ -52,10 +51,10 @@ SAGITTA = stack_of(
         ],
     },
     (
-        MessageClass("set", TC, 0, 128),
-        MessageClass("get", TLM, 1, 129),
-        MessageClass("telemetry", TLM, 2, 130, 132),
-        MessageClass("action", TC, 3, 131),
+        MessageClass(name="set", kind=TC, code=0, reply=128),
+        MessageClass(name="get", kind=TLM, code=1, reply=129),
+        MessageClass(name="telemetry", kind=TLM, code=2, reply=130, unsolicited=132),
+        MessageClass(name="action", kind=TC, code=3, reply=131),
     ),
     (
         RowShape("set", 6, TC, 16),
@@ -70,7 +69,7 @@ NOS3 = stack_of(
         "framing": {"kind": "fixed", "start": [0xDE, 0xAD], "end": [0xBE, 0xEF], "request_size": 5},
         "request_header": [{"role": "id", "type": "u8"}],
     },
-    (MessageClass("command", TC), MessageClass("telemetry", TLM)),
+    (MessageClass(name="command", kind=TC), MessageClass(name="telemetry", kind=TLM)),
     (
         RowShape("command", 0, TC, 4, 0, ("echo",)),
         RowShape("telemetry", 1, TLM, 4, 4, ("echo", "reply")),

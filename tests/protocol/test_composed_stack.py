@@ -34,6 +34,16 @@ def test_slip_escapes_as_in_rfc_1055() -> None:
     assert sent.hex(" ").upper() == "C0 01 DB DC 02 DB DD C0"
 
 
+def test_slip_has_the_substitutes_of_the_definition() -> None:
+    framing = {"kind": "slip", "substitutes": [0x01, 0x02]}
+    stack = stack_of({"framing": framing, "request_header": [{"role": "id", "type": "u8"}]})
+    sent = stack.encode_request(Request(TC, 5, b"\xc0\xdb"))
+    assert sent.hex(" ").upper() == "C0 05 DB 01 DB 02 C0"
+    assert [item.data for item in stack.device().feed(sent, 0.0) if isinstance(item, Request)] == [
+        b"\xc0\xdb"
+    ]
+
+
 def test_slip_accepts_a_sender_that_ends_frames_without_starting_them() -> None:
     link = {"framing": {"kind": "slip"}, "request_header": [{"role": "id", "type": "u8"}]}
     assert [

@@ -127,5 +127,5 @@ def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
         'unit = { name = "x", version = "1", doc = "x" }\n'
         '[[section]]\nheading = "Frames"\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
     )
-    with pytest.raises(IcdError, match="section Frames: row 2 has 1 cells, must have 2"):
+    with pytest.raises(IcdError, match=r"section\.Frames: row 2 has 1 cells, must have 2"):
         load_unit(tmp_path)

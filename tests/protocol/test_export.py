@@ -25,9 +25,9 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
 from starhil.protocol.export.describe import anchor, example_text, field_cells
 from starhil.protocol.export.packets import key_bits, key_of
-from starhil.protocol.export.quoting import cosmos_state
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.quoting import cosmos_state
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_examples import exchanges
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units

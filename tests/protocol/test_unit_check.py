@@ -9,7 +9,8 @@ import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
-from starhil.protocol.icd import check_unit, load_unit
+from starhil.protocol.icd import load_unit
+from starhil.protocol.unit_examples import check_unit
 from starhil.protocol.values import IcdError
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'

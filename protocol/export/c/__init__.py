@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.c.rows import RowCode
 from starhil.protocol.export.packets import key_of
-from starhil.protocol.export.quoting import Scope, c_comment, identifier
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.quoting import Scope, c_comment, identifier
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack
 

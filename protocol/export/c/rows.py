@@ -8,9 +8,9 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from starhil.protocol.codec import Field, Row, Slot
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning
-from starhil.protocol.export.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, Value, to_f32
 
 MAP: Final = "map"

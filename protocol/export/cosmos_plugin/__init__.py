@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import cosmos
 from starhil.protocol.export.cosmos_plugin.composed import link_text
 from starhil.protocol.export.packets import key_bits, key_of
-from starhil.protocol.export.quoting import cosmos_name, cosmos_string, identifier, markdown, ruby_string
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import BURST_ID
+from starhil.protocol.quoting import cosmos_name, cosmos_string, identifier, markdown, ruby_string
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack, serial_answers
 

@@ -9,19 +9,22 @@ from unittest import mock
 
 import pytest
 
-from starhil.emulator.cli.app import main
+from starhil.emulator.cli import app as starhil
+from starid.cli import app as starid
 
 
-def run_command_line(*arguments: str, encoding: str = "utf-8") -> tuple[int, str, str]:
-    """Run `starhil`; return exit status, standard output and standard error."""
+def run_command_line(
+    *arguments: str, encoding: str = "utf-8", program: str = "starhil"
+) -> tuple[int, str, str]:
+    """Run `starhil` or `starid`; return exit status, standard output and standard error."""
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding, write_through=True) for _ in range(2))
     with (
-        mock.patch.object(sys, "argv", ["starhil", *arguments]),
+        mock.patch.object(sys, "argv", [program, *arguments]),
         contextlib.redirect_stdout(out),
         contextlib.redirect_stderr(err),
         pytest.raises(SystemExit) as end,
     ):
-        main()
+        {"starhil": starhil, "starid": starid}[program].main()
     assert isinstance(end.value.code, int)
     return end.value.code, _text(out), _text(err)
 

@@ -33,7 +33,7 @@ def test_an_operating_system_error_is_one_line_and_status_2(
     def fail() -> None:
         raise error
 
-    monkeypatch.setattr(app, "build_app", lambda: built)
+    monkeypatch.setattr(app, "build_app", lambda _words: built)
     monkeypatch.setattr("sys.argv", ["starhil"])
     with pytest.raises(SystemExit) as caught:
         app.main()
@@ -99,7 +99,7 @@ def test_the_process_exits_with_the_status_of_the_command(
         if raised is not None:
             raise raised
 
-    monkeypatch.setattr(app, "build_app", lambda: built)
+    monkeypatch.setattr(app, "build_app", lambda _words: built)
     monkeypatch.setattr("sys.argv", ["starhil"])
     with pytest.raises(SystemExit) as caught:
         app.main()
@@ -144,7 +144,6 @@ def test_help_shows_flags_without_a_type_and_positional_arguments_in_capitals() 
     for command, shown in (
         ("run", "[PROFILE]"),
         ("session", "SCRIPT"),
-        ("reproduce", "[NAME]..."),
         ("replay", "FOLDER"),
     ):
         text = CliRunner().invoke(app.build_app(), [command, "--help"]).stdout

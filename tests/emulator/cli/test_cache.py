@@ -106,10 +106,10 @@ def test_kernels_are_counted_from_a_time_on(folder: Path) -> None:
     machine_code = folder / "kernels" / "0123456789abcdef"
     machine_code.mkdir(parents=True)
     for number, written_s in enumerate((1000, 2000, 3000)):
-        path = machine_code / f"module.kernel-{number}.py311.1.nbc"
+        path = machine_code / f"kernel-{number}.kernel"
         path.write_bytes(b"code")
         os.utime(path, (written_s, written_s))
-        path.with_suffix(".nbi").write_bytes(b"index")
+        path.with_suffix(".part").write_bytes(b"being written")
     assert [cache.kernels_written_since(begin_s) for begin_s in (0, 2000, 4000)] == [3, 2, 0]
 
 

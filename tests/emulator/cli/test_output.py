@@ -1,4 +1,4 @@
-"""Output paths, encodings and numbers: what holds for every command."""
+"""Output paths, encodings and numbers: what holds for every command of both programs."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ import pytest
 import typer
 
 from starhil.emulator.cli import app, output
+from starid.cli import app as library
+from starid.cli import command_line
+from starid.cli.output import show_every_character
 from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import WORKER
 
@@ -29,16 +32,23 @@ def starhil(*arguments: str, **environment: str) -> subprocess.CompletedProcess[
     )
 
 
+def program_of(command: str) -> str:
+    """The program that has a sub-command."""
+    return "starid" if command in library.COMMANDS else "starhil"
+
+
 def refusal(*arguments: str) -> str:
     """The one line on standard error of a command that is rejected."""
-    status, out, said = run_command_line(*arguments)
+    status, out, said = run_command_line(*arguments, program=program_of(arguments[0]))
     assert (status, out, said.count("\n")) == (2, "", 1), said
     return said
 
 
 def commands(group: Any = None, path: str = "") -> list[tuple[str, Any]]:
-    """Every command of the command line with its path."""
-    group = typer.main.get_command(app.build_app()) if group is None else group
+    """Every command of both programs with its path."""
+    if group is None:
+        programs = (app.build_app(), library.build_app())
+        return [found for program in programs for found in commands(typer.main.get_command(program))]
     found: list[tuple[str, Any]] = []
     for name, command in group.commands.items():
         below = f"{path} {name}".strip()
@@ -71,11 +81,12 @@ def test_missing_folders_are_made_and_a_file_in_their_place_is_rejected(
     arguments: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "a" / "b" / "out.png"
-    status, _, said = run_command_line(*arguments.split(), str(path))
+    program = program_of(arguments.split(maxsplit=1)[0])
+    status, _, said = run_command_line(*arguments.split(), str(path), program=program)
     assert status == 0, said
     assert path.stat().st_size > 0
     assert [each.name for each in path.parent.iterdir()] == ["out.png"]
-    assert refusal(*arguments.split(), str(path / "c" / "out.png")).startswith(f"starhil: {path / 'c'}")
+    assert refusal(*arguments.split(), str(path / "c" / "out.png")).startswith(f"{program}: {path / 'c'}")
     assert "is a folder" in refusal(*arguments.split(), str(path.parent))
 
 
@@ -97,7 +108,7 @@ def test_an_image_on_the_standard_output_has_its_report_on_the_standard_error() 
 
 @pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp437", "utf-8"])
 def test_an_output_of_any_encoding_shows_every_character(encoding: str) -> None:
-    status, out, said = run_command_line("catalog", "--star", "11767", encoding=encoding)
+    status, out, said = run_command_line("catalog", "--star", "11767", encoding=encoding, program="starid")
     assert (status, said) == (0, "")
     assert "37.97" in out
 
@@ -105,13 +116,13 @@ def test_an_output_of_any_encoding_shows_every_character(encoding: str) -> None:
 def test_characters_that_an_encoding_lacks_are_spelled_out(monkeypatch: pytest.MonkeyPatch) -> None:
     stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
     monkeypatch.setattr("sys.stdout", stream)
-    output.show_every_character()
+    show_every_character()
     print("1σ 0.12″ ≤ 3° 漢 \udcff", file=stream, flush=True)
     assert stream.buffer.getvalue() == b'1sigma 0.12" <= 3 deg \\u6f22 \\udcff\n'  # type: ignore[attr-defined]
 
 
 def test_every_command_rejects_numbers_that_are_not_finite() -> None:
-    assert [path for path, command in commands() if not isinstance(command, app.FiniteCommand)] == []
+    assert [path for path, command in commands() if not isinstance(command, command_line.FiniteCommand)] == []
 
 
 @pytest.mark.parametrize(

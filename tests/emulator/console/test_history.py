@@ -7,7 +7,7 @@ from starhil.emulator.console.history import COLUMNS, History
 
 def test_eight_hours_of_frames_keep_the_newest_hour_in_the_same_memory(bench):
     published = []
-    bench.device.on_frame.append(published.append)
+    bench.device.signals.frame_published.connect(published.append)
     assert bench.command("set_mode", mode="lost_in_space") == 0
     bench.step(2.0)
     history = History(kept=100)
@@ -22,7 +22,7 @@ def test_eight_hours_of_frames_keep_the_newest_hour_in_the_same_memory(bench):
 
 def test_rows_come_oldest_first_whatever_their_number(bench):
     published = []
-    bench.device.on_frame.append(published.append)
+    bench.device.signals.frame_published.connect(published.append)
     bench.command("set_mode", mode="lost_in_space")
     bench.step(8.0)
     history = History(kept=5)
@@ -34,7 +34,7 @@ def test_rows_come_oldest_first_whatever_their_number(bench):
 
 def test_a_frame_without_attitude_has_no_errors_but_its_truth(bench):
     published = []
-    bench.device.on_frame.append(published.append)
+    bench.device.signals.frame_published.connect(published.append)
     bench.pipeline.fail = "no_match"
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.0)

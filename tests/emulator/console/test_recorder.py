@@ -52,7 +52,7 @@ def test_images_truth_measurements_telemetry_and_events_are_read_back(run, tmp_p
     published = []
 
     async def scenario(emulation, _line):
-        emulation.device.on_frame.append(published.append)
+        emulation.device.signals.frame_published.connect(published.append)
         await record(emulation)
 
     run(scenario, options=options(path))

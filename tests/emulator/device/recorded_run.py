@@ -88,7 +88,7 @@ def recording() -> Iterator[str]:
     """Yield the lines of the recording."""
     bench = Bench(Profile(parameters={"canopen_node": 5}), truth=FixedTruth(ATTITUDE))
     sent: list[Reply] = []
-    bench.requests.unsolicited_receivers.append(sent.append)
+    bench.device.signals.unsolicited.connect(sent.append)
     bench.device.power_on()
     for label, seconds, commands in STEPS:
         yield label

@@ -174,7 +174,7 @@ def test_a_jump_marks_no_frame_but_that_which_lost_it(bench):
     bench.pipeline.window_rad = WINDOW_RAD
     bench.command("set_mode", mode="lost_in_space")
     bench.step(4.5)
-    bench.device.cycle.truth = FixedTruth(ORION.rotated((0.5, 0.0, 0.0)))
+    bench.device.surroundings.truth = FixedTruth(ORION.rotated((0.5, 0.0, 0.0)))
     assert reasons(bench, 4) == ["prediction_lost", "ok", "ok", "ok"]
 
 

@@ -120,7 +120,7 @@ def test_a_smaller_size_is_the_mean_over_squares():
 def test_a_new_frame_is_taken_beside_the_stored_image(bench):
     save(bench, "size_64")
     taken = []
-    bench.device.images.capture_full(taken.append)
+    bench.device.images.capture_full().when_done(taken.append)
     assert bench.command("save_image", image_size="size_64") is ErrorCode.BUSY
     bench.step(1.0)
     (frame,) = taken
@@ -153,7 +153,7 @@ def test_a_whole_frame_is_taken_though_frames_stop(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
     taken = []
-    bench.device.images.capture_full(taken.append)
+    bench.device.images.capture_full().when_done(taken.append)
     bench.command("set_mode", mode="standby")
     bench.step(0.25)
     assert [frame.frame for frame in taken] == [bench.pipeline.frames[-1].index]

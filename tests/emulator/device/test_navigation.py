@@ -109,7 +109,7 @@ def test_a_run_continues_after_its_orbit_has_decayed(make_bench, caplog):
         def state(self, _unix_s):
             raise EmulatorError("orbit: TLE: satellite has decayed")
 
-    bench.device.cycle.orbit = Decays()
+    bench.device.surroundings._orbit = Decays()
     bench.command("set_mode", mode="lost_in_space")
     bench.step(3.5)
     assert [frame.position_m for frame in bench.pipeline.frames] == [None] * len(bench.pipeline.frames)

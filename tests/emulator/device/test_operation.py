@@ -49,6 +49,16 @@ def test_start_mode_is_entered_after_boot(make_bench):
     assert bench.device.modes.mode.makes_frames
 
 
+def test_the_end_of_boot_changes_nothing_once_a_fault_has_ended_it(make_bench):
+    bench = make_bench(Profile(parameters={"start_mode": "lost_in_space"}))
+    bench.device.power_on()
+    bench.device.pipeline_ready({})
+    bench.device.modes.fail("catalogue")
+    assert bench.command("set_mode", mode="standby") is ErrorCode.OK
+    bench.step(5.0)
+    assert bench.mode == "standby"
+
+
 def test_error_is_left_for_standby_only(bench):
     bench.device.modes.fail("sensor")
     assert bench.read("device_status")["error"] == "sensor"

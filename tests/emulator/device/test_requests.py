@@ -79,7 +79,7 @@ def test_counters_wrap_at_16_bits(bench):
 
 def test_unsolicited_telemetry_is_sent_at_its_rate(bench):
     sent = []
-    bench.requests.unsolicited_receivers.append(sent.append)
+    bench.device.signals.unsolicited.connect(sent.append)
     assert bench.command("set_unsolicited", telemetry=160, rate=4.0) is ErrorCode.OK
     bench.step(9.99)
     assert len(sent) == 40
@@ -93,7 +93,7 @@ def test_unsolicited_telemetry_is_sent_at_its_rate(bench):
 def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
     bench = make_bench(Profile(parameters={"unsolicited_rate": 2.0, "unsolicited_selection": 128}))
     sent = []
-    bench.requests.unsolicited_receivers.append(sent.append)
+    bench.device.signals.unsolicited.connect(sent.append)
     bench.start()
     assert len(sent) == 3
     assert sent[0].id == 128
@@ -101,7 +101,7 @@ def test_unsolicited_telemetry_of_the_profile_starts_by_itself(make_bench):
 
 def test_unsolicited_image_frame_is_left_out_while_an_image_is_opened(bench):
     sent = []
-    bench.requests.unsolicited_receivers.append(sent.append)
+    bench.device.signals.unsolicited.connect(sent.append)
     bench.command("set_mode", mode="lost_in_space")
     bench.step(2.5)
     bench.command("set_unsolicited", telemetry=192, rate=20.0)

@@ -116,7 +116,7 @@ def test_a_save_that_fails_after_a_reset_takes_back_nothing_that_the_next_one_wr
 
 def changes_of(bench):
     reported = []
-    bench.device.parameters.observe(
+    bench.device.signals.parameters_changed.connect(
         lambda names: reported.append({name: bench.device.parameters[name] for name in names})
     )
     return reported
@@ -172,7 +172,7 @@ def test_forgotten_parameters_are_defaults_after_the_next_restart(make_bench, tm
     bench.command("set_parameter", parameter=1, value=55.0)
     bench.command("save_parameters")
     reported = []
-    bench.device.forget_parameters(reported.append)
+    bench.device.forget_parameters().when_done(reported.append)
     assert reported == [None]
     assert bench.device.parameters["exposure"] == 55
     assert bench.read("device_status")["parameters_changed"]

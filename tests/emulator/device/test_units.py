@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
+from starhil.emulator.run import Run
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode, ReplyKind
 from starid.attitude import Attitude
@@ -86,7 +86,7 @@ def test_the_sign_of_the_scalar_stays_with_the_last_where_any_is_allowed(unit):
     signs = set()
     for _ in range(12):  # a whole turn about x, after which a continuous quaternion has the other sign
         turning = turning.rotated((np.radians(30.0), 0.0, 0.0))
-        bench.device.cycle.truth = FixedTruth(turning)
+        bench.device.surroundings.truth = FixedTruth(turning)
         bench.device.parameters.set({"max_rate": 30.0})
         bench.step(1.0)
         now = reported(bench)
@@ -192,7 +192,7 @@ def test_a_list_of_rows_is_sent_with_each_frame_or_at_a_rate(unit):
         + row("telecommand", 3, "subscribe", SUBSCRIPTION, 'action = "subscribe"')
     )
     sent = []
-    bench.requests.unsolicited_receivers.append(lambda reply: sent.append((reply.kind, reply.id)))
+    bench.device.signals.unsolicited.connect(lambda reply: sent.append((reply.kind, reply.id)))
     assert bench.command("subscribe", row_1=2, row_2=1) is ErrorCode.OK
     bench.step(3.0)
     assert sent == [(ReplyKind.UNSOLICITED, 2), (ReplyKind.UNSOLICITED, 1)] * 3
@@ -218,7 +218,7 @@ def test_subscriptions_end_with_a_reset(unit):
         + row("telecommand", 4, "reset", more='action = "reset"')
     )
     sent = []
-    bench.requests.unsolicited_receivers.append(sent.append)
+    bench.device.signals.unsolicited.connect(sent.append)
     bench.command("subscribe", row_1=1, rate=5.0)
     bench.command("reset")
     bench.step(0.1)
@@ -255,4 +255,4 @@ def test_a_unit_whose_rows_are_bound_to_nothing_does_not_start(tmp_path):
     text = HEAD + row("telemetry", 1, "bare", '{ name = "a", type = "u8" }') + START
     (tmp_path / "unit.toml").write_text(text, encoding="utf-8")
     with pytest.raises(EmulatorError, match="telemetry bare: field a: no `value`"):
-        Emulation(Profile(name="x", unit=str(tmp_path)))
+        Run([Profile(name="x", unit=str(tmp_path))])

@@ -18,8 +18,9 @@ from starhil.protocol.can_framing import (
     MessageType,
     encode_request_frames,
 )
+from starhil.protocol.cubespace_serial import HostReceiver, encode_request
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.serial_interface import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 
@@ -254,10 +255,10 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
         counted = 0
         handle = bench.requests.handle
 
-        def watched(request, later):
+        def watched(request):
             nonlocal counted
             counted += 1
-            replies = handle(request, later)
+            replies = handle(request)
             row = bench.icd.row_by_id(request.id)
             if row is None:
                 assert replies[0].code is ErrorCode.INVALID_ID
@@ -291,10 +292,10 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
         requests = 0
         handle = bench.requests.handle
 
-        def watched(request, later):
+        def watched(request):
             nonlocal requests
             requests += 1
-            return handle(request, later)
+            return handle(request)
 
         bench.requests.handle = watched
         for _ in range(JUNK):

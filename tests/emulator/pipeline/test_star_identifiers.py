@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from starhil.emulator.device.cycle import as_quaternion
+from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineSetup
 from starhil.emulator.pipeline.pipeline import Pipeline

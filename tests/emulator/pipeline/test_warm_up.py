@@ -10,17 +10,17 @@ import pytest
 SCRIPT = """
 import sys
 from dataclasses import replace
-from numba.core.dispatcher import Dispatcher
-from starhil.emulator.emulation import pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import load_profile
+from starid.jit import KernelFunction
 
 def kernels():
     modules = [module for name, module in sys.modules.items() if name.partition(".")[0] in ("starid", "starhil")]
     return {
-        f"{item.py_func.__module__}.{item.__name__}{signature}"
-        for module in modules for item in vars(module).values() if isinstance(item, Dispatcher)
-        for signature in item.signatures
+        f"{item.py_func.__module__}.{item.__name__}({signature})"
+        for module in modules for item in vars(module).values() if isinstance(item, KernelFunction)
+        for signature in item.loaded
     }
 
 requests = []

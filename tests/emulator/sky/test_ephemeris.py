@@ -16,13 +16,12 @@ from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.sky.view import Sky
-from starhil.emulator.truth.config import unix_time
 from starhil.emulator.truth.orbit import KeplerOrbit
 from starid.aberration import aberrated
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
-from starid.earth import earth_and_sun, earth_velocity, in_metres, terrestrial_time
+from starid.earth import earth_and_sun, earth_velocity, in_metres, terrestrial_time, unix_time
 
 NEW_YEAR = unix_time("2026-01-01")
 BY_DATE = Sky({"bodies": "ephemeris"})

@@ -9,7 +9,7 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.truth.config import OrbitConfig, unix_time
+from starhil.emulator.truth.config import OrbitConfig
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.orbit import (
     EARTH_GM_M3_S2,
@@ -20,6 +20,7 @@ from starhil.emulator.truth.orbit import (
 )
 from starhil.emulator.truth.source import FixedTruth, TruthState
 from starid.attitude import Attitude
+from starid.earth import unix_time
 
 NEW_YEAR = 1_767_225_600.0
 VANGUARD = (  # Vallado et al. 2006, AIAA 2006-6753, satellite 5

@@ -61,8 +61,8 @@ class Emulated:
         """Turn at a constant body rate from now on, and let some frames pass."""
         device = self.bench.device
         now_s = self.bench.clock.now_ns() / 1e9
-        attitude = device.cycle.truth.state(now_s).attitude
-        device.cycle.truth = RateTruth(attitude, np.radians(rate_deg_s), now_s)
+        attitude = device.surroundings.truth.state(now_s).attitude
+        device.surroundings.truth = RateTruth(attitude, np.radians(rate_deg_s), now_s)
         self.step(4.0)
 
     def cover(self) -> None:

@@ -6,12 +6,12 @@ import functools
 
 import numpy as np
 
-from starhil.emulator.benchmarks.scenes import Scene, SceneMaker, SceneSettings
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog
 from starid.geometric.identifier import Identifier
 from starid.geometric.pattern_index import resolved_stars
+from starid.lab.leaderboard.scenes import Scene, SceneMaker, SceneSettings
 
 WRONG_ARCSEC = 360.0
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from starhil.emulator.benchmarks.identify import ROWS, STANDARD, best_attitude
-from starhil.emulator.benchmarks.scenes import SceneSettings
 from starid.attitude import ARCSEC_PER_RAD
 from starid.geometric.identifier import Effort, Identifier
+from starid.lab.leaderboard.comparison import ROWS, STANDARD, best_attitude
+from starid.lab.leaderboard.scenes import SceneSettings
 from starid.solution import Reason
 from starid.wahba import METHODS, solve_wahba
 from tests.starid.geometric.sky_points import WRONG_ARCSEC, identifier, maker, scenes

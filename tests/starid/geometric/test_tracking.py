@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starhil.emulator.benchmarks.scenes import SceneSettings
 from starid.attitude import Attitude, propagate, random_attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
 from starid.geometric.identifier import Effort, Identifier
+from starid.lab.leaderboard.scenes import SceneSettings
 from starid.missing import missing_stars
 from starid.solution import Reason, Solution
 from starid.tracker import Tracker

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from sklearn.cluster import DBSCAN
 
+from starid.lab.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import FilterError, ObservedFrame
 from starid.thesis.fsf import ClusterFilter, density_clusters, disparity_list, pair_count, pair_features
 from starid.thesis.metrics import Confusion
 from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis.simulation import PIXEL_DEG, NoiseModel, moved_frames, turned
 
 RADIUS = 21.0
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial import cKDTree
 from sklearn.linear_model import Lasso
 
+from starid.lab.simulation import turned
 from starid.thesis.cell_search import exact_nearest, exact_vector, stored_neighbours
 from starid.thesis.database import DatabaseError
 from starid.thesis.features import FeatureVector, extract_features
 from starid.thesis.lasso import LAMBDAS, coordinate_descent, lasso_path, optimality_gap
 from starid.thesis.lsi import LostInSpace
 from starid.thesis.metrics import boresight_error
-from starid.thesis.simulation import turned
 from starid.thesis.subcell import SubcellSearch
 from tests.starid.thesis.thesis_sky import database, lost_in_space, thesis_frames
 

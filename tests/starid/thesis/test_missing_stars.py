@@ -7,13 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
+from starid.lab.simulation import turned
 from starid.thesis.cme import estimate_motion
 from starid.thesis.database import DatabaseError, DatabaseParameters, build_database
 from starid.thesis.false_stars import FilterResult, ObservedFrame
 from starid.thesis.lsi import LostInSpace
 from starid.thesis.metrics import boresight_error
 from starid.thesis.missing_stars import DividedField, restore_missing
-from starid.thesis.simulation import turned
 from tests.starid.thesis.thesis_sky import lost_in_space, thesis_catalog
 
 RADIUS = 20.0

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from sklearn.linear_model import Lasso
 
+from starid.lab.simulation import NoiseModel, moved_frames
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.lasso import LAMBDAS, lasso_path
 from starid.thesis.lsi import LostInSpace
 from starid.thesis.reference import ReferenceFilter, ReferenceLostInSpace, reference_path
-from starid.thesis.simulation import NoiseModel, moved_frames
 from tests.starid.thesis.thesis_sky import database, lost_in_space
 
 STARS = np.array(

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from starid.lab.simulation import NoiseModel, add_noise, sky_sequence, turned
 from starid.thesis.cme import estimate_motion
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.metrics import boresight_error, error_colours, rotation_error
@@ -20,7 +21,6 @@ from starid.thesis.rsi import (
 )
 from starid.thesis.rsi_memory import AnswerMemory
 from starid.thesis.scalable_filter import TrackFilter, TrackFilterSettings
-from starid.thesis.simulation import NoiseModel, add_noise, sky_sequence, turned
 from tests.starid.thesis.thesis_sky import lost_in_space
 
 

@@ -1,0 +1,42 @@
+"""What the parts of a head report to each other. All signals of a head are declared here.
+
+::
+
+    cycle ──exposed──► images              cycle ──frame_published──► device, subscriptions, CANopen, logs, console
+    modes ──mode_changed──► device, CANopen, console        parameters ──parameters_changed──► device, subscriptions, links
+    device ──started──► subscriptions      device ──restarted──► links, revival of the pipeline
+    subscriptions ──row_due──► requests    requests ──unsolicited──► links
+
+The sender changes its own state before it reports. Observers are called in the order in which the parts were made:
+first the device, so that every other part finds it up to date.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.device.modes import Transition
+from starhil.emulator.signals import Signal
+from starhil.protocol.codec import Row
+from starhil.protocol.messages import Reply
+
+
+@dataclass(frozen=True)
+class Signals:
+    """The signals of a head."""
+
+    exposed: Signal[int] = field(default_factory=lambda: Signal("exposure"))
+    """An exposure was sent to the pipeline; its index."""
+    frame_published: Signal[Measurement] = field(default_factory=lambda: Signal("frame"))
+    mode_changed: Signal[Transition] = field(default_factory=lambda: Signal("mode"))
+    parameters_changed: Signal[frozenset[str]] = field(default_factory=lambda: Signal("parameters"))
+    """Parameters have other values; their names."""
+    started: Signal[str] = field(default_factory=lambda: Signal("start"))
+    """The device was switched on or reset, and has set parameters and time; the cause."""
+    restarted: Signal[str] = field(default_factory=lambda: Signal("reset"))
+    """A reset is complete; the cause."""
+    row_due: Signal[Row] = field(default_factory=lambda: Signal("unsolicited row"))
+    """A telemetry row is due to be sent unsolicited."""
+    unsolicited: Signal[Reply] = field(default_factory=lambda: Signal("unsolicited telemetry"))
+    """A message for every link."""

@@ -1,0 +1,95 @@
+"""What acts on a sensor from outside: its true motion, date and orbit, temperature, radiation, and optical faults."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from starhil.emulator.clock import NANOSECONDS
+from starhil.emulator.device.power import ThermalModel
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.profile import Profile
+from starhil.emulator.sky.radiation import particle_rate
+from starhil.emulator.sky.view import has_aberration
+from starhil.emulator.truth.orbit import Orbit
+from starhil.emulator.truth.source import TruthSource, TruthState
+
+log = logging.getLogger("starhil.device")
+
+
+@dataclass(frozen=True)
+class Conditions:
+    """Conditions of the detector: temperature, °C, and particles per second."""
+
+    temperature_c: float
+    particles_s: float
+
+
+class Surroundings:
+    """The surroundings of a sensor.
+
+    Parameters
+    ----------
+    profile
+        Date, orbit, radiation and sky.
+    truth
+        Truth of the sensor; what it describes may change during a run.
+    thermal
+        Temperature of the unit.
+    now_ns
+        Returns the simulation time, nanoseconds.
+
+    Attributes
+    ----------
+    faults
+        Optical faults: fields of the sky objects that differ from the profile's.
+    has_aberration
+        Whether the sky has aberration.
+    """
+
+    def __init__(
+        self, profile: Profile, truth: TruthSource, thermal: ThermalModel, now_ns: Callable[[], int]
+    ) -> None:
+        self.truth = truth
+        self.has_aberration = profile.images.used or bool(has_aberration(profile.sky))
+        self.faults: dict[str, Any] = {}
+        self._radiation = profile.radiation
+        self._start_unix_s = profile.start_unix_s
+        self._orbit = orbit_of(profile)
+        self._thermal = thermal
+        self._now_ns = now_ns
+
+    def state(self, at_ns: int) -> TruthState:
+        """Return the truth with date and orbit at a simulation time in nanoseconds."""
+        t_s = at_ns / NANOSECONDS
+        state, unix_s = self.truth.state(t_s), self._start_unix_s + t_s
+        try:
+            return state.completed(unix_s, self._orbit)
+        except EmulatorError as error:
+            log.warning("%s; the run continues without an orbit", error)
+            self._orbit = None
+            return state.completed(unix_s, None)
+
+    def conditions(self, truth: TruthState) -> Conditions:
+        """Return the current conditions of the detector."""
+        position_m = None if truth.orbit is None else truth.orbit.position_m
+        particles_s = particle_rate(
+            self._radiation.quiet_s, self._radiation.anomaly_s, position_m, truth.unix_s
+        )
+        return Conditions(self._thermal.temperature_c(self._now_ns()), particles_s)
+
+    def set_faults(self, faults: dict[str, Any]) -> None:
+        """Replace the optical faults."""
+        self.faults = faults
+
+
+def orbit_of(profile: Profile) -> Orbit | None:
+    """Return the true orbit of a profile, or None."""
+    if profile.orbit is None:
+        return None
+    try:
+        return profile.orbit.build(profile.start_unix_s)
+    except EmulatorError as error:
+        raise EmulatorError(f"profile {profile.source}: {error}") from None

@@ -1,0 +1,216 @@
+"""Fault injection at three levels: optical, device and link."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Final, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from starhil.emulator.device.device import Device
+from starhil.emulator.device.parameters import memory_bits
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.base import Link
+from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
+from starhil.emulator.sky.objects import SkyObjects
+from starhil.emulator.truth.config import Strict
+
+
+def check_sky(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values if they are valid fields of `SkyObjects`.
+
+    Raises
+    ------
+    ValueError
+        A field is invalid; the message names it and the allowed values.
+    """
+    try:
+        SkyObjects.from_dict(values)
+    except EmulatorError as error:
+        raise ValueError(str(error)) from None
+    return values
+
+
+SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
+"""Fields of `SkyObjects` as decoded from TOML or JSON."""
+
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
+
+
+NO_ERROR: Final = 0
+"""Value in `device_error` that means no error."""
+
+
+class UpsetFault(Strict):
+    """A bit flipped by a particle in the memory of the device: in a parameter or in a star's direction."""
+
+    parameter: str | None = None
+    """Name of the parameter."""
+    star: Annotated[int, Field(ge=1, le=200_000)] | None = None
+    """Hipparcos number of the star."""
+    component: Annotated[int, Field(ge=0, le=2)] = 0
+    """Component of the star's direction: 0, 1 or 2 for x, y or z."""
+    bit: Annotated[int, Field(ge=0, le=63)]
+    """Bit number, 0 for the least significant; components of directions have 32 bits."""
+
+    @model_validator(mode="after")
+    def _one_target(self) -> Self:
+        if (self.parameter is None) == (self.star is None):
+            raise ValueError("give either parameter or star")
+        return self
+
+
+class DeviceFault(Strict):
+    """A fault of the device."""
+
+    stuck: bool = False
+    """Unresponsive: requests are neither counted nor answered; exposures continue."""
+    error: str | None = None
+    """Enter the error mode with this error, a name in the enumeration `device_error`."""
+    reset: str | None = None
+    """Restart now with this cause, a name in the enumeration `reset_cause`."""
+    upset: UpsetFault | None = None
+    """Flip a bit in memory; undone by a restart or by restoring the parameters."""
+
+
+class WireFault(Strict):
+    """Faults of a link; see `WireFaultSettings`."""
+
+    drop: Probability = 0.0
+    """Probability that an outgoing serial reply or CAN frame is lost."""
+    corrupt: Probability = 0.0
+    """Probability that one of its bits is flipped."""
+    junk: Probability = 0.0
+    """Probability that random bytes, or a CAN frame with a random CAN ID, are sent before it."""
+    delay_s: Seconds = 0.0
+    """Delay of everything that is sent."""
+    split: Annotated[int, Field(ge=0, le=4096)] = 0
+    """Size of the chunks in which serial replies are sent; 0: not split."""
+    gap_s: Seconds = 0.02
+    """Pause between the chunks."""
+
+    def settings(self) -> WireFaultSettings:
+        """Return the settings for a link."""
+        return WireFaultSettings(**self.model_dump())
+
+
+class FaultRequest(Strict):
+    """One `fault` request; omitted levels keep their faults."""
+
+    optical: SkyValues | None = None
+    """Objects in addition to the sky of the profile: fields of `SkyObjects`, or `blocked_share`."""
+    device: DeviceFault | None = None
+    """Fault of the device."""
+    serial: WireFault | None = None
+    """Faults of the serial line."""
+    can: WireFault | None = None
+    """Faults of outgoing CAN frames, including CANopen."""
+
+
+class Faults:
+    """The currently injected faults.
+
+    Parameters
+    ----------
+    device
+        Device that the faults affect.
+    links
+        The links of the device, also those that are opened later.
+    """
+
+    def __init__(self, device: Device, links: Sequence[Link]) -> None:
+        self._device = device
+        self._links = links
+        self._optical: dict[str, Any] = {}
+
+    @property
+    def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
+        return [(link.bus, link.wire) for link in self._links]
+
+    def inject(self, request: FaultRequest) -> None:
+        """Inject the faults of a request, all or none."""
+        self.check(request)
+        device = self._device
+        if request.optical is not None:
+            self._optical = dict(request.optical)
+            device.surroundings.set_faults(self._optical)
+        faults = {"serial": request.serial, "can": request.can}
+        for name, wire in self._wires:
+            fault = faults[name]
+            if fault is not None:
+                wire.settings = fault.settings()
+        if request.device is not None:
+            device.unresponsive = request.device.stuck
+            if request.device.reset is not None:
+                device.reset(request.device.reset)
+            if request.device.error is not None:
+                device.modes.fail(request.device.error)
+            if request.device.upset is not None:
+                self._upset(request.device.upset)
+
+    def _upset(self, upset: UpsetFault) -> None:
+        if upset.parameter is not None:
+            self._device.upset_parameter(upset.parameter, upset.bit)
+        elif upset.star is not None:
+            self._device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
+
+    def check(self, request: FaultRequest) -> None:
+        """Check that the faults of a request can be injected."""
+        enums = self._device.icd.model.enums
+        if request.device is not None:
+            errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]
+            for key, name, known in (
+                ("error", request.device.error, errors),
+                ("reset", request.device.reset, list(enums["reset_cause"].values)),
+            ):
+                if name is not None and name not in known:
+                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
+            if request.device.upset is not None:
+                self._check_upset(request.device.upset)
+        there = {name for name, _ in self._wires}
+        for name, fault in (("serial", request.serial), ("can", request.can)):
+            if fault is not None and name not in there:
+                raise EmulatorError(
+                    f"{name}: this run has no such link; start it with --{name}, or omit this fault"
+                )
+
+    def _check_upset(self, upset: UpsetFault) -> None:
+        if upset.parameter is not None:
+            definition = self._device.icd.parameters.get(upset.parameter)
+            if definition is None:
+                raise EmulatorError(f"device.upset.parameter: {upset.parameter!r} is not a parameter")
+            if upset.bit >= memory_bits(definition):
+                raise EmulatorError(
+                    f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"
+                )
+        elif upset.bit >= DIRECTION_BITS:
+            raise EmulatorError(f"device.upset.bit: a direction has bits 0 to {DIRECTION_BITS - 1}")
+        elif self._device.profile.run.algorithm != "geometric":
+            raise EmulatorError("device.upset.star: only the algorithm geometric keeps directions in memory")
+
+    def clear(self) -> None:
+        """End all faults; the error mode ends only by telecommand, and flipped parameters by a restart."""
+        self._optical = {}
+        device = self._device
+        device.surroundings.set_faults({})
+        device.unresponsive = False
+        device.cycle.restore_catalog()
+        for _, wire in self._wires:
+            wire.settings = WireFaultSettings()
+
+    def describe(self) -> dict[str, Any]:
+        """Return the current faults by level."""
+        found: dict[str, Any] = {}
+        if self._optical:
+            found["optical"] = dict(self._optical)
+        if self._device.unresponsive:
+            found["device"] = {"stuck": True}
+        if self._device.cycle.upsets:
+            stars = [upset.hip for upset in self._device.cycle.upsets]
+            found.setdefault("device", {})["upset_stars"] = stars
+        for name, wire in self._wires:
+            if not wire.settings.none:
+                found[name] = vars(wire.settings)
+        return found

@@ -1,0 +1,99 @@
+"""Checks: sum, XOR, CRC and XXH32, each bit by bit or step by step from its definition.
+
+Sources: the Rocksoft model (R. Williams, "A painless guide to CRC error detection algorithms", 1993), whose terms
+the CRC catalogues use, and the xxHash specification (Y. Collet, doc/xxhash_spec.md). The tests compare with the check
+values that the catalogues publish for "123456789" and with `zlib`, `binascii` and the xxHash library.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from starhil.hil_tests.judge.rows import SIZES
+
+WORD: Final = 0xFFFFFFFF
+
+
+def check_function(
+    model: Any, order: Any, custom: Callable[[str], Callable[[bytes], bytes]]
+) -> Callable[[bytes], bytes]:
+    """Return the check that a definition selects, as a function from the covered bytes to the bytes sent.
+
+    `custom` returns a check of the unit's plugin by name.
+    """
+    order = getattr(model, "order", None) or order
+    match model.kind:
+        case "none":
+            return lambda _covered: b""
+        case "sum":
+            return lambda covered: _sum(covered, SIZES[model.type], model.complement).to_bytes(
+                SIZES[model.type], order
+            )
+        case "xor":
+            return lambda covered: bytes((_xor(covered, model.init),))
+        case "crc":
+            size = SIZES[model.type]
+            return lambda covered: crc(
+                covered, 8 * size, model.poly, model.init, model.xor, reflect=model.reflect
+            ).to_bytes(size, order)
+        case "xxh32":
+            return lambda covered: xxh32(covered, model.seed).to_bytes(4, order)
+        case _:
+            return custom(model.name)
+
+
+def _sum(covered: bytes, size: int, complement: str) -> int:
+    total = sum(covered) % (1 << 8 * size)
+    return {"none": total, "ones": (1 << 8 * size) - 1 - total, "twos": -total % (1 << 8 * size)}[complement]
+
+
+def _xor(covered: bytes, start: int) -> int:
+    for byte in covered:
+        start ^= byte
+    return start
+
+
+def crc(data: bytes, bits: int, poly: int, init: int, xor_out: int, *, reflect: bool) -> int:
+    """Return a CRC: the register shifts once for each bit of the message, the highest bit first unless reflected."""
+    register = init
+    for byte in data:
+        for place in range(8) if reflect else range(7, -1, -1):
+            out = register >> bits - 1 ^ byte >> place & 1
+            register = (register << 1 ^ (poly if out else 0)) & (1 << bits) - 1
+    if reflect:
+        register = sum((register >> place & 1) << bits - 1 - place for place in range(bits))
+    return register ^ xor_out
+
+
+PRIMES: Final = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1)
+
+
+def _rotated(number: int, count: int) -> int:
+    number &= WORD
+    return (number << count | number >> 32 - count) & WORD
+
+
+def xxh32(data: bytes, seed: int) -> int:
+    """Return XXH32, in the steps of its specification."""
+    one, two, three, four, five = PRIMES
+    striped = len(data) // 16 * 16
+    if len(data) >= 16:
+        lanes = [seed + one + two, seed + two, seed, seed - one]  # step 1
+        for start in range(0, striped, 4):  # step 2: four lanes in turn
+            word = int.from_bytes(data[start : start + 4], "little")
+            lane = start // 4 % 4
+            lanes[lane] = _rotated(lanes[lane] + word * two, 13) * one & WORD
+        total = sum(_rotated(lane, turn) for lane, turn in zip(lanes, (1, 7, 12, 18), strict=True))  # step 3
+    else:
+        total = seed + five
+    total += len(data)  # step 4
+    rest = data[striped:]
+    for start in range(0, len(rest) // 4 * 4, 4):  # step 5
+        total = _rotated(total + int.from_bytes(rest[start : start + 4], "little") * three, 17) * four
+    for byte in rest[len(rest) // 4 * 4 :]:
+        total = _rotated(total + byte * five, 11) * one
+    total &= WORD
+    for shift, prime in ((15, two), (13, three), (16, 1)):  # step 6
+        total = (total ^ total >> shift) * prime & WORD
+    return total

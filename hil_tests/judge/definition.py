@@ -1,0 +1,206 @@
+"""The definition as data: the one module of the judge that knows the types of `starhil.protocol`.
+
+It copies what the TOML files say, field by field. What follows from it (offsets, bit positions, sizes) is counted
+here from the order of the fields, so that an error of the product's layout is not copied. Shared on purpose, and
+said so in docs/rules.md: the reader of the TOML files; the framing and check of a unit's own plugin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+from starhil.hil_tests.judge.framings import Framing, Measure, Taken
+from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
+from starhil.hil_tests.judge.rows import SIZES, Field, Row
+from starhil.protocol.canopen.layout import read_layout
+from starhil.protocol.framings import Receiving
+from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.unit_folders import find_unit
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter that the unit exposes."""
+
+    id: int
+    name: str
+    type: str
+    minimum: float
+    maximum: float
+    default: float
+    enum: Mapping[str, int] | None
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The definition of a unit.
+
+    Attributes
+    ----------
+    folder
+        Folder of its files; None for a definition that was not read from one.
+    serial, can
+        Models of `[link.serial]` and `[link.can]`; None if the unit does not have the link.
+    unanswered
+        Rows that the serial line does not answer.
+    errors
+        Number of each error by name.
+    telecommand_crc
+        Whether a telecommand may be followed by its CRC-8.
+    canopen
+        Model of `[canopen]`: objects and PDOs; None if the unit has none.
+    """
+
+    name: str
+    folder: Path | None
+    telecommands: Mapping[str, Row]
+    telemetry: Mapping[str, Row]
+    parameters: Mapping[str, Parameter]
+    serial: Any
+    can: Any
+    byte_order: Literal["little", "big"]
+    classes: tuple[Any, ...] = ()
+    unanswered: frozenset[str] = frozenset()
+    errors: Mapping[str, int] = field(default_factory=dict)
+    first_telemetry_id: int | None = None
+    telecommand_crc: bool = False
+    plugin: Any = None
+    canopen: Any = None
+
+    @cached_property
+    def rows(self) -> tuple[Row, ...]:
+        """All rows: telecommands, then telemetry, each in the order of IDs."""
+        tables = (self.telecommands, self.telemetry)
+        return tuple(row for table in tables for row in sorted(table.values(), key=lambda row: row.id))
+
+    @cached_property
+    def _by_key(self) -> Mapping[tuple[str, int], Row]:
+        return {(row.klass, row.id): row for row in self.rows}
+
+    def row(self, request: Request) -> Row | None:
+        """Return the row of a request; without a class, the first row with its ID."""
+        found = self._by_key.get((request.klass, request.id))
+        if found is None and not request.klass:
+            found = next((row for row in self.rows if row.id == request.id), None)
+        return found
+
+    def is_telemetry(self, klass: str, row_id: int) -> bool:
+        """Return whether an ID, which need not belong to a row, is telemetry."""
+        kind = next((item.kind for item in self.classes if item.name == klass), None)
+        if kind is not None:
+            return str(kind.value) == "telemetry"
+        if self.first_telemetry_id is not None:
+            return row_id >= self.first_telemetry_id
+        return any(row.id == row_id for row in self.telemetry.values())
+
+    def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
+        """Return the request for a row, or for an ID, which need not belong to one."""
+        if isinstance(row, int):
+            return Request(row, data, klass, self.is_telemetry(klass, row))
+        return Request(row.id, data, row.klass, row.is_telemetry)
+
+    def code(self, error: str) -> int:
+        """Return the unit's number for an error."""
+        if not self.errors:
+            return PUBLISHED.index(error)
+        return self.errors.get(error, self.errors.get("other", PUBLISHED.index(error)))
+
+
+def read_unit(name_or_folder: str | Path) -> Unit:
+    """Return the definition of a unit: a bundled unit by name, a folder of TOML files, or one file."""
+    path = find_unit(name_or_folder)
+    return unit_of(load_unit(name_or_folder), path if path.is_dir() else path.parent)
+
+
+def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
+    """Return a definition in the judge's types."""
+    serial = icd.link.serial
+    return Unit(
+        name=icd.name,
+        folder=folder,
+        telecommands={row.name: _row(row) for row in icd.telecommands.values()},
+        telemetry={row.name: _row(row) for row in icd.telemetry.values()},
+        parameters={item.name: _parameter(item) for item in icd.parameters.values()},
+        serial=serial,
+        can=icd.link.can,
+        byte_order=icd.conventions.byte_order,
+        classes=icd.classes,
+        unanswered=frozenset(getattr(serial.framing, "unanswered", ()) if serial is not None else ()),
+        errors=icd.errors,
+        first_telemetry_id=icd.first_telemetry_id,
+        telecommand_crc=icd.conventions.telecommand_crc,
+        plugin=icd.plugin,
+        canopen=read_layout(icd) if icd.canopen is not None else None,
+    )
+
+
+def _parameter(item: Any) -> Parameter:
+    enum = None if item.enum is None else item.enum.values
+    default = enum[item.default] if enum is not None else float(item.default)
+    return Parameter(item.id, item.name, item.type, item.minimum, item.maximum, float(default), enum)
+
+
+def _row(row: Any) -> Row:
+    return Row(
+        row.kind, row.id, row.name, tuple(_fields(row)), row.klass, row.provenance, row.source, row.action, row.arguments,
+        row.answers,
+    )  # fmt: skip
+
+
+def _fields(row: Any) -> Iterator[Field]:
+    """Yield the fields of a row in wire order: bytes follow bytes, and bits of the same bytes follow bits."""
+    offset = 0
+    for slot in row.slots:
+        size = SIZES.get(slot.type, slot.size)
+        shift = 0
+        for item in row.fields:
+            if item.slot.index != slot.index:
+                continue
+            default: Value | None = item.default
+            yield Field(
+                item.name, item.kind, slot.type, slot.order, offset, size, shift, item.width, item.scale, item.bias,
+                item.minimum, item.maximum, None if item.enum is None else item.enum.values, default, item.const,
+                item.value, item.argument, item.telecommand, item.unit,
+            )  # fmt: skip
+            shift += item.width
+        offset += size
+
+
+def plugin_check(unit: Unit, name: str) -> Any:
+    """Return a check of the unit's plugin."""
+    return unit.plugin.checks[name]
+
+
+def plugin_framing(unit: Unit) -> Framing:
+    """Return the framing of the unit's plugin."""
+    return _PluginFraming(unit)
+
+
+class _PluginFraming:
+    """A framing of a plugin, whose own deframer finds the messages."""
+
+    marks = b"\x1f\x7f\xff"
+
+    def __init__(self, unit: Unit) -> None:
+        link = unit.serial
+        self._framing = unit.plugin.framings[link.framing.name]()
+        self._sizes = link.max_size or 1 << 16, link.timeout
+
+    def encode(self, body: bytes) -> bytes:
+        """Return a body as bytes on the line."""
+        line: bytes = self._framing.encode(body)
+        return line
+
+    def take(self, received: bytearray, measure: Measure) -> Taken | None:
+        """Remove the first message that the plugin finds."""
+        deframer = self._framing.deframer(Receiving(lambda body: body, measure, *self._sizes))
+        for position, byte in enumerate(received, 1):
+            for found in deframer.feed(bytes((byte,)), 0.0):
+                line = bytes(received[:position])
+                del received[:position]
+                return Taken(found) if isinstance(found, bytes) else Taken(line, junk=True)
+        return None

@@ -1,0 +1,41 @@
+"""Framing by size: a field of the header counts the bytes (`length`), or each row has its own size (`fixed`).
+
+    | start | header … length … | data | check | end |        length
+    | start | header | data of the row's size  | check | end |        fixed
+      DE AD                                             BE EF        NOS3 (generic_star_tracker_device.c)
+
+Start and end may be empty. There is no escaping: the marks may occur in the body.
+"""
+
+from __future__ import annotations
+
+from starhil.hil_tests.judge.framings import Measure, Taken, junk
+
+
+class Counted:
+    """A body of a known size between marks."""
+
+    def __init__(self, start: list[int], end: list[int]) -> None:
+        self._start, self._end = bytes(start), bytes(end)
+        self.marks = self._start + self._end or b"\x1f\x7f\xff"
+
+    def encode(self, body: bytes) -> bytes:
+        """Return the body between its marks."""
+        return self._start + body + self._end
+
+    def take(self, received: bytearray, measure: Measure) -> Taken | None:
+        """Remove a message that must begin at once."""
+        begun = bytes(received[: len(self._start)])
+        if begun != self._start[: len(begun)]:
+            return junk(received)
+        try:
+            size = measure(bytes(received[len(self._start) :]))
+        except ValueError:
+            return junk(received)
+        if size is None or len(received) < len(self._start) + size + len(self._end):
+            return None
+        line = bytes(received[: len(self._start) + size + len(self._end)])
+        if line[len(self._start) + size :] != self._end:
+            return junk(received)
+        del received[: len(line)]
+        return Taken(line[len(self._start) : len(self._start) + size])

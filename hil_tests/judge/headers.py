@@ -1,0 +1,149 @@
+"""Headers: fields by role before the data of a message, and the check behind the data.
+
+    | field | field | bit bit bit … | field … |  data  | check |
+     address  class   id ack final     ticks
+
+Source: docs/units.md, which defines the roles; the headers of Sagitta (c2a-aobc sagitta.c), NSP (cosmos-core
+sinclair_lib.cpp) and NOS3 are such lists. Bits are listed from the lowest. A `length` counts the parts that its
+`includes` names. A constant, an address and a length in an answer must be exactly what the definition says.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from starhil.hil_tests.judge.rows import SIZES
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A header that was read: values by role, name of the class, and size."""
+
+    values: Mapping[str, int]
+    klass: str
+    size: int
+
+
+class Header:
+    """The header of requests or of replies.
+
+    Parameters
+    ----------
+    models
+        Fields as in the definition.
+    order
+        Byte order of the unit.
+    codes
+        Code of each class in messages of this direction; several codes may name one class.
+    sizes
+        Bytes of `start`, `check` and `end`, which a length may include.
+    """
+
+    def __init__(
+        self,
+        models: Sequence[Any],
+        order: Literal["little", "big"],
+        codes: Sequence[tuple[str, int]],
+        sizes: Mapping[str, int],
+    ) -> None:
+        self._models, self._order = models, order
+        self._codes, self._sizes = codes, sizes
+
+    def _in(self, klass: str) -> Iterator[Any]:
+        return (model for model in self._models if model.classes is None or klass in model.classes)
+
+    def roles(self, klass: str | None = None) -> set[str]:
+        """Return the roles in messages of a class, or of any."""
+        models = self._models if klass is None else self._in(klass)
+        return {part.role for model in models for part in (model, *model.bits) if part.role is not None}
+
+    def place(self, model: Any, klass: str) -> tuple[int, int]:
+        """Return offset and size of a field in messages of a class."""
+        before = [_size(item) for item in self._in(klass)]
+        number = list(self._in(klass)).index(model)
+        return sum(before[:number]), _size(model)
+
+    def size(self, klass: str) -> int:
+        """Return the bytes of the header in messages of a class."""
+        return sum(_size(model) for model in self._in(klass))
+
+    def write(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
+        """Return the header of a message; a role without a value has its default."""
+        line = b""
+        for model in self._in(klass):
+            number = 0
+            if model.bits:
+                shift = 0
+                for bit in model.bits:
+                    number |= _sent(bit, values) << shift
+                    shift += bit.width
+            elif model.role == "length":
+                number = self._counted(model, self.size(klass), data_size)
+            else:
+                number = _sent(model, values)
+            line += number.to_bytes(
+                _size(model), model.order or self._order, signed=model.type.startswith("i")
+            )
+        return line
+
+    def read(self, body: bytes) -> Opened | None:
+        """Read a header; return None if more bytes are needed.
+
+        Raises ValueError for a constant or class that the definition does not have.
+        """
+        values: dict[str, int] = {}
+        klass, position = "", 0
+        for model in self._models:
+            if model.classes is not None and klass not in model.classes:
+                continue
+            piece = body[position : position + _size(model)]
+            if len(piece) < _size(model):
+                return None
+            position += len(piece)
+            number = int.from_bytes(piece, model.order or self._order, signed=model.type.startswith("i"))
+            _note(model, number, values)
+            for bit in model.bits:
+                _note(bit, number & (1 << bit.width) - 1, values)
+                number >>= bit.width
+            if "class" in values and not klass:
+                klass = next((name for name, code in self._codes if code == values["class"]), "")
+                if not klass:
+                    raise ValueError(f"class {values['class']}")
+        return Opened(values, klass, position)
+
+    def data_size(self, opened: Opened) -> int | None:
+        """Return the bytes of data that the length in a header gives; None if it has no length."""
+        model = next((item for item in self._in(opened.klass) if item.role == "length"), None)
+        return None if model is None else opened.values["length"] - self._counted(model, opened.size, 0)
+
+    def _counted(self, model: Any, header: int, data: int) -> int:
+        sizes = {**self._sizes, "header": header, "data": data}
+        return sum(sizes[part] for part in model.includes)
+
+    def seconds(self, role: str, count: int) -> float:
+        """Return a number of counts of `ticks` or `time` in seconds."""
+        return count * next(float(model.scale) for model in self._models if model.role == role)
+
+
+def _size(model: Any) -> int:
+    return SIZES[model.type.replace("bits", "u")]
+
+
+def _sent(part: Any, values: Mapping[str, int]) -> int:
+    """Return what a field or bit sends: its constant, the value for its role, or its default."""
+    if part.const is not None:
+        return int(part.const)
+    return values.get(part.role, part.default or 0)
+
+
+def _note(part: Any, number: int, values: dict[str, int]) -> None:
+    """Record the value of a role; a constant or an address must be that of the definition."""
+    required = part.const
+    if required is None and part.role == "address":
+        required = part.default or 0
+    if required is not None and number != required:
+        raise ValueError(f"{part.role or 'constant'} {number}, must be {required}")
+    if part.role is not None:
+        values[part.role] = number

@@ -1,0 +1,328 @@
+"""Rows: physical values to bytes and back.
+
+     row   | field | field | b7 b6 … b0 | field …        fields follow each other without gaps
+     bits  the first bit of a definition is the lowest bit of the number that the bytes make
+     value physical = raw × scale + bias; an enumeration names raw values; a flag is one bit or 0 and 1
+
+Source: docs/units.md, which defines the terms; integers are two's complement and floats IEEE 754 in the byte order
+of the field. A field without a name is sent as zeros.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import struct
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final, Literal
+
+from starhil.hil_tests.judge.messages import Value
+
+FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
+RowKind = Literal["telecommand", "telemetry"]
+SIZES: Final = {
+    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
+}  # fmt: skip
+"""Bytes of each type of number."""
+LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
+"""Largest finite number of each floating type; any finite number fits f64."""
+
+
+@dataclass(frozen=True)
+class Field:
+    """One value of a row, and where it lies.
+
+    Attributes
+    ----------
+    name
+        Empty for unused bytes or bits.
+    type, order
+        Type (`bytes` for raw bytes and text) and byte order of the bytes that hold it.
+    offset, size
+        These bytes in the row.
+    shift, width
+        Lowest bit and number of bits; a width of 0 stands for the whole number.
+    unit, scale, bias, minimum, maximum
+        Physical value; limits None if only the type limits it.
+    value, argument, telecommand
+        Quantity that it reports, argument of the action that it sets, telecommand whose value it reports.
+    """
+
+    name: str
+    kind: FieldKind
+    type: str
+    order: Literal["little", "big"]
+    offset: int
+    size: int
+    shift: int = 0
+    width: int = 0
+    scale: float = 1.0
+    bias: float = 0.0
+    minimum: float | None = None
+    maximum: float | None = None
+    enum: Mapping[str, int] | None = None
+    default: Value | None = None
+    const: int | float | None = None
+    value: str | None = None
+    argument: str | None = None
+    telecommand: str | None = None
+    unit: str = ""
+
+    @property
+    def type_limits(self) -> tuple[int, int]:
+        """Lowest and highest raw number that the bits can hold."""
+        bits = self.width or 8 * self.size
+        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.type.startswith("i") else (0, (1 << bits) - 1)
+
+    @cached_property
+    def raw_limits(self) -> tuple[int, int]:
+        """Lowest and highest raw number within the limits."""
+        ends = [
+            None if end is None else round((end - self.bias) / self.scale)
+            for end in (self.minimum, self.maximum)
+        ]
+        low, high = ends if self.scale > 0 else ends[::-1]
+        least, greatest = self.type_limits
+        return least if low is None else max(low, least), greatest if high is None else min(high, greatest)
+
+    @cached_property
+    def limits(self) -> tuple[float, float]:
+        """Lowest and highest physical number."""
+        if self.kind == "float":
+            widest = LARGEST[self.type]
+            low, high = self.minimum, self.maximum
+            return -widest if low is None else low, widest if high is None else high
+        low, high = sorted(raw * self.scale + self.bias for raw in self.raw_limits)
+        return low, high
+
+    @cached_property
+    def plain(self) -> Value:
+        """A value that must be accepted: the default, otherwise the one nearest zero."""
+        for given in (self.const, self.default):
+            if given is not None:
+                return given
+        match self.kind:
+            case "bytes":
+                return bytes(self.size)
+            case "text":
+                return ""
+            case "flag":
+                return False
+            case "enum":
+                return next(iter(self.enum or {}), 0)
+            case _:
+                low, high = self.limits
+                return (
+                    min(max(0.0, low), high)
+                    if self.kind == "float" or self.scale != 1.0
+                    else min(max(0, low), high)
+                )
+
+    def bytes_of(self, value: Value) -> bytes:
+        """Return the bytes of a field that shares them with no other."""
+        if isinstance(value, bytes):
+            return value.ljust(self.size, b"\0")
+        if self.kind == "text":
+            return str(value).encode("latin-1").ljust(self.size, b"\0")
+        if self.kind == "float":
+            return self.bytes_of_float((float(value) - self.bias) / self.scale)
+        return self.bytes_of_raw(self.raw_of(value))
+
+    def bytes_of_float(self, raw: float) -> bytes:
+        """Return the bytes of a raw floating-point number."""
+        return struct.pack(
+            ("<" if self.order == "little" else ">") + {"f32": "f", "f64": "d"}[self.type], raw
+        )
+
+    def bytes_of_raw(self, raw: int) -> bytes:
+        """Return the bytes of a raw integer."""
+        return raw.to_bytes(self.size, self.order, signed=self.type.startswith("i"))
+
+    def raw_of(self, value: Value) -> int:
+        """Return the raw number of a flag, a member of an enumeration, or a physical number."""
+        if isinstance(value, str):
+            return (self.enum or {})[value]
+        if isinstance(value, bytes):
+            raise TypeError(f"{self.name}: bytes are not a number")
+        if self.kind in ("enum", "flag") or (self.scale == 1.0 and self.bias == 0.0):
+            return round(value)
+        return round((value - self.bias) / self.scale)
+
+    def read(self, data: bytes) -> int | float | bytes:
+        """Return the raw value in the bytes of a row."""
+        piece = data[self.offset : self.offset + self.size]
+        if self.type == "bytes":
+            return piece
+        if self.type in LARGEST:
+            (number,) = struct.unpack(
+                ("<" if self.order == "little" else ">") + {"f32": "f", "f64": "d"}[self.type], piece
+            )
+            return float(number)
+        number = int.from_bytes(piece, self.order, signed=self.type.startswith("i") and not self.width)
+        return number >> self.shift & (1 << self.width) - 1 if self.width else number
+
+    def physical(self, raw: float | bytes) -> Value:
+        """Return the physical value; a number without a name in the enumeration stays a number."""
+        if isinstance(raw, bytes):
+            return raw.rstrip(b"\0").decode("latin-1") if self.kind == "text" else raw
+        if self.kind == "flag":
+            return bool(raw)
+        if self.kind == "enum":
+            return next((name for name, number in (self.enum or {}).items() if number == raw), int(raw))
+        scaled = self.scale != 1.0 or self.bias != 0.0
+        return raw * self.scale + self.bias if scaled else raw
+
+    def fault(self, raw: float | bytes) -> str | None:
+        """Return what is wrong with a received raw value; None if it is as defined."""
+        if self.kind == "unused":
+            return "zeros expected" if any(raw if isinstance(raw, bytes) else (int(raw),)) else None
+        if isinstance(raw, bytes):
+            return None
+        if self.const is not None:
+            return None if self.physical(raw) == self.const else f"{self.const} expected"
+        if self.kind == "enum" and self.enum is not None:
+            return None if raw in self.enum.values() else "not in its enumeration"
+        low, high = self.limits
+        if self.type == "f32" and self.kind == "float":  # the limits may be rounded to single precision
+            low, high = min(low, _single(low)), max(high, _single(high))
+        inside = low <= raw * self.scale + self.bias <= high and math.isfinite(raw)
+        if self.kind != "float":
+            inside = self.raw_limits[0] <= raw <= self.raw_limits[1]
+        return None if inside else f"outside {low:g} to {high:g}"
+
+    def any_value(self, special: bytes, turn: int, rng: random.Random) -> Value:
+        """Return a value within the limits, if possible made of special bytes in the first two turns, else random."""
+        size = self.size
+        pattern = (special * (turn + size))[turn:][:size] if turn < 2 and special else rng.randbytes(size)
+        match self.kind:
+            case "bytes":
+                return pattern
+            case "text":
+                return "star"[:size]
+            case "flag":
+                return rng.random() < 0.5
+            case "enum":
+                return rng.choice(list(self.enum or {"": 0}))
+            case "float":
+                number = float(self.read(bytes(self.offset) + pattern))
+                low, high = self.limits
+                return min(max(number, low), high) if abs(number) < 1e30 else 0.0
+            case _:
+                low_raw, high_raw = self.raw_limits
+                raw = int.from_bytes(pattern, self.order)
+                chosen = raw if low_raw <= raw <= high_raw else rng.randint(low_raw, high_raw)
+                return self.physical(chosen)
+
+
+def _single(number: float) -> float:
+    """Round to single precision."""
+    return (
+        float(struct.unpack("<f", struct.pack("<f", number))[0]) if abs(number) <= LARGEST["f32"] else number
+    )
+
+
+@dataclass(frozen=True)
+class Row:
+    """A telecommand or telemetry row.
+
+    Attributes
+    ----------
+    fields
+        All fields in wire order, unused ones included.
+    action, arguments
+        Action that a telecommand performs, and its fixed arguments.
+    answers
+        Answers in order: `echo`, `reply`.
+    """
+
+    kind: RowKind
+    id: int
+    name: str
+    fields: tuple[Field, ...]
+    klass: str = ""
+    provenance: str = "ours"
+    source: str = ""
+    action: str | None = None
+    arguments: Mapping[str, Value] = field(default_factory=dict)
+    answers: tuple[str, ...] = ("reply",)
+
+    def __repr__(self) -> str:
+        return f"Row({self.kind} {self.id} {self.name})"
+
+    @cached_property
+    def size(self) -> int:
+        """Bytes of data."""
+        return max((item.offset + item.size for item in self.fields), default=0)
+
+    @cached_property
+    def named(self) -> Mapping[str, Field]:
+        """The fields that carry values, by name, in wire order."""
+        return {item.name: item for item in self.fields if item.name}
+
+    @property
+    def is_telemetry(self) -> bool:
+        """Whether the row is telemetry."""
+        return self.kind == "telemetry"
+
+    def example(self) -> dict[str, Value]:
+        """Return values that must be accepted."""
+        return {name: item.plain for name, item in self.named.items()}
+
+    def encode(self, values: Mapping[str, Value] | None = None) -> bytes:
+        """Return the bytes of a row; a missing value becomes the plain one. Limits are not looked at."""
+        given = {**self.example(), **(values or {})}
+        if given.keys() != self.named.keys():
+            raise LookupError(f"{self.name} has no field {', '.join(given.keys() - self.named.keys())}")
+        data = bytearray(self.size)
+        for name, item in self.named.items():
+            place = slice(item.offset, item.offset + item.size)
+            if item.width:
+                whole = int.from_bytes(data[place], item.order) | item.raw_of(given[name]) << item.shift
+                data[place] = whole.to_bytes(item.size, item.order)
+            else:
+                data[place] = item.bytes_of(given[name])
+        return bytes(data)
+
+    def decode(self, data: bytes) -> dict[str, Value]:
+        """Return the physical values by name.
+
+        Raises ValueError for a wrong length.
+        """
+        if len(data) != self.size:
+            raise ValueError(f"{self.name}: {len(data)} bytes, must be {self.size}")
+        return {name: item.physical(item.read(data)) for name, item in self.named.items()}
+
+    def faults(self, data: bytes) -> Iterator[str]:
+        """Yield the values that are outside their limits, and unused bits that are not zero."""
+        for item in self.fields:
+            raw = item.read(data)
+            if (text := item.fault(raw)) is not None:
+                yield f"{self.name}.{item.name or 'unused'}: {item.physical(raw)!r}, {text}"
+
+    def bad_values(self, item: Field) -> Iterator[tuple[str, bytes]]:
+        """Yield data of a telecommand with one field outside its limits, each with a name of what is wrong."""
+        good = self.encode()
+
+        def placed(piece: bytes) -> bytes:
+            return good[: item.offset] + piece + good[item.offset + item.size :]
+
+        if item.kind == "float":
+            low, high = item.limits
+            step = 0.1 * max(abs(low), abs(high), 1.0)
+            yield "nan", placed(item.bytes_of_float(math.nan))
+            yield "infinite", placed(item.bytes_of_float(math.inf))
+            if item.minimum is not None:
+                yield "low", placed(item.bytes_of(low - step))
+            if item.maximum is not None:
+                yield "high", placed(item.bytes_of(high + step))
+        elif item.kind == "enum" and not item.width:
+            known = set((item.enum or {}).values())
+            yield "unknown", placed(item.bytes_of_raw(next(n for n in range(255, -1, -1) if n not in known)))
+        elif item.kind == "integer":
+            (low_raw, high_raw), (least, greatest) = item.raw_limits, item.type_limits
+            if low_raw > least:
+                yield "low", placed(item.bytes_of_raw(low_raw - 1))
+            if high_raw < greatest:
+                yield "high", placed(item.bytes_of_raw(high_raw + 1))

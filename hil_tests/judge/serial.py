@@ -1,0 +1,330 @@
+"""Messages on the serial line: a header and a check, or a CubeSpace dialect, within a framing.
+
+    request ──► body ──► framing ──► line          line ──► framing ──► body ──► answer
+
+    composed   | header by roles | data | check |                                  `Headed`
+    dialect a  | ID | data or error |           CubeComputer (AlbertaSat)         `Dialect`
+    dialect b  | data or error |                CubeSense node (RADSAT)
+    dialect c  | ID | data or error |           generation 2; 7F 07 0F 4F 2F name the kind (libCubeObc)
+
+An answer without an ID belongs to the oldest request that has not been answered, so requests are noted in order.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from functools import partial
+from typing import Final, Protocol
+
+from starhil.hil_tests.judge.checks import check_function
+from starhil.hil_tests.judge.definition import Unit, plugin_check, plugin_framing
+from starhil.hil_tests.judge.framings import Framing, Taken
+from starhil.hil_tests.judge.framings.counted import Counted
+from starhil.hil_tests.judge.framings.delimited import Delimited
+from starhil.hil_tests.judge.framings.escaped import Escaped
+from starhil.hil_tests.judge.framings.slip import Slip
+from starhil.hil_tests.judge.headers import Header, Opened
+from starhil.hil_tests.judge.messages import (
+    BURST_ID,
+    BURST_SIZE,
+    FIRST_TELEMETRY,
+    Answer,
+    AnswerKind,
+    Request,
+)
+
+CUBESPACE: Final = (0x1F, 0x7F, 0xFF)
+"""Escape, start of a request, and end."""
+KINDS: Final[dict[int, AnswerKind]] = {0x07: "ack", 0x0F: "nack", 0x2F: "unsolicited", 0x4F: "unsolicited"}
+"""Start bytes of generation 2: acknowledge, refusal, event, unsolicited telemetry."""
+
+
+class Envelope(Protocol):
+    """What surrounds the data of a message within its framing."""
+
+    def body(self, request: Request) -> bytes:
+        """Return the body of a request."""
+
+    def size(self, begun: bytes, asked: Request | None) -> int | None:
+        """Return the size of the answer's body that begins with these bytes; None if more are needed."""
+
+    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+        """Return the answer in a body; `asked` is the oldest request without an answer."""
+
+    def can_refuse(self, klass: str) -> bool:
+        """Return whether answers of a class can express a refusal."""
+
+    has_codes: bool
+    """Whether a refusal carries a code."""
+    has_unsolicited: bool
+
+
+class SerialLine:
+    """The host's end of a unit's serial line.
+
+    Parameters
+    ----------
+    unit
+        Definition of the unit.
+    dialect
+        Dialect of the answers, of a unit that has several; default: b.
+    """
+
+    def __init__(self, unit: Unit, dialect: str | None = None) -> None:
+        link = unit.serial
+        self._unit = unit
+        self.framing: Framing
+        self.envelope: Envelope
+        self.dialect: str | None = None
+        if link.framing.kind == "cubespace":
+            self.dialect = link.framing.dialect or dialect or "b"
+            escape, start, end = CUBESPACE
+            starts = (start, *KINDS) if self.dialect == "c" else (start,)
+            self.framing = Escaped(escape, starts, end)
+            self.envelope = Dialect(unit, self.dialect)
+        else:
+            self.framing = _framing(unit)
+            self.envelope = Headed(unit)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything received and asked."""
+        self.received = bytearray()
+        self._asked: deque[Request] = deque()
+        self._echoed = False
+
+    def encode(self, request: Request) -> bytes:
+        """Return a request as bytes on the line."""
+        return self.framing.encode(self.envelope.body(request))
+
+    def expect(self, request: Request) -> None:
+        """Note a request, in order."""
+        self._asked.append(request)
+
+    def feed(self, data: bytes) -> list[Answer]:
+        """Return the answers that these bytes complete."""
+        self.received += data
+        answers = []
+        while self.received:
+            asked = self._asked[0] if self._asked else None
+            echo = (
+                None
+                if asked is None or self._echoed or not self._answers(asked, "echo")
+                else self.envelope.body(asked)
+            )
+            measure = (
+                partial(self.envelope.size, asked=asked)
+                if echo is None
+                else partial(_size_of_echo, len(echo))
+            )
+            taken = self.framing.take(self.received, measure)
+            if taken is None:
+                break
+            answer = self._answer(taken, asked, echo)
+            if answer is not None:
+                answers.append(answer)
+        return answers
+
+    def _answer(self, taken: Taken, asked: Request | None, echo: bytes | None) -> Answer | None:
+        if taken.junk or (echo is not None and taken.body != echo):
+            answer = Answer("malformed", data=taken.body)
+        elif asked is not None and echo is not None:
+            if self._answers(asked, "reply"):
+                self._echoed = True
+                return None
+            answer = Answer("ack", row_id=asked.id, klass=asked.klass)
+        else:
+            answer = self.envelope.answer(taken, asked)
+        ends = answer.final and answer.kind not in ("unsolicited", "burst")
+        if ends and asked is not None and (answer.row_id in (None, asked.id) or answer.kind == "malformed"):
+            self._asked.popleft()
+            self._echoed = False
+        return answer
+
+    def _answers(self, request: Request, kind: str) -> bool:
+        row = self._unit.row(request)
+        return kind in (row.answers if row is not None else ("reply",))
+
+
+def _size_of_echo(size: int, _begun: bytes) -> int:
+    return size
+
+
+def _framing(unit: Unit) -> Framing:
+    model = unit.serial.framing
+    match model.kind:
+        case "escaped":
+            return Escaped(model.escape, (model.start,), model.end)
+        case "slip":
+            return Slip(model)
+        case "length" | "fixed":
+            return Counted(model.start, model.end)
+        case "delimited":
+            return Delimited(model)
+        case _:
+            return plugin_framing(unit)
+
+
+class Headed:
+    """A header by roles, and a check."""
+
+    has_unsolicited = True
+
+    def __init__(self, unit: Unit) -> None:
+        link = unit.serial
+        self._unit = unit
+        self._start = bytes(
+            getattr(link.framing, "start", [])
+            if link.framing.kind != "escaped"
+            else (link.framing.escape, link.framing.start)
+        )
+        end = getattr(link.framing, "end", [])
+        ending = {"escaped": 2, "slip": 1}.get(link.framing.kind) or len(end)
+        self._compute = check_function(link.check, unit.byte_order, partial(plugin_check, unit))
+        self.covers = getattr(link.check, "covers", [])
+        self.check_size = len(self._compute(b""))
+        sizes = {"start": len(self._start), "check": self.check_size, "end": ending}
+        coded = [item for item in unit.classes if item.code is not None]
+        requests = [(item.name, item.code) for item in coded]
+        replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]
+        self._unsolicited = {item.unsolicited for item in coded if item.unsolicited is not None}
+        replies += [(item.name, item.unsolicited) for item in coded if item.unsolicited is not None]
+        self.requests = Header(link.request_header, unit.byte_order, requests, sizes)
+        self.replies = Header(link.reply_header, unit.byte_order, replies, sizes)
+        self._codes = dict(requests)
+        self.has_codes = "status" in self.replies.roles()
+
+    def body(self, request: Request) -> bytes:
+        """Return header, data and check of a request."""
+        values = {"id": request.id, "class": self._codes.get(request.klass, 0)}
+        return self.closed(self.requests.write(values, request.klass, len(request.data)), request.data)
+
+    def closed(self, header: bytes, data: bytes) -> bytes:
+        """Return header, data and check."""
+        return header + data + self._compute(self._covered(header, data))
+
+    def _covered(self, header: bytes, data: bytes) -> bytes:
+        parts = {"start": self._start, "header": header, "data": data}
+        return b"".join(parts[name] for name in ("start", "header", "data") if name in self.covers)
+
+    def size(self, begun: bytes, asked: Request | None) -> int | None:
+        """Return the size of header, data and check."""
+        opened = self.replies.read(begun)
+        if opened is None:
+            return None
+        data = self.replies.data_size(opened)
+        if data is None:
+            row = self._unit.row(self._request(opened, asked))
+            data = row.size if row is not None and row.is_telemetry and not _refused(opened) else 0
+        return opened.size + data + self.check_size
+
+    def _request(self, opened: Opened, asked: Request | None) -> Request:
+        """Return the request that an answer names, or the one that was asked if it names none."""
+        if "id" not in opened.values:
+            if asked is None:
+                raise ValueError("an answer without a request")
+            return asked
+        klass = opened.klass or (asked.klass if asked is not None and asked.id == opened.values["id"] else "")
+        return Request(opened.values["id"], klass=klass)
+
+    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+        """Return the answer in header, data and check, all of which must be right."""
+        end = len(taken.body) - self.check_size
+        try:
+            opened = self.replies.read(taken.body[: max(end, 0)])
+            request = None if opened is None else self._request(opened, asked)
+        except ValueError:
+            opened = request = None
+        if opened is None or request is None:
+            return Answer("malformed", data=taken.body)
+        header, data = taken.body[: opened.size], taken.body[opened.size : end]
+        if self.closed(header, data) != taken.body or self.replies.data_size(opened) not in (None, len(data)):
+            return Answer("malformed", data=taken.body)
+        row = self._unit.row(request)
+        klass = request.klass or (row.klass if row is not None else "")
+        telemetry = row.is_telemetry if row is not None else self._unit.is_telemetry(klass, request.id)
+        kind: AnswerKind = "telemetry" if telemetry else "ack"
+        if _refused(opened):
+            kind = "nack"
+        elif opened.values.get("class") in self._unsolicited:
+            kind = "unsolicited"
+        values = opened.values
+        time_s = self.replies.seconds("time", values["time"]) if "time" in values else 0.0
+        final = bool(values.get("final", 1))
+        code = values.get("status", 0)
+        return Answer(kind, code, data, request.id, klass, 0, final, time_s, taken.body)
+
+    def can_refuse(self, klass: str) -> bool:
+        """Return whether the header of a class has a status or an acknowledge bit."""
+        return bool(self.replies.roles(klass) & {"status", "ack"})
+
+
+def _refused(opened: Opened) -> bool:
+    return bool(opened.values.get("status", 0)) or not opened.values.get("ack", 1)
+
+
+class Dialect:
+    """The CubeSpace dialects of the answers; requests are the same in all: ID and data."""
+
+    has_codes = True
+
+    def __init__(self, unit: Unit, dialect: str) -> None:
+        self._unit, self._dialect = unit, dialect
+        self.has_unsolicited = dialect == "c"
+
+    def body(self, request: Request) -> bytes:
+        """Return ID and data."""
+        return bytes((request.id,)) + request.data
+
+    def size(self, begun: bytes, asked: Request | None) -> int | None:  # noqa: ARG002 -- the framing marks the end
+        """Return None: the end of a message is marked."""
+        return None
+
+    def can_refuse(self, klass: str) -> bool:  # noqa: ARG002 -- in all
+        """Return True."""
+        return True
+
+    def answer(self, taken: Taken, asked: Request | None) -> Answer:
+        """Return the answer in a message of the unit's dialect."""
+        body = taken.body
+        row = None if asked is None else self._unit.row(asked)
+        as_asked = self._dialect == "b" and row is not None and row.is_telemetry and row.size == len(body)
+        if (
+            taken.start == CUBESPACE[1]
+            and body[:1] == bytes((BURST_ID,))
+            and len(body) == 1 + BURST_SIZE
+            and not as_asked
+        ):
+            return Answer("burst", data=body[1:], row_id=BURST_ID, body=body)
+        if self._dialect == "b":
+            if asked is None:
+                return Answer("malformed", data=body)
+            return self._generation_1(asked.id, body, body, named=False)
+        if not body:
+            return Answer("malformed")
+        if self._dialect == "a":
+            return self._generation_1(body[0], body[1:], body, named=True)
+        return self._generation_2(taken.start, body[0], body[1:], body)
+
+    def _generation_1(self, number: int, data: bytes, body: bytes, *, named: bool) -> Answer:
+        """Read telemetry, or one byte: 0 for an acknowledge, otherwise the code of a refusal."""
+        row_id = number if named else None
+        row = self._unit.row(Request(number))
+        if number >= FIRST_TELEMETRY and (len(data) != 1 or (row is not None and row.size == 1)):
+            return Answer("telemetry", data=data, row_id=row_id, body=body)
+        if len(data) == 1 and data[0]:
+            return Answer("nack", data[0], row_id=row_id, body=body)
+        acknowledged = data == b"\0" and number < FIRST_TELEMETRY
+        return Answer("ack" if acknowledged else "malformed", data=data, row_id=row_id, body=body)
+
+    def _generation_2(self, start: int, number: int, data: bytes, body: bytes) -> Answer:
+        kind = KINDS.get(start)
+        if kind == "ack" and number >= FIRST_TELEMETRY:
+            return Answer("telemetry", data=data, row_id=number, body=body)
+        if kind == "ack" and not data:
+            return Answer("ack", row_id=number, body=body)
+        if kind == "nack" and len(data) == 1 and data[0]:
+            return Answer("nack", data[0], row_id=number, body=body)
+        if kind == "unsolicited":
+            return Answer("unsolicited", data=data, row_id=number, body=body)
+        return Answer("malformed", data=body, body=body)

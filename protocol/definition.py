@@ -1,0 +1,182 @@
+"""The interface definition of a unit, indexed by name and ID; `icd` reads it from TOML files."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from typing import Final, TypeVar
+
+from starhil.protocol.codec import Row
+from starhil.protocol.conventions import Conventions
+from starhil.protocol.device_model import DeviceModel, device_model
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.link_schema import LinkModel, MessageClass
+from starhil.protocol.messages import ErrorCode, Request, RequestKind
+from starhil.protocol.plugin import Plugin
+from starhil.protocol.values import EnumDefinition, Parameter, Section
+
+_Item = TypeVar("_Item")
+
+OTHER_ERROR: Final = "other"
+"""Key in `[errors]` for all errors that the table does not name."""
+
+
+class UnknownNameError(ProtocolError, KeyError):
+    """A name that is not in the interface definition; the text suggests similar ones."""
+
+    def __str__(self) -> str:
+        """Return the text without quotes, which KeyError would add."""
+        return str(self.args[0])
+
+
+class Names(dict[str, _Item]):
+    """Items by name; a missing name raises UnknownNameError with suggestions."""
+
+    def __init__(self, what: str, items: Iterable[tuple[str, _Item]]) -> None:
+        super().__init__(items)
+        self._what = what
+
+    def __missing__(self, name: str) -> _Item:
+        near = difflib.get_close_matches(name, self, n=3)
+        hint = f"did you mean {', '.join(near)}?" if near else "`starhil icd export markdown` lists all"
+        raise UnknownNameError(f"no {self._what} named {name!r} in the interface definition; {hint}")
+
+
+@dataclass(frozen=True)
+class RawTable:
+    """A table of a definition that another module validates, and its file."""
+
+    file: Path
+    document: Mapping[str, object]
+
+
+@dataclass(frozen=True)
+class InterfaceDefinition:
+    """The interface between a device and an OBC: rows, enumerations and parameters."""
+
+    name: str
+    version: str
+    doc: str
+    telecommands: Names[Row]
+    telemetry: Names[Row]
+    enums: Names[EnumDefinition]
+    parameters: Names[Parameter]
+    """The parameters that the unit exposes."""
+    device_parameters: Names[Parameter]
+    """All parameters of the device; those that the unit exposes have the unit's limits and defaults."""
+    sections: tuple[Section, ...] = ()
+    """Documentation that accompanies the rows, such as conventions."""
+    canopen: RawTable | None = None
+    """Layout of the object dictionary, if the unit has CANopen."""
+    link: LinkModel = field(default_factory=LinkModel)
+    """The links of the unit."""
+    conventions: Conventions = field(default_factory=Conventions)
+    classes: tuple[MessageClass, ...] = ()
+    errors: Mapping[str, int] = field(default_factory=dict)
+    """Error codes on the wire by name; empty: the published codes."""
+    first_telemetry_id: int | None = None
+    """IDs from this one on are telemetry, even if there is no such row."""
+    plugin: Plugin = field(default_factory=Plugin)
+
+    @property
+    def model(self) -> DeviceModel:
+        """The device model."""
+        return device_model()
+
+    @cached_property
+    def telecommands_by_id(self) -> Mapping[int, Row]:
+        """Telecommands by ID."""
+        return {row.id: row for row in self.telecommands.values()}
+
+    @cached_property
+    def telemetry_by_id(self) -> Mapping[int, Row]:
+        """Telemetry by ID."""
+        return {row.id: row for row in self.telemetry.values()}
+
+    @cached_property
+    def rows_by_key(self) -> Mapping[tuple[str, int], Row]:
+        """Rows by class and ID."""
+        return {(row.klass, row.id): row for row in self.rows}
+
+    @cached_property
+    def parameters_by_id(self) -> Mapping[int, Parameter]:
+        """Parameters by ID."""
+        return {parameter.id: parameter for parameter in self.parameters.values()}
+
+    def row_by_id(self, row_id: int) -> Row | None:
+        """Return the telecommand or telemetry row with this ID, or None."""
+        telemetry = self.kind_of_id(row_id) is RequestKind.TELEMETRY
+        return (self.telemetry_by_id if telemetry else self.telecommands_by_id).get(row_id)
+
+    def telemetry_row(self, row_id: int, klass: str | None = None) -> Row | None:
+        """Return the telemetry row with this ID in a class (default: the first that has it), or None."""
+        names = [item.name for item in self.classes if klass in (None, item.name)] or [""]
+        found = (self.rows_by_key.get((name, row_id)) for name in names)
+        return next((row for row in found if row is not None and row.kind == "telemetry"), None)
+
+    def kind_of_id(self, row_id: int) -> RequestKind:
+        """Return the kind of an ID in a unit without classes; an unknown ID is taken as a telecommand."""
+        first = self.first_telemetry_id
+        telemetry = row_id in self.telemetry_by_id if first is None else row_id >= first
+        return RequestKind.TELEMETRY if telemetry else RequestKind.TELECOMMAND
+
+    @staticmethod
+    def request(row: Row, data: bytes = b"", source: int = 0) -> Request:
+        """Return the request for a row."""
+        return Request(RequestKind(row.kind), row.id, data, source, klass=row.klass)
+
+    def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
+        """Return a request by ID, which need not belong to a row, and by class if the unit has classes.
+
+        The default class is that of the first row with this ID, or the first class if there is none.
+        """
+        if not self.classes:
+            return Request(self.kind_of_id(row_id), row_id, data)
+        kinds = {item.name: item.kind for item in self.classes}
+        if klass is None:
+            klass = next((row.klass for row in self.rows if row.id == row_id), self.classes[0].name)
+        if klass not in kinds:
+            raise UnknownNameError(f"no class named {klass!r}; the unit has {', '.join(kinds)}")
+        return Request(kinds[klass], row_id, data, klass=klass)
+
+    def error_number(self, code: ErrorCode) -> ErrorCode | int:
+        """Return the unit's code for an error."""
+        if not self.errors:
+            return code
+        name = code.name.lower()
+        if name in self.errors:
+            return self.errors[name]
+        return 0 if code is ErrorCode.OK else self.errors.get(OTHER_ERROR, int(code))
+
+    @property
+    def link_is_unknown(self) -> bool:
+        """Whether the serial link is of a plugin that was not run."""
+        serial = self.link.serial
+        custom = serial is not None and "custom" in (serial.framing.kind, serial.check.kind)
+        return custom and self.plugin.skipped is not None
+
+    @property
+    def canopen_only(self) -> bool:
+        """Whether CANopen is the only link of the unit."""
+        return self.canopen is not None and self.link.serial is None and self.link.can is None
+
+    def error_name(self, number: int) -> str:
+        """Return the name of an error by the unit's code."""
+        numbers = self.errors or {code.name.lower(): int(code) for code in ErrorCode}
+        return next((name for name, known in numbers.items() if known == number), "unpublished code")
+
+    def enum(self, name: str) -> EnumDefinition:
+        """Return an enumeration of the unit or, if it has none of this name, of the device model."""
+        return self.enums[name] if name in self.enums else self.model.enums[name]
+
+    @property
+    def rows(self) -> Iterator[Row]:
+        """All rows: telecommands, then telemetry, each in order of ID."""
+        return chain(
+            sorted(self.telecommands.values(), key=lambda row: row.id),
+            sorted(self.telemetry.values(), key=lambda row: row.id),
+        )

@@ -1,0 +1,137 @@
+"""`starid database`: build and inspect feature databases."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, TextIO
+
+import typer
+
+from starid.cli.frame_options import frame_catalog, frame_parameters
+from starid.cli.options import AsJson
+from starid.cli.output import output_help, prepare_output, report_stream
+
+group = typer.Typer(
+    help="Build or inspect databases of the LSI and RSI algorithms: feature vectors of overlapping patches of the sky.",
+    no_args_is_help=True,
+)
+
+
+@group.command("build")
+def build(
+    overlap: Annotated[
+        float, typer.Option(help="Overlap of neighbouring sky patches in percent, such as 99.5.")
+    ],
+    geometry: Annotated[
+        str, typer.Option(help="planar (flat RA–Dec plane, as in the thesis) or spherical (a real camera).")
+    ] = "planar",
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help=output_help("File to write; without it, the database is built and discarded."),
+        ),
+    ] = None,
+    kappa: Annotated[
+        float | None, typer.Option(help="Magnitude limit κ; default: 11.5 planar, 5.0 spherical.")
+    ] = None,
+    direction: Annotated[
+        str | None,
+        typer.Option(
+            help="Stars kept: faintest (magnitude ≥ κ) or brightest (magnitude ≤ κ); default: faintest planar, brightest spherical."
+        ),
+    ] = None,
+    band: Annotated[
+        str | None, typer.Option(help="Magnitude band: hp or v; default: hp planar, v spherical.")
+    ] = None,
+    fov: Annotated[
+        float | None, typer.Option(help="Width of a sky patch, degrees; default: 40 planar, 42 spherical.")
+    ] = None,
+    full_field: Annotated[
+        bool,
+        typer.Option("--full-field", help="Square patches instead of circular ones; not roll-invariant."),
+    ] = False,
+    epoch: Annotated[
+        float | None,
+        typer.Option(help="Epoch of the positions, Julian year; default: 1991.25 planar, 2026 spherical."),
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Build a feature database."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from starid.thesis.database import build_database
+    from starid.thesis.database_file import save_database
+
+    if output is not None:
+        prepare_output(output, "-o")
+    planar = geometry == "planar"
+    parameters = frame_parameters(
+        geometry,
+        fov=fov,
+        kappa=kappa if kappa is not None else (11.5 if planar else 5.0),
+        direction=direction or ("faintest" if planar else "brightest"),
+        band=band or ("hp" if planar else "v"),
+        full_field=full_field,
+        overlap_percent=overlap,
+    )
+    catalog = frame_catalog(geometry, epoch)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeRemainingColumn(),
+    )
+    start = time.perf_counter()
+    with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:
+        task = bar.add_task("frames")
+        database = build_database(
+            catalog, parameters, progress=lambda done, total: bar.update(task, completed=done, total=total)
+        )
+    seconds = time.perf_counter() - start
+    result: dict[str, object] = {
+        "cells": database.cells,
+        "bytes_features": database.bytes_features,
+        "seconds": round(seconds, 3),
+    }
+    if output is not None:
+        result["bytes_file"] = save_database(database, output)
+        result["file"] = str(output)
+    _print(result, as_json=as_json, to=report_stream(output))
+
+
+@group.command("info")
+def info(file: Annotated[Path, typer.Argument(help="Database file.")], as_json: AsJson = False) -> None:
+    """Verify a database file and show the parameters it was built with."""
+    import dataclasses
+
+    from starid.thesis.database_file import load_database
+
+    database = load_database(file)
+    _print(
+        {
+            "file": str(file),
+            "cells": database.cells,
+            "bytes_features": database.bytes_features,
+            "stars": int(database.sky.stars.shape[0]),
+            "catalog": database.catalog_identity,
+            **dataclasses.asdict(database.parameters),
+            "minimum": database.minimum.tolist(),
+            "maximum": database.maximum.tolist(),
+        },
+        as_json=as_json,
+        to=sys.stdout,
+    )
+
+
+def _print(values: dict[str, object], *, as_json: bool, to: TextIO) -> None:
+    if as_json:
+        to.write(json.dumps(values) + "\n")
+        return
+    width = max(len(key) for key in values)
+    to.writelines(f"{key:<{width}}  {value}\n" for key, value in values.items())

@@ -1,0 +1,112 @@
+"""Output of commands: files, tables, and text for any terminal."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final, TextIO, TypeAlias
+
+from starid.errors import StaridError
+
+Column: TypeAlias = tuple[str, Callable[[Any], str]]
+"""Heading of a column, and the function that formats a row for it."""
+
+_PLAIN: Final = {
+    "°": " deg",
+    "″": '"',
+    "′": "'",
+    "×": "x",
+    "±": "+/-",
+    "÷": "/",
+    "−": "-",
+    "–": "-",
+    "—": "-",
+    "…": "...",
+    "·": "*",
+    "≤": "<=",
+    "≥": ">=",
+    "→": "->",
+    "²": "^2",
+    "⁻": "^-",
+    "√": "sqrt",
+    "σ": "sigma",
+    "κ": "kappa",
+    "μ": "mu",
+    "µ": "u",
+    "π": "parallax",
+}
+"""Replacements for characters that the encoding of an output lacks."""
+
+_HANDLER: Final = "starhil-plain"
+
+
+def output_help(what: str) -> str:
+    """Return the help of an option that names an output file."""
+    return f"{what} Missing folders are created; /dev/stdout is standard output."
+
+
+def prepare_output(path: Path, option: str) -> Path:
+    """Create the folder of an output file, so that an invalid path fails before the work starts.
+
+    Raises
+    ------
+    StaridError
+        The folder cannot be created, or the path is a folder.
+    """
+    if path.is_dir():
+        raise StaridError(f"{path}: is a folder; name a file with {option}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StaridError(
+            f"{path}: its folder cannot be created ({error.strerror}); choose another file with {option}"
+        ) from None
+    return path
+
+
+def report_stream(output: Path | None) -> TextIO:
+    """Return the stream for the report of a command: stderr if its output file is stdout, or else stdout."""
+    from starid.files import is_stdout
+
+    return sys.stderr if output is not None and is_stdout(output) else sys.stdout
+
+
+def progress() -> Callable[[str], None]:
+    """Return a function that prints progress to stderr."""
+    from rich.console import Console
+
+    return Console(stderr=True).print
+
+
+def print_table(columns: Sequence[Column], rows: Iterable[Any]) -> None:
+    """Print a table in full width, even in a narrower terminal."""
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*(heading for heading, _ in columns), box=SIMPLE)
+    for row in rows:
+        table.add_row(*(show(row) for _, show in columns))
+    console = Console()
+    console.width = max(console.width, Console(width=1000).measure(table).maximum)
+    console.print(table)
+
+
+def show_every_character() -> None:
+    """Make stdout and stderr replace characters that their encoding lacks."""
+    codecs.register_error(_HANDLER, _spell_out)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors=_HANDLER)
+
+
+def _spell_out(error: UnicodeError) -> tuple[str, int]:
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    missing = error.object[error.start : error.end]
+    return "".join(
+        _PLAIN.get(c) or c.encode("ascii", "backslashreplace").decode() for c in missing
+    ), error.end

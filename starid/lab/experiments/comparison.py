@@ -1,0 +1,190 @@
+"""Checks against published numbers: agreement within a stated tolerance, or improvement on the number.
+
+Two things can make an agreement worthless. A constant may have been fitted to the number it explains: such a
+check names the constants and is of the class "fitted", outside the totals. And one constant answer may agree
+with a whole column of a table: `null_model` finds the best one and marks the checks that it meets as weak.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import TypedDict
+
+from starid.lab.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
+
+
+class Readings(TypedDict, total=False):
+    """A number from the author's version of the algorithm, from the printed one, and ours."""
+
+    author: float
+    printed: float
+    ours: float
+
+
+Tolerance = tuple[float, str]
+"""Largest difference from the published number, and its origin."""
+
+
+def rounding(digits: int, unit: str = "") -> Tolerance:
+    """Half a unit of the last printed digit."""
+    return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
+
+
+def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two shares (percent) counted in equally many trials, as a multiple of the standard error.
+
+    The standard error is computed for (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too.
+    """
+    share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
+    error = 100.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
+    return sigmas * error, f"{sigmas:g} standard errors of two shares of {trials}, {sigmas * error:.2g} %"
+
+
+def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two means over equally many trials, as a multiple of the standard error."""
+    error = sigma * math.sqrt(2.0 / trials)
+    return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
+
+
+def sampled_deviation(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two standard deviations over equally many trials, as a multiple of the standard error."""
+    error = sigma / math.sqrt(trials - 1)
+    return sigmas * error, f"{sigmas:g} standard errors of two deviations of {trials}, {sigmas * error:.2g}"
+
+
+def shown(
+    quantity: str,
+    *,
+    published: float | str | None = None,
+    author: float | str | None = None,
+    printed: float | str | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a row without a check."""
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        remark=remark,
+        author=value_text(author, unit, digits),
+        printed=value_text(printed, unit, digits),
+    )
+
+
+def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -> Row:
+    """Turn a row into a check that passes if all its published numbers match."""
+    met, of = sum(map(bool, matches)), len(matches)
+    return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
+
+
+def _agreeing(informing: Row, target: str, matches: Sequence[bool], fitted: str) -> Row:
+    if fitted:
+        return _checked(informing, "fitted", f"{target}; fitted: {fitted}", matches)
+    return _checked(informing, "agrees", target, matches)
+
+
+def best_constant(intervals: Iterable[Sequence[float]]) -> float:
+    """Value in most of the intervals: the best answer that ignores all that varies within a table."""
+    known = list(intervals)
+    lows = [low for low, _ in known]
+    return max(lows, key=lambda value: sum(low <= value <= high for low, high in known))
+
+
+def null_model(rows: Sequence[Row]) -> list[Row]:
+    """Mark as weak the checks in one column of a table that its best constant answer meets as well."""
+    intervals = [row.interval for row in rows if row.interval]
+    if not intervals:
+        return list(rows)
+    constant = best_constant(intervals)
+    return [
+        replace(row, weak=row.of, weak_met=row.met)
+        if row.interval and row.interval[0] <= constant <= row.interval[1]
+        else row
+        for row in rows
+    ]
+
+
+def agreement(
+    quantity: str,
+    *,
+    published: float,
+    tolerance: Tolerance,
+    author: float | None = None,
+    printed: float | None = None,
+    ours: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+    fitted: str = "",
+) -> Row:
+    """Make a check for agreement with a published number.
+
+    The value checked is the author's version, or else the printed one, or else ours. `fitted` names the
+    constants that were fitted to published numbers, and on which the value depends.
+
+    Raises
+    ------
+    ReproduceError
+        There is no number to check.
+    """
+    checked = author if author is not None else printed if printed is not None else ours
+    if checked is None or isinstance(checked, str):
+        raise ReproduceError(
+            f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
+        )
+    largest, origin = tolerance
+    readings = {"published": published, "author": author, "printed": printed, "ours": ours}
+    informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
+    made = _agreeing(informing, f"± {origin}", [abs(checked - published) <= largest], fitted)
+    return replace(made, interval=(published - largest, published + largest))
+
+
+def same(
+    quantity: str,
+    *,
+    published: str,
+    author: str | None = None,
+    printed: str | None = None,
+    ours: str | None = None,
+    matches: Sequence[bool],
+    target: str,
+    remark: str = "",
+    fitted: str = "",
+    null: Sequence[bool] = (),
+) -> Row:
+    """Make one row for several published numbers; `target` names the rule by which each agrees or not.
+
+    `null` says which of the numbers the null model meets, `fitted` is as in `agreement`.
+    """
+    met, of = sum(map(bool, matches)), len(matches)
+    remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
+    informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
+    made = _agreeing(informing, target, matches, fitted)
+    weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
+    return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
+
+
+def improvement(
+    quantity: str,
+    *,
+    published: float,
+    ours: float,
+    larger: bool,
+    unit: str = "",
+    digits: int = 2,
+    remark: str = "",
+) -> Row:
+    """Make a check that ours is better than a published number; the remark states by how much."""
+    gain = ours - published if larger else published - ours
+    better = f"by {value_text(gain, unit, digits)}"
+    if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:
+        better = f"by a factor of {published / ours:.3g}"
+    passed = bool(ours >= published if larger else ours <= published)
+    remark = f"Better {better}. {remark}".strip() if passed else remark
+    informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
+    return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])

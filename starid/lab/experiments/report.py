@@ -1,0 +1,212 @@
+"""The report: rows of all experiments compared with the published values, figures and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from starid.files import write_atomically
+from starid.lab.experiments.experiment import Row
+from starid.lab.experiments.known_misses import known_miss
+from starid.lab.experiments.runner import FinishedExperiment
+
+REPORT_FILE: Final = "report.md"
+"""Name of the report in the folder of results."""
+
+_HEAD: Final = """# The thesis's experiments, reproduced
+
+Experiments of E. O. Özyurt, *A Feedback Star Identification Algorithm via Regularized Pattern Recognition
+Using a Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University), computed here from the
+Hipparcos catalogue (new reduction) and compared with the published values. There are four columns, of which a
+row fills those that apply:
+
+* **published**: the value printed in the thesis; a curve or a phrase is quoted, "—" means none.
+* **as the author ran it**: the author's version, inferred from the published numbers, with MATLAB's `lasso`.
+* **as printed**: the equations and parameters of the thesis's text, solved exactly.
+* **ours**: this project's own solution of the task.
+
+A check belongs to one of these classes, which are counted separately:
+
+* **agrees**: the value as the author ran it (or else as printed, or else ours) is within a tolerance on
+  *both* sides of the published number. The tolerance comes from the printed digits or from the sampling
+  error; the row says which.
+* **agrees, weak**: the same, but one constant answer for the whole column of the table agrees as well (the
+  best such constant is the null model): these checks can hardly fail.
+* **fitted**: the value agrees, but depends on constants that were fitted to published numbers; the row names
+  them. This is an explanation, not an agreement, and stands outside the totals.
+* **better**: ours is better than the published number; the row says by how much.
+* **ours**: nothing was published; the bound is a requirement of this project.
+
+A known miss states its reason; any other failed check is a *regression* and gives the exit status 1.
+
+How to read the accuracy figures of the LSI algorithm:
+
+* **On the grid**: the thesis tests on 1 701 frames, and with p = 99.5 % every one of them *is* a frame of the
+  database. The nearest neighbour is then the frame itself, and the figure says little about frames in
+  between.
+* **Off the grid**: the same frames, each moved by a random fraction of the grid step, which is what a real
+  sensor sees. Every accuracy figure is given for both.
+"""
+
+CLASSES: Final = {
+    "agrees": "published numbers agree",
+    "weak": "published numbers agree, and a constant answer does too",
+    "fitted": "published numbers explained by fitted constants",
+    "better": "published numbers are bettered",
+    "ours": "bounds of this project hold",
+}
+"""Classes of checks, and what is counted in each."""
+
+
+def _mark(experiment: str, row: Row) -> str:
+    if row.passed is None:
+        return ""
+    name = f"{row.kind}, weak" if row.weak == row.of else row.kind
+    if row.passed:
+        return name
+    return f"**missed** ({name})" if known_miss(experiment, row) else f"**regression** ({name})"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _remark(experiment: str, row: Row) -> str:
+    known = known_miss(experiment, row)
+    return " ".join(part for part in (row.remark, known.reason if known else "") if part)
+
+
+def _table(rows: Iterable[tuple[str, Row]]) -> list[str]:
+    lines = [
+        "| quantity | published | as the author ran it | as printed | ours | check | class | remark |",
+        "|---|---:|---:|---:|---:|---|---|---|",
+    ]
+    for experiment, row in rows:
+        cells = (
+            row.quantity,
+            row.published,
+            row.author,
+            row.printed,
+            row.ours,
+            row.target,
+            _mark(experiment, row),
+            _remark(experiment, row),
+        )
+        lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
+    return lines
+
+
+def counts(results: Sequence[FinishedExperiment]) -> dict[str, dict[str, int]]:
+    """For each class, how many numbers agree and how many there are."""
+    found = {kind: {"met": 0, "of": 0} for kind in CLASSES}
+    for row in (row for result in results for row in result.outcome.rows if row.kind):
+        weak, weak_met = (row.weak, row.weak_met) if row.kind == "agrees" else (0, 0)
+        for kind, met, of in ((row.kind, row.met - weak_met, row.of - weak), ("weak", weak_met, weak)):
+            found[kind]["met"] += met
+            found[kind]["of"] += of
+    return found
+
+
+def regressions(results: Sequence[FinishedExperiment]) -> list[tuple[str, Row]]:
+    """Failed checks that are not known misses, with the names of their experiments."""
+    return [
+        (result.experiment.name, row)
+        for result in results
+        for row in result.outcome.failed
+        if known_miss(result.experiment.name, row) is None
+    ]
+
+
+def _section(finished: FinishedExperiment) -> list[str]:
+    experiment, outcome = finished.experiment, finished.outcome
+    lines = [f"## {experiment.title}", ""]
+    for note in outcome.notes:
+        lines += [note, ""]
+    lines += _table((experiment.name, row) for row in outcome.rows)
+    lines.append("")
+    for name in outcome.files:
+        if name.endswith(".png"):
+            lines += [f"![{name}]({experiment.name}/{name})", ""]
+    tables = [f"[{name}]({experiment.name}/{name})" for name in outcome.files if not name.endswith(".png")]
+    if tables:
+        lines += ["Data: " + ", ".join(tables), ""]
+    lines += [f"`starid reproduce {experiment.name}`, {finished.seconds:.0f} s of processor time.", ""]
+    return lines
+
+
+def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int) -> str:
+    """Format the report in Markdown."""
+    missed = [(result.experiment.name, row) for result in results for row in result.outcome.failed]
+    lost = regressions(results)
+    lines = [_HEAD]
+    if quick:
+        lines += [
+            "This is the **quick** run: fewer databases, fewer frames. Numbers that depend on the number of frames differ",
+            "from those of the full run within their statistical spread.",
+            "",
+        ]
+    minutes = sum(result.seconds for result in results) / 60.0
+    lines += [
+        f"Seed {seed}. The run took {minutes:.1f} minutes of processor time, about half as long on two cores.",
+        "",
+        "| class | met | of |",
+        "|---|---:|---:|",
+    ]
+    found = counts(results)
+    lines += [f"| {words} | {found[kind]['met']} | {found[kind]['of']} |" for kind, words in CLASSES.items()]
+    lines.append("")
+    if lost:
+        lines += ["## Regressions", "", *_table(lost), ""]
+    known = [entry for entry in missed if entry not in lost]
+    if known:
+        lines += ["## Known misses", "", *_table(known), ""]
+    lines += ["## Contents", ""]
+    lines += [f"* {result.experiment.title} — `{result.experiment.name}`" for result in results]
+    lines.append("")
+    for result in results:
+        lines += _section(result)
+    return "\n".join(lines)
+
+
+def write_report(results: Sequence[FinishedExperiment], folder: Path, *, quick: bool, seed: int) -> Path:
+    """Write the report to the folder of results and return its path."""
+    path = folder / REPORT_FILE
+    text = report_text(results, quick=quick, seed=seed)
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    return path
+
+
+def summary(results: Sequence[FinishedExperiment]) -> dict[str, Any]:
+    """Counts and rows as plain values, for `--json`."""
+    rows = [(result, row) for result in results for row in result.outcome.rows]
+    return {
+        "experiments": {
+            result.experiment.name: {
+                "seconds": round(result.seconds, 2),
+                "computed_parts": result.parts,
+                "missed": [row.quantity for row in result.outcome.failed],
+            }
+            for result in results
+        },
+        "classes": counts(results),
+        "missed": sum(row.passed is False for _, row in rows),
+        "regressions": [f"{name}: {row.quantity}" for name, row in regressions(results)],
+        "rows": [
+            {
+                "experiment": result.experiment.name,
+                "quantity": row.quantity,
+                "published": row.published,
+                "as_the_author_ran_it": row.author,
+                "as_printed": row.printed,
+                "ours": row.ours,
+                "class": row.kind,
+                "target": row.target,
+                "passed": row.passed,
+                "known_miss": known.reason
+                if (known := known_miss(result.experiment.name, row)) is not None
+                else None,
+            }
+            for result, row in rows
+        ],
+    }

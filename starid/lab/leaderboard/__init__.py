@@ -1,0 +1,1 @@
+"""Star identification solvers, ours and others, on the same scenes."""

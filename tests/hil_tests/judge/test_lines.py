@@ -1,0 +1,165 @@
+"""The judge's lines against bytes that public sources publish, and against the product's codec for every unit."""
+
+from __future__ import annotations
+
+import math
+import random
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from starhil.hil_tests.judge.can import frames_of, read_answer
+from starhil.hil_tests.judge.definition import Unit, read_unit
+from starhil.hil_tests.judge.messages import Answer
+from starhil.hil_tests.judge.serial import SerialLine
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
+from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.unit_folders import bundled_units
+from tests.conformance.links import LINKS, write_unit
+
+
+def definitions() -> dict[str, tuple[InterfaceDefinition, Unit]]:
+    """All bundled units, and one for each kind of link that none of them has."""
+    with TemporaryDirectory() as folder:
+        others = [write_unit(Path(folder) / link, link) for link in LINKS]
+        return {Path(name).name: (load_unit(name), read_unit(name)) for name in (*bundled_units(), *others)}
+
+
+DEFINITIONS = definitions()
+ON_SERIAL = [name for name, (_icd, unit) in DEFINITIONS.items() if unit.serial is not None]
+
+CHECKED = [name for name in ON_SERIAL if DEFINITIONS[name][1].serial.check.kind != "none"]
+
+
+def same(one: object, other: object) -> bool:
+    return one == other or (isinstance(one, float) and math.isclose(one, float(str(other)), rel_tol=1e-12))
+
+
+@pytest.mark.parametrize("name", DEFINITIONS)
+def test_rows_have_the_bytes_and_values_of_the_product(name):
+    icd, unit = DEFINITIONS[name]
+    for row, known in zip(unit.rows, icd.rows, strict=True):
+        data = known.encode(known.sample(), check=False)
+        seen, wanted = row.decode(data), known.decode(data, check=False)
+        assert [key for key in wanted if not same(seen[key], wanted[key])] == [], row
+        assert row.encode(seen) == data, row
+        assert list(row.faults(data)) == [], row
+
+
+@pytest.mark.parametrize("name", ON_SERIAL)
+@pytest.mark.parametrize("dialect", ["a", "b", "c"])
+def test_both_sides_of_the_line_agree_with_the_product(name, dialect):
+    icd, unit = DEFINITIONS[name]
+    stack, line, rng = build_serial_stack(icd), SerialLine(unit, dialect), random.Random(5)
+    style = None if line.dialect is None else Dialect(line.dialect)
+    for row, known in zip(unit.rows, icd.rows, strict=True):
+        if row.name in unit.unanswered or row.answers == ("echo",):
+            continue
+        data = rng.randbytes(row.size)
+        request = unit.request(row, b"" if row.is_telemetry else data)
+        assert line.encode(request) == stack.encode_request(icd.request(known, request.data)), row
+        kind = ReplyKind.TELEMETRY if row.is_telemetry else ReplyKind.ACK
+        sent = stack.encode_reply(
+            Reply(kind, row.id, data if row.is_telemetry else b"", klass=row.klass), style
+        )
+        echo = line.encode(request) if "echo" in row.answers else b""
+        line.expect(request)
+        (answer,) = [item for byte in echo + sent for item in line.feed(bytes((byte,)))]
+        assert (answer.kind, answer.data if row.is_telemetry else data) == (kind.value, data), row
+        assert answer.row_id in (None, row.id)
+        refusal = stack.encode_reply(
+            Reply(ReplyKind.NACK, row.id, code=ErrorCode.BUSY, klass=row.klass), style
+        )
+        if refusal and not (row.size == 1 and line.dialect in ("a", "b")):
+            line.clear()
+            line.expect(request)
+            (answer,) = line.feed(refusal)
+            assert (answer.kind, answer.code) == ("nack", 6 if line.envelope.has_codes else 0), row
+
+
+@pytest.mark.parametrize("name", CHECKED)
+def test_a_changed_byte_is_not_taken_for_the_answer(name):
+    icd, unit = DEFINITIONS[name]
+    line = SerialLine(unit)
+    row = max((item for item in unit.telemetry.values()), key=lambda item: item.size < 40)
+    sent = build_serial_stack(icd).encode_reply(
+        Reply(ReplyKind.TELEMETRY, row.id, bytes(range(64, 64 + row.size)), klass=row.klass)
+    )
+    covered = range(len(sent)) if "header" in unit.serial.check.covers else range(6, len(sent) - 2)
+    for place in covered:
+        line.clear()
+        line.expect(unit.request(row))
+        damaged = bytearray(sent)
+        damaged[place] ^= 0x01
+        kinds = {answer.kind for answer in line.feed(bytes(damaged))}
+        assert kinds <= {"malformed", "nack"} or bytes(damaged).strip(sent[:1]) == sent.strip(sent[:1]), place
+
+
+def test_sagitta_reads_as_its_flight_driver_writes():
+    """c2a-aobc sagitta.c: C0 21 02 18 XXH32(seed 1425) C0, with C0 as DB DC and DB as DB DD."""
+    unit = read_unit("sagitta")
+    line = SerialLine(unit)
+    sent = line.encode(unit.request(unit.telemetry["solution"]))
+    assert sent[:4].hex() == "c0210218"
+    assert sent[-1] == 0xC0
+    assert line.framing.encode(b"\xc0\xdb\x00").hex() == "c0dbdcdbdd00c0"
+
+
+def test_nos3_answers_follow_the_echo_of_the_request():
+    """generic_star_tracker_device.c: DEAD id u32 BEEF, echoed; then DEAD u32 BEEF, big-endian."""
+    unit = read_unit("nos3")
+    line, row = SerialLine(unit), unit.telemetry["housekeeping"]
+    sent = line.encode(unit.request(row))
+    assert sent.hex() == "dead0100000000beef"
+    line.expect(unit.request(row))
+    (answer,) = line.feed(sent + bytes.fromhex("dead00000007beef"))
+    assert row.decode(answer.data) == {"counter": 7}
+    line.expect(unit.request(row))
+    assert line.feed(b"\xde\xad\x02" + sent[3:])[0].kind == "malformed"
+
+
+def test_dialects_read_as_published():
+    """AlbertaSat adcs_io.c (a: 6 bytes), RADSAT RCamera.c (b: 5 bytes), libCubeObc (c: 07 and 0F)."""
+    unit = read_unit("cubestar")
+    row = unit.telecommands["clear_counters"]
+    for dialect, accepted, refused in (
+        ("a", bytes((0x1F, 0x7F, row.id, 0, 0x1F, 0xFF)), bytes((0x1F, 0x7F, row.id, 3, 0x1F, 0xFF))),
+        ("b", b"\x1f\x7f\x00\x1f\xff", b"\x1f\x7f\x03\x1f\xff"),
+        ("c", bytes((0x1F, 0x07, row.id, 0x1F, 0xFF)), bytes((0x1F, 0x0F, row.id, 3, 0x1F, 0xFF))),
+    ):
+        line = SerialLine(unit, dialect)
+        for sent, kind, code in ((accepted, "ack", 0), (refused, "nack", 3)):
+            line.expect(unit.request(row))
+            (answer,) = line.feed(sent)
+            assert (answer.kind, answer.code) == (kind, code)
+
+
+def test_can_frames_are_the_published_vectors():
+    """libCubeObc: TC 54 with 12 bytes, TLM 133, TLM 170 with 33 bytes, and a refusal."""
+    unit = read_unit("cubestar")
+    sent = frames_of(unit.request(54, bytes(range(12))), 1, 4)
+    assert [(f"{can_id:08X}", data.hex().upper()) for can_id, data in sent] == [
+        ("07360104", "0001020304050601"),
+        ("07360104", "0708090A0B00"),
+    ]
+    assert frames_of(unit.request(133), 1, 4) == [(0x04850104, b"")]
+    frames = [CanFrame(0x08AA0401, bytes(7) + bytes((left,))) for left in (4, 3, 2, 1)]
+    frames.append(CanFrame(0x08AA0401, bytes(5) + b"\0"))
+    following = iter([*frames[1:], None])
+    assert read_answer(frames[0], lambda: next(following)) == Answer(
+        "telemetry", data=bytes(33), row_id=170, other=1
+    )
+    following = iter([*frames[2:], None])
+    assert read_answer(frames[0], lambda: next(following)).kind == "malformed"
+    assert read_answer(CanFrame(0x06850401, b"\x03"), lambda: None) == Answer("nack", 3, row_id=133, other=1)
+
+
+def test_classes_and_ids_name_the_kind_of_an_unknown_id():
+    sagitta = read_unit("sagitta")
+    assert sagitta.request(200, klass="parameter").telemetry
+    assert not sagitta.request(200, klass="action").telemetry
+    assert not read_unit("cubestar").request(31).telemetry

@@ -1,0 +1,112 @@
+"""The command `starid`: what it imports, and what it shares with `starhil`."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import EntryPoint
+from pathlib import Path
+
+import cv2
+import pytest
+
+from starhil.emulator.cli.app import COMMANDS, MOVED
+from starhil.emulator.sensor.renderer import render
+from starid.attitude import Attitude
+from starid.camera import Camera
+from starid.catalog import load_catalog
+from starid.cli import app, identify
+from tests.emulator.cli.command_line import run_command_line
+
+ROOT = Path(__file__).parents[3]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+NOT_OF_THE_ENGINE = {
+    "aiohttp", "can", "canopen", "construct", "joblib", "matplotlib", "mcap", "serial", "sgp4",
+    "sklearn", "starhil", "starid.lab", "starid.thesis",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def photograph(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("photograph") / "sky.png"
+    camera, truth = Camera.from_fov(20.0, 640, 480), Attitude.from_radec_roll(83.8, -1.2, 30.0)
+    cv2.imwrite(str(path), render(camera, load_catalog(), truth, seed=1).image)
+    return path
+
+
+@pytest.mark.process
+def test_a_photograph_is_identified_without_the_packages_of_the_bench_and_the_laboratory(
+    photograph: Path,
+) -> None:
+    program = "from starid.cli import main; main()"
+    done = subprocess.run(
+        [sys.executable, "-X", "importtime", "-c", program, "identify", photograph, "--fov", "20", "--json"],
+        capture_output=True, text=True, timeout=300, check=True,
+    )  # fmt: skip
+    assert json.loads(done.stdout)["valid"]
+    imported = {line.split("|")[-1].strip() for line in done.stderr.splitlines() if "|" in line}
+    assert "starid.geometric.identifier" in imported
+    assert not {
+        name for name in imported for other in NOT_OF_THE_ENGINE if f"{name}.".startswith(f"{other}.")
+    }
+
+
+def test_the_engine_needs_a_part_of_what_the_project_needs() -> None:
+    engine = set(PROJECT["dependency-groups"]["engine"])
+    assert engine < set(PROJECT["project"]["dependencies"])
+
+
+def test_a_photograph_is_annotated(photograph: Path, tmp_path: Path) -> None:
+    marked = tmp_path / "marked.png"
+    status, out, _ = run_command_line(
+        "annotate", str(photograph), "--fov", "20", "-o", str(marked), "--json", program="starid"
+    )
+    assert (status, json.loads(out)["valid"]) == (0, True)
+    pixels = cv2.imread(str(marked))
+    assert pixels.shape == (480, 640, 3)
+    assert (pixels[:, :, 1] != pixels[:, :, 2]).any()  # circles are coloured
+
+
+@pytest.mark.parametrize(("old", "new"), MOVED.items())
+def test_an_old_name_works_and_states_the_new_one(old: tuple[str, ...], new: str) -> None:
+    status, out, said = run_command_line(*old, "--help")
+    assert (status, said) == (0, f"starhil {' '.join(old)}: is now starid {new}\n")
+    assert f"Usage: starid {new}" in out
+    assert (status, out, "") == run_command_line(new, "--help", program="starid")
+
+
+def test_an_old_name_rejects_as_the_new_one_does() -> None:
+    status, out, said = run_command_line("catalog", "--limit", "nan")
+    _, rejected = said.splitlines()
+    assert (status, out) == (2, "")
+    assert rejected.startswith("starid: catalog: invalid value for '--limit'")
+
+
+def test_no_sub_command_has_two_programs() -> None:
+    assert {*COMMANDS} & {*app.COMMANDS} == {"bench"}
+
+
+def test_only_the_module_of_the_given_sub_command_is_imported() -> None:
+    program = "import sys; from starid.cli import app; app.build_app(['catalog']); print(*sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True
+    )
+    loaded = {name for name in done.stdout.split() if name in app.COMMANDS.values()}
+    assert loaded == {"starid.cli.catalog"}
+
+
+def test_the_camera_of_a_profile_of_the_emulator_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    ((name, value),) = PROJECT["project"]["entry-points"]["starid.cameras"].items()
+    entry = EntryPoint(name, value, "starid.cameras")
+    monkeypatch.setattr(identify, "entry_points", lambda group: [entry] if group == entry.group else [])
+    assert identify._camera("cubestar").distortion[0] == -0.15
+
+
+def test_an_extra_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    status, out, said = run_command_line("reproduce", "-o", str(tmp_path), program="starid")
+    assert (status, out) == (2, "")
+    assert said == "starid: matplotlib is not installed; run: pip install 'starhil[lab]'\n"
+    assert not list(tmp_path.iterdir())
