@@ -115,9 +115,21 @@ def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDe
     return definition, reader.errors if files else [f"{path}: no .toml file in this folder"]
 
 
-def _place(error: ErrorDetails) -> tuple[int | str, ...]:
+def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
+    """Return the keys that lead to an error; pydantic also names the kinds of unions, such as `crc` of a check."""
+    steps: list[int | str] = []
+    for step in error["loc"][:-1]:
+        try:
+            document = document[step]
+        except (KeyError, IndexError, TypeError):
+            continue
+        steps.append(step)
+    return (*steps, *error["loc"][-1:])
+
+
+def _place(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
     """Return the place of what cannot be used because of an error: a key, a field, a table."""
-    location = error["loc"]
+    location = _location(document, error)
     if error["type"] == "extra_forbidden":
         return location
     if len(location) > 3 and location[2] == "fields":
@@ -204,13 +216,14 @@ class _Reader:
             model = schema.FileModel.model_validate(document)
         except ValidationError as error:
             for item in error.errors():
-                where = f"{file}: {_key_path(document, item['loc'])}"
+                location = _location(document, item)
+                where = f"{file}: {_key_path(document, location)}"
                 if item["type"] == "extra_forbidden":
-                    hint = did_you_mean(str(item["loc"][-1]), _known_keys(item["loc"]))
+                    hint = did_you_mean(str(location[-1]), _known_keys(location))
                     self.errors.append(f"{where}: unknown key{hint}")
                 else:
                     self.errors.append(f"{where}: {item['msg']}")
-            for place in sorted({_place(item) for item in error.errors()}, key=_order, reverse=True):
+            for place in sorted({_place(document, item) for item in error.errors()}, key=_order, reverse=True):
                 self._remove(document, place)
             model = schema.FileModel.model_validate(document)
         self._files.append((file, model))
