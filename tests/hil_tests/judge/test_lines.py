@@ -17,7 +17,7 @@ from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import bundled_units
 from tests.conformance.links import LINKS, write_unit
