@@ -42,13 +42,7 @@ REQUIRED_ROWS = (
 
 
 def check_rows(icd: InterfaceDefinition) -> None:
-    """Check that a unit has the rows that the load requests.
-
-    Raises
-    ------
-    BenchError
-        The unit lacks some of them.
-    """
+    """Check that a unit has the rows that the load requests."""
     missing = [name for name in REQUIRED_ROWS if name not in icd.telemetry and name not in icd.telecommands]
     if missing:
         raise BenchError(

@@ -199,14 +199,17 @@ class CanopenLink:
     ) -> None:
         device = self._device = requests.device
         self.transport: Final = transport
-        dictionary = build_dictionary(device.icd)
         self.application = DeviceApplication(requests, self._finish_write)
-        dictionary.application = self.application
-        bit_rates = frozenset(dictionary.layout.bit_rates)
-        self.slave = CanopenSlave(dictionary, self._wanted_node, storage=storage, bit_rates=bit_rates)
-        self.slave.store.on_save = self.application.save
-        self.slave.store.on_restore = self.application.restore
-        self.slave.on_reset = self._reset_device
+        dictionary = build_dictionary(device.icd, self.application)
+        self.slave = CanopenSlave(
+            dictionary,
+            self._wanted_node,
+            storage=storage,
+            bit_rates=frozenset(dictionary.layout.bit_rates),
+            on_save=self.application.save,
+            on_restore=self.application.restore,
+            on_reset=self._reset_device,
+        )
         self._dictionary = dictionary
         self._actions: deque[Action] = deque()
         self._busy = False
