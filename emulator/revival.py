@@ -27,13 +27,7 @@ STEADY_S: Final = 60.0
 
 
 class PipelineRevival:
-    """Restarts the pipeline of a device.
-
-    Parameters
-    ----------
-    ready
-        Called when the pipeline is ready again.
-    """
+    """Restarts the pipeline of a device."""
 
     def __init__(
         self, imager: PipelineImager, device: Device, ready: Callable[[PipelineReady], None]
