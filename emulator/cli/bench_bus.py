@@ -19,7 +19,7 @@ from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.serial_load import load_serial
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 
 UPDATE_RATE_HZ = 10.0
 NODE = 44

@@ -14,7 +14,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError, Value
 
 Bus = Literal["can", "canopen", "serial"]

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import resource
 import shutil
+import signal
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
@@ -13,10 +16,13 @@ from typing import Any, ClassVar, Final, TypeVar
 from pydantic import TypeAdapter
 
 from starhil.emulator.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.endurance.simulated_loop import WORKER_WAIT_S
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
 from starhil.emulator.pipeline.error_model import ErrorModelImager
+from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import MAX_STEP_S, StepPump
 from starhil.emulator.replay import prepare_recording
@@ -32,6 +38,8 @@ from starhil.protocol.transports.paced import SerialTransport
 Item = TypeVar("Item", bytes, CanFrame)
 
 STATE_FOLDER: Final = "state"
+LONGEST_START_S: Final = 120.0
+"""Longest wall time for which a killed pipeline may take to be missed, or to be ready again, seconds."""
 TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 
 
@@ -41,16 +49,17 @@ class MemoryTransport(Transport[Item]):
     Attributes
     ----------
     sent
-        Items that the device has sent and nobody has taken.
+        Items that the device has sent and nobody has taken, each with its time, seconds.
     reads
         Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader.
     """
 
     immediate: ClassVar[bool] = True
 
-    def __init__(self, description: str) -> None:
+    def __init__(self, description: str, now_s: Callable[[], float]) -> None:
         super().__init__(description)
-        self.sent: list[Item] = []
+        self._now_s = now_s
+        self.sent: list[tuple[float, Item]] = []
         self.reads = True
 
     async def _open(self) -> None:
@@ -63,7 +72,7 @@ class MemoryTransport(Transport[Item]):
             self.statistics.dropped += count
             return False
         self.statistics.sent += count
-        self.sent.append(item)
+        self.sent.append((self._now_s(), item))
         return True
 
     def deliver(self, item: Item) -> None:
@@ -133,10 +142,14 @@ class UnitUnderTest:
     folder
         Folder of the state, best in memory (tmpfs).
     rendered
-        Whether images are rendered and solved; otherwise the pipeline is an error model.
+        Whether images are rendered and solved, in a process; otherwise the pipeline is an error model.
     record
         Folder of a recording, which holds the time since power was last switched on.
 
+    Attributes
+    ----------
+    frames, exposed_s
+        Number of images solved in all, and the sum of their periods, seconds.
     """
 
     def __init__(
@@ -156,7 +169,7 @@ class UnitUnderTest:
             **profile.get("run", {}),
             "seed": seed,
             "clock": "stepped",
-            "worker": "thread" if rendered else "error_model",
+            "worker": "process" if rendered else "error_model",
             "state_dir": str(folder.resolve() / STATE_FOLDER),
         }
         channels: dict[str, Any] = {
@@ -170,6 +183,8 @@ class UnitUnderTest:
         self._recorder: Recorder | None = None
         self._truth_log: TruthLog | None = None
         self._run: Run | None = None
+        self.frames = 0
+        self.exposed_s = 0.0
         self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
         self._transports: dict[str, MemoryTransport[Any]] = {}
         self._errors = _InternalErrors()
@@ -192,9 +207,10 @@ class UnitUnderTest:
     async def power_on(self) -> None:
         """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
         reads = {name: transport.reads for name, transport in self._transports.items()}
-        port = MemorySerial("serial")
+        self._run = None
+        port = MemorySerial("serial", self._time_s)
         buses: dict[str, MemoryTransport[CanFrame]] = {
-            name: MemoryTransport(name) for name in ("can", "canopen")
+            name: MemoryTransport(name, self._time_s) for name in ("can", "canopen")
         }
         self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():
@@ -207,6 +223,7 @@ class UnitUnderTest:
             self._recorder.open()
         self._run = Run([self.profile], self._recorder or wiring)
         await self._run.open()
+        self.head.device.signals.frame_published.connect(self._count_frame)
         if self._recorder is not None:
             path = self._recorder.folder / TRUTH_FILE
             self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
@@ -232,6 +249,14 @@ class UnitUnderTest:
     def now_s(self) -> float:
         """Simulation time since power was switched on, seconds."""
         return self.run.clock.now_ns() / NANOSECONDS
+
+    def _time_s(self) -> float:
+        """Return the simulation time; it is zero while the run is being opened."""
+        return 0.0 if self._run is None else self.now_s
+
+    def _count_frame(self, measurement: Measurement) -> None:
+        self.frames += 1
+        self.exposed_s += measurement.period_s
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
         """Let simulation time pass, and the same time of the event loop.
@@ -265,8 +290,8 @@ class UnitUnderTest:
         """Pass bytes or a frame to the device."""
         self._transports[link].deliver(item)
 
-    def take(self, link: str) -> list[Any]:
-        """Return what the device has sent on a link since the last call."""
+    def take(self, link: str) -> list[tuple[float, Any]]:
+        """Return what the device has sent on a link since the last call, each item with its time, seconds."""
         sent = self._transports[link].sent
         taken = list(sent)
         sent.clear()
@@ -289,13 +314,22 @@ class UnitUnderTest:
         self.run.record("clear_faults")
         self.head.faults.clear()
 
-    def end_pipeline(self) -> bool:
-        """End the image pipeline, as the death of its process does; return False if it renders images."""
-        imager = self.head.imager
-        if not isinstance(imager, ErrorModelImager):
-            return False
-        imager.end("pipeline: ended by an endurance run")
-        return True
+    async def end_pipeline(self) -> None:
+        """End the image pipeline; a process is killed, and its successor awaited, which takes no simulation time."""
+        imager, device = self.head.imager, self.head.device
+        if isinstance(imager, ErrorModelImager):
+            imager.end("pipeline: ended by an endurance run")
+            return
+        if not isinstance(imager, ProcessImager):
+            raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
+        os.kill(imager.pid, signal.SIGKILL)
+        for ready in (False, True):
+            until_s = time.monotonic() + LONGEST_START_S
+            while device.warm is not ready:
+                if time.monotonic() > until_s:
+                    raise EmulatorError("endurance: the pipeline has not been restarted")
+                await asyncio.sleep(WORKER_WAIT_S)
+                time.sleep(WORKER_WAIT_S)
 
     def set_disk(self, *, full: bool) -> None:
         """Set whether this process can write to files; by the kernel, so that it concerns every writer."""
@@ -320,6 +354,11 @@ class UnitUnderTest:
     def queued_events(self) -> int:
         """Return the number of events in the queue of the device."""
         return self.head.device.scheduler.count
+
+    def memory_bytes(self) -> int:
+        """Return the resident memory of this process."""
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize()
 
     def dispose(self) -> None:
         """Remove the log handler and the limit of files."""

@@ -6,6 +6,7 @@ by coverage; `test_corpus.py` repeats the inputs that were worth keeping.
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import json
 import logging
@@ -75,6 +76,7 @@ from tests.fuzzing.edits import edited, toml
 from tests.protocol.canopen.conftest import Bench as CanopenBench
 
 CONFIGS = Path(__file__).parents[2] / "configs"
+CORPUS = Path(__file__).parent / "corpus"
 UNITS = tuple(bundled_units())
 DOCUMENTED = (EmulatorError, ProtocolError, BenchError, StaridError)
 """The errors that a caller of the readers expects."""
@@ -120,6 +122,12 @@ def target(
         return make
 
     return enter
+
+
+def read_corpus(name: str) -> list[bytes]:
+    """Return the inputs of a target that were kept: one a line, as Python writes bytes."""
+    path = CORPUS / f"{name}.txt"
+    return [ast.literal_eval(line) for line in path.read_text("ascii").splitlines()] if path.exists() else []
 
 
 def chunks(data: bytes) -> Iterator[bytes]:

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from starid.cli.app import build_app
 from starid.errors import StaridError
 from starid.lab.experiments import known_misses, registry, report, runner
-from starid.lab.experiments.comparison import agreement, improvement, same, sampling
+from starid.lab.experiments.comparison import agreement, improvement, null_model, same, sampling
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -273,6 +273,33 @@ def test_a_row_of_several_numbers_counts_each():
     assert "2 of 3 agree" in made.remark
 
 
+def test_a_fitted_constant_is_named_and_outside_the_totals():
+    made = agreement("q", published=1.0, tolerance=(0.1, "a tenth"), author=1.0, fitted="c = 1")
+    assert (made.kind, made.passed, made.target) == ("fitted", True, "± a tenth; fitted: c = 1")
+    found = report.counts([_finished((made,))])
+    assert found["fitted"] == {"met": 1, "of": 1}
+    assert found["agrees"] == {"met": 0, "of": 0}
+
+
+def test_the_best_constant_marks_the_checks_that_it_meets():
+    rows = [
+        agreement(f"q{x}", published=x, tolerance=(0.6, ""), author=value)
+        for x, value in ((98.0, 98.0), (100.0, 5.0), (100.5, 100.5), (90.0, 90.0))
+    ]
+    marked = null_model(rows)
+    assert [(row.weak, row.weak_met) for row in marked] == [(0, 0), (1, 0), (1, 1), (0, 0)]
+    found = report.counts([_finished(tuple(marked))])
+    assert found["weak"] == {"met": 1, "of": 2}
+    assert found["agrees"] == {"met": 2, "of": 2}
+
+
+def test_numbers_that_a_null_model_meets_are_counted_apart():
+    made = same("q", published="", matches=[True, True, False], null=[True, False, True], target="")
+    found = report.counts([_finished((made,))])
+    assert found["weak"] == {"met": 1, "of": 2}
+    assert found["agrees"] == {"met": 1, "of": 1}
+
+
 def test_the_sampling_error_combines_two_counts():
     greatest, words = sampling(50.0, 1000)
     assert greatest == pytest.approx(3.0 * np.sqrt(2.0 * 0.25 / 1000.0) * 100.0, rel=1e-2)
@@ -325,6 +352,10 @@ def test_every_known_miss_has_a_reason_and_an_experiment():
         assert experiment in names
         for quantity, entry in entries.items():
             assert entry.reason.endswith("."), quantity
+
+
+def _finished(rows):
+    return runner.FinishedExperiment(_experiment(), Outcome(rows), quick=False, seconds=0.0, parts=0)
 
 
 def _invoke(*arguments: str):
