@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Any, Final
 
 import numpy as np
@@ -203,7 +204,7 @@ def run(
     -------
     dict
         `rows` (list of `Tally.report`), `solvers` (what each takes for each field: database, time to build or
-        load it, growth of resident memory), `skipped`, `versions`, `seed`.
+        load it, growth of resident memory), `skipped`, `versions`, `seed`, `date`.
     """
     if frames < 1:
         raise StaridError(f"--frames {frames}: must be at least 1")
@@ -226,6 +227,7 @@ def run(
     tallies.sort(key=lambda tally: list(rows).index(tally.row))
     return {
         "seed": seed,
+        "date": datetime.now(UTC).date().isoformat(),
         "rows": [tally.report() for tally in tallies],
         "solvers": made,
         "skipped": skipped,

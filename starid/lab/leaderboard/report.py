@@ -50,7 +50,7 @@ def markdown(answer: Answer, command: str) -> str:
     ]
     lines += ["", *(f"- {name}: skipped, {why}" for name, why in answer["skipped"].items())]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    lines += ["", f"Seed {answer['seed']}. Versions: {versions}.", ""]
+    lines += ["", f"{answer['date']}, seed {answer['seed']}. Versions: {versions}.", ""]
     return "\n".join(lines)
 
 

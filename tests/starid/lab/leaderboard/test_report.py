@@ -82,6 +82,7 @@ def test_wrong_answers_rank_below_missing_ones_and_slow_below_fast() -> None:
 def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
     answer = {
         "seed": 3,
+        "date": "2026-01-02",
         "rows": [entry("one", valid=100.0, wrong=0, cpu=1.0), entry("two", valid=50.0, wrong=2, cpu=1.0, row="8°")],
         "solvers": [
             {"solver": "one", "field_deg": 42.0, "limit_v": 5.5, "database_kb": 120.0, "build_s": 0.1, "memory_mb": 3.0},
