@@ -235,7 +235,9 @@ class _Reader:
                 if not said:  # later ones may be caused by what was removed
                     self.errors += _texts(file, document, error)
                 said = True
-                for place in sorted({_place(document, item) for item in error.errors()}, key=_order, reverse=True):
+                for place in sorted(
+                    {_place(document, item) for item in error.errors()}, key=_order, reverse=True
+                ):
                     self._remove(document, place)
             else:
                 return
