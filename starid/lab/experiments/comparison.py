@@ -2,14 +2,21 @@
 
 An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
 and marks the checks that it meets as weak. (Constants fitted to published numbers: see `choices`.)
+
+`published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
+tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
+``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``the same``, or a number and its origin.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TypedDict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypedDict
 
 from starid.lab.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
 
@@ -178,3 +185,81 @@ def improvement(
     remark = f"Better {better}. {remark}".strip() if passed else remark
     informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
     return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])
+
+
+@lru_cache(maxsize=1)
+def _published() -> dict[tuple[str, str], dict[str, str]]:
+    with Path(__file__).with_name("published.csv").open(encoding="utf-8", newline="") as stream:
+        return {(line["experiment"], line["quantity"]): line for line in csv.DictReader(stream)}
+
+
+def published(experiment: str, quantity: str) -> list[float]:
+    """Return the published numbers of a quantity; none if the thesis has none."""
+    line = _published().get((experiment, quantity))
+    return [] if line is None else [float(word) for word in line["published"].split()]
+
+
+def compared(
+    experiment: str,
+    quantity: str,
+    *,
+    author: Any = None,
+    printed: Any = None,
+    ours: Any = None,
+    remark: str = "",
+) -> Row:
+    """Check a quantity of `published.csv`; several numbers must agree one by one.
+
+    Parameters
+    ----------
+    experiment, quantity
+        Key in `published.csv`.
+    author, printed, ours
+        The number, or as many as are published; the first that is given is checked.
+    remark
+        By default that of the table.
+    """
+    line, numbers = _published()[experiment, quantity], published(experiment, quantity)
+    unit, digits, rule, remark = (
+        line["unit"],
+        int(line["digits"]),
+        line["tolerance"],
+        remark or line["remark"],
+    )
+    if len(numbers) == 1 and rule != "the same":
+        word, _, rest = rule.partition(" ")
+        if word in ("digit", "rounding"):
+            tolerance = rounding(digits if word == "digit" else int(rest), unit)
+        else:
+            tolerance = float(word), rest
+        readings = {
+            name: None if value is None else float(value)
+            for name, value in (("author", author), ("printed", printed), ("ours", ours))
+        }
+        return agreement(
+            quantity,
+            published=numbers[0],
+            tolerance=tolerance,
+            **readings,
+            unit=unit,
+            digits=digits,
+            remark=remark,
+        )
+
+    def text(values: Any) -> str | None:
+        return None if values is None else ", ".join(f"{value:.{digits}f}" for value in values) + unit
+
+    checked = next(values for values in (author, printed, ours) if values is not None)
+    largest = 0.0 if rule == "the same" else 0.51 * 10.0**-digits
+    return same(
+        quantity,
+        published=text(numbers) or "",
+        author=text(author),
+        printed=text(printed),
+        ours=text(ours),
+        matches=[bool(abs(a - b) <= largest) for a, b in zip(checked, numbers, strict=True)],
+        target=rule
+        if rule == "the same"
+        else f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
+        remark=remark,
+    )
