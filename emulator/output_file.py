@@ -54,7 +54,7 @@ class Output:
 
 
 class OutputFile:
-    """A file of complete, unbuffered records; only one emulator at a time can write to it.
+    """A file of complete, unbuffered records; only one emulator at a time can write to it. If it is rejected, it is unchanged.
 
     Parameters
     ----------
@@ -68,11 +68,6 @@ class OutputFile:
         Whether to replace an existing file.
     output
         The output of which this file is a part; after a failure, no part is written. By default it is the whole.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
     def __init__(

@@ -11,7 +11,6 @@ size, at most 3 KB; `tests/fuzzing/test_corpus.py` repeats it.
 from __future__ import annotations
 
 import argparse
-import ast
 import io
 import os
 import re
@@ -72,12 +71,6 @@ def modules() -> list[str]:
     ]
 
 
-def read_corpus(name: str) -> list[bytes]:
-    """Return the inputs of a target that were kept."""
-    path = CORPUS / f"{name}.txt"
-    return [ast.literal_eval(line) for line in path.read_text("ascii").splitlines()] if path.exists() else []
-
-
 def load_targets() -> dict[str, Target]:
     """Import the targets with instrumented modules, once for all."""
     import atheris
@@ -135,14 +128,14 @@ def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
     return CORPUS_BYTES - left
 
 
-def fuzz(name: str, target: Target, seconds: float) -> bool:
+def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
     """Fuzz a target and renew its corpus; return whether no input failed."""
     FAILURES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         found, log = scratch / "found", scratch / "log"
         found.mkdir()
-        for number, data in enumerate([*target.seeds(), *read_corpus(name)]):
+        for number, data in enumerate([*target.seeds(), *kept]):
             (found / f"seed{number}").write_bytes(data)
         before = set(FAILURES.glob(f"{name}-*"))
         options = [
@@ -175,6 +168,8 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the targets")
     options = parser.parse_args()
     targets = load_targets()
+    from tests.fuzzing.targets import read_corpus
+
     wanted = [
         name
         for name in targets
@@ -182,7 +177,7 @@ def main() -> None:
     ]
     if options.list or not wanted:
         sys.exit("\n".join(targets) if options.list else "no such target; see --list")
-    failed = [name for name in wanted if not fuzz(name, targets[name], options.seconds)]
+    failed = [name for name in wanted if not fuzz(name, targets[name], read_corpus(name), options.seconds)]
     print(f"{len(wanted) - len(failed)} of {len(wanted)} targets without a failure {' '.join(failed)}")
     sys.exit(bool(failed))
 

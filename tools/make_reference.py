@@ -353,7 +353,7 @@ def accepted_options(algorithm: str) -> list[str]:
 
 def faults() -> str:
     """Keys of the tables of a `fault` request, except optical faults, whose keys are those of `[sky]`."""
-    from starhil.emulator.control.faults import DeviceFault, WireFault
+    from starhil.emulator.faults import DeviceFault, WireFault
     from starhil.protocol.icd import load_unit
 
     enums = load_unit().enums

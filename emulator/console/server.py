@@ -81,13 +81,7 @@ class ConsoleServer:
         self._listener: asyncio.Server | None = None
 
     async def start(self, where: str) -> str:
-        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page.
-
-        Raises
-        ------
-        EmulatorError
-            The port is in use, or `where` is not an address.
-        """
+        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page."""
         host, port = parse_address(where)
         app = web.Application(middlewares=[self._guard], client_max_size=LARGEST_REPORT)
         for path in ("/", "/runs"):
@@ -289,13 +283,7 @@ def _download(text: str, name: str, kind: str) -> web.Response:
 
 
 def parse_address(where: str) -> tuple[str, int]:
-    """Return host and port of `auto` or HOST:PORT.
-
-    Raises
-    ------
-    EmulatorError
-        The address is invalid.
-    """
+    """Return host and port of `auto` or HOST:PORT."""
     if where == "auto":
         return "127.0.0.1", 0
     host, _, port = where.rpartition(":")

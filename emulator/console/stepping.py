@@ -34,13 +34,7 @@ class StepRunner:
         """Simulation seconds per second; 0 while paused."""
 
     def run(self, speed: float) -> None:
-        """Run at a speed; 0 pauses.
-
-        Raises
-        ------
-        EmulatorError
-            The speed is out of range.
-        """
+        """Run at a speed; 0 pauses."""
         if not 0.0 <= speed <= FASTEST:
             raise EmulatorError(f"speed: {speed:g} is outside 0 … {FASTEST:g}")
         self.pause()

@@ -28,8 +28,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_interface import HostEnd
+from starhil.protocol.serial_interface import Dialect, HostEnd
 from starhil.protocol.serial_stack import build_serial_stack
 
 KEPT_ITEMS: Final = 20_000

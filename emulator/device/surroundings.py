@@ -86,13 +86,7 @@ class Surroundings:
 
 
 def orbit_of(profile: Profile) -> Orbit | None:
-    """Return the true orbit of a profile, or None.
-
-    Raises
-    ------
-    EmulatorError
-        The values do not describe an orbit.
-    """
+    """Return the true orbit of a profile, or None."""
     if profile.orbit is None:
         return None
     try:

@@ -160,13 +160,7 @@ class ProcessImager(_RequestQueue):
         return self._worker.process.pid
 
     async def start(self) -> PipelineReady:
-        """Wait until the pipeline is ready.
-
-        Raises
-        ------
-        EmulatorError
-            The start failed; the text is the worker's reason in one line.
-        """
+        """Wait until the pipeline is ready."""
         self._started = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
         self._writer.write(_with_length(self._setup))
@@ -247,13 +241,7 @@ class ThreadImager(_RequestQueue):
         """Queue of requests; None before the start and after an unexpected end."""
 
     async def start(self) -> PipelineReady:
-        """Wait until the pipeline is ready.
-
-        Raises
-        ------
-        EmulatorError
-            The start failed; one line.
-        """
+        """Wait until the pipeline is ready."""
         self._started = self._loop.create_future()
         self._requests = queue.SimpleQueue()
         self._thread = threading.Thread(
@@ -263,13 +251,7 @@ class ThreadImager(_RequestQueue):
         return await self._started
 
     async def restart(self) -> PipelineReady:
-        """Start another thread after one has ended, and wait until it is ready.
-
-        Raises
-        ------
-        EmulatorError
-            The start failed.
-        """
+        """Start another thread after one has ended, and wait until it is ready."""
         return await self.start()
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:

@@ -75,13 +75,7 @@ class TruthState:
     unix_s: float | None = None
 
     def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
-        """Return the state with the date and orbit of the run if the source has none.
-
-        Raises
-        ------
-        EmulatorError
-            The orbit cannot be propagated to this date.
-        """
+        """Return the state with the date and orbit of the run if the source has none."""
         date = unix_s if self.unix_s is None else self.unix_s
         place = self.orbit
         if place is None and orbit is not None:

@@ -259,6 +259,7 @@ def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
             for body in change(_body(probe)):
                 probe.send(probe.line.framing.encode(body))
             probe.expect_silence("the check is wrong")
+            probe.sleep_past_timeout()  # a length that was changed may announce more bytes
             probe.drain()
             probe.expect_alive()
 
@@ -283,7 +284,8 @@ def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
         yield body[:-size]
 
     yield _case("check", "wrong", "a message with a bit of the check flipped is not answered", silent(wrong))
-    yield _case("check", "damaged", "a message with a bit flipped is not answered", silent(damaged))
+    if "header" in envelope.covers:
+        yield _case("check", "damaged", "a message with a bit flipped is not answered", silent(damaged))
     yield _case("check", "missing", "a message without the check is not answered", silent(missing))
     if size > 1:
         title = "a check with its bytes in the other order is not accepted"

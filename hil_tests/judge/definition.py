@@ -164,7 +164,7 @@ def _fields(row: Any) -> Iterator[Field]:
             yield Field(
                 item.name, item.kind, slot.type, slot.order, offset, size, shift, item.width, item.scale, item.bias,
                 item.minimum, item.maximum, None if item.enum is None else item.enum.values, default, item.const,
-                item.value, item.argument, item.telecommand,
+                item.value, item.argument, item.telecommand, item.unit,
             )  # fmt: skip
             shift += item.width
         offset += size

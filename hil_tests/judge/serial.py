@@ -181,7 +181,7 @@ class Headed:
         end = getattr(link.framing, "end", [])
         ending = {"escaped": 2, "slip": 1}.get(link.framing.kind) or len(end)
         self._compute = check_function(link.check, unit.byte_order, partial(plugin_check, unit))
-        self._covers = getattr(link.check, "covers", [])
+        self.covers = getattr(link.check, "covers", [])
         self.check_size = len(self._compute(b""))
         sizes = {"start": len(self._start), "check": self.check_size, "end": ending}
         coded = [item for item in unit.classes if item.code is not None]
@@ -205,7 +205,7 @@ class Headed:
 
     def _covered(self, header: bytes, data: bytes) -> bytes:
         parts = {"start": self._start, "header": header, "data": data}
-        return b"".join(parts[name] for name in ("start", "header", "data") if name in self._covers)
+        return b"".join(parts[name] for name in ("start", "header", "data") if name in self.covers)
 
     def size(self, begun: bytes, asked: Request | None) -> int | None:
         """Return the size of header, data and check."""

@@ -62,6 +62,8 @@ class DeviceDictionary(Dictionary):
         The interface definition.
     layout
         Indices of its rows, fields and parameters.
+    application
+        Device behind the dictionary; by default it is a stand-in.
 
     Attributes
     ----------
@@ -71,10 +73,12 @@ class DeviceDictionary(Dictionary):
         Parameter → key of its entry.
     """
 
-    def __init__(self, icd: InterfaceDefinition, layout: CanopenModel) -> None:
+    def __init__(
+        self, icd: InterfaceDefinition, layout: CanopenModel, application: Application | None = None
+    ) -> None:
         self.icd = icd
         self.layout = layout
-        self.application: Application = StandInApplication(icd)
+        self.application: Application = application or StandInApplication(icd)
         self.sources: dict[str, set[Key]] = {}
         self.parameters: dict[str, Key] = {}
         self._readers: dict[Key, Callable[[], bytes]] = {}
@@ -420,9 +424,9 @@ class _Packer:
         return enum.values[value]
 
 
-def build_dictionary(icd: InterfaceDefinition) -> DeviceDictionary:
+def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:
     """Build the object dictionary of the device that serves a definition, with the definition's layout."""
-    return DeviceDictionary(icd, read_layout(icd))
+    return DeviceDictionary(icd, read_layout(icd), application)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

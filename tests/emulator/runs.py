@@ -50,6 +50,24 @@ class FakeImager(DirectImager):
         return
 
 
+class FirstHead:
+    """The first head of a run, and the run with its truth, its clock and all fields of its ready line."""
+
+    def __init__(self, run, fields=()) -> None:
+        self.run = run
+        self._fields = fields
+
+    def __getattr__(self, name):
+        run = self.run
+        return next(getattr(part, name) for part in (run.heads[0], run, run.truth) if hasattr(part, name))
+
+    @property
+    def ready_fields(self):
+        run = self.run
+        truth = {"truth": run.truth.address} if run.truth.address else {}
+        return {**truth, **run.heads[0].ready_fields, **dict(self._fields)}
+
+
 def command(emulation, name, **values) -> ErrorCode | None:
     """Send a telecommand past the links; return its error code, or None while its outcome is open."""
     row = emulation.device.icd.telecommands[name]

@@ -1,15 +1,20 @@
 """Checks against published numbers: agreement within a stated tolerance, or improvement on the number.
 
-`published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
-tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
-``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``the same``, or a number and its origin.
+`published.csv` holds numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
+tolerance, remark, and the constant that was fitted to them, if any. `compared` makes the check of a quantity from
+what an experiment measured. The tolerance is ``digit`` (half of the last of the digits shown), ``rounding N`` (of N
+digits), ``the same``, or a number and its origin.
+
+Two things can make an agreement worthless. A constant may have been fitted to the number it explains: such a
+check names the constants and is of the class "fitted", outside the totals. And one constant answer may agree
+with a whole column of a table: `null_model` finds the best one and marks the checks that it meets as weak.
 """
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -51,6 +56,12 @@ def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
     return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
 
 
+def sampled_deviation(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two standard deviations over equally many trials, as a multiple of the standard error."""
+    error = sigma / math.sqrt(trials - 1)
+    return sigmas * error, f"{sigmas:g} standard errors of two deviations of {trials}, {sigmas * error:.2g}"
+
+
 def shown(
     quantity: str,
     *,
@@ -79,6 +90,34 @@ def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -
     return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
 
 
+def _agreeing(informing: Row, target: str, matches: Sequence[bool], fitted: str) -> Row:
+    if fitted:
+        made = _checked(informing, "fitted", f"{target}; fitted: {fitted}", matches)
+        return replace(made, fitted=fitted)
+    return _checked(informing, "agrees", target, matches)
+
+
+def best_constant(intervals: Iterable[Sequence[float]]) -> float:
+    """Value in most of the intervals: the best answer that ignores all that varies within a table."""
+    known = list(intervals)
+    lows = [low for low, _ in known]
+    return max(lows, key=lambda value: sum(low <= value <= high for low, high in known))
+
+
+def null_model(rows: Sequence[Row]) -> list[Row]:
+    """Mark as weak the checks in one column of a table that its best constant answer meets as well."""
+    intervals = [row.interval for row in rows if row.interval]
+    if not intervals:
+        return list(rows)
+    constant = best_constant(intervals)
+    return [
+        replace(row, weak=row.of, weak_met=row.met)
+        if row.interval and row.interval[0] <= constant <= row.interval[1]
+        else row
+        for row in rows
+    ]
+
+
 def agreement(
     quantity: str,
     *,
@@ -90,10 +129,12 @@ def agreement(
     unit: str = "",
     digits: int = 2,
     remark: str = "",
+    fitted: str = "",
 ) -> Row:
     """Make a check for agreement with a published number.
 
-    The value checked is the author's version, or else the printed one, or else ours.
+    The value checked is the author's version, or else the printed one, or else ours. `fitted` names the
+    constants that were fitted to published numbers, and on which the value depends.
 
     Raises
     ------
@@ -108,7 +149,8 @@ def agreement(
     largest, origin = tolerance
     readings = {"published": published, "author": author, "printed": printed, "ours": ours}
     informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
-    return _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
+    made = _agreeing(informing, f"± {origin}", [abs(checked - published) <= largest], fitted)
+    return replace(made, interval=(published - largest, published + largest))
 
 
 def same(
@@ -121,12 +163,19 @@ def same(
     matches: Sequence[bool],
     target: str,
     remark: str = "",
+    fitted: str = "",
+    null: Sequence[bool] = (),
 ) -> Row:
-    """Make one row for several published numbers; `target` names the rule by which each agrees or not."""
+    """Make one row for several published numbers; `target` names the rule by which each agrees or not.
+
+    `null` says which of the numbers the null model meets, `fitted` is as in `agreement`.
+    """
     met, of = sum(map(bool, matches)), len(matches)
     remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
     informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
-    return _checked(informing, "agrees", target, matches)
+    made = _agreeing(informing, target, matches, fitted)
+    weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
+    return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
 
 
 def improvement(
@@ -207,6 +256,7 @@ def compared(
             unit=unit,
             digits=digits,
             remark=remark,
+            fitted=line["fitted"],
         )
 
     def text(values: Any) -> str | None:
@@ -225,4 +275,5 @@ def compared(
         if rule == "the same"
         else f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
         remark=remark,
+        fitted=line["fitted"],
     )

@@ -94,8 +94,8 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
     },
     "rsi": _each(
         "At the printed noise and μ = f = 3 the features of a frame no longer determine its position.",
-        "mean ε_f, p = 99.5 %, μ = 3, f = 3, noise × 1: RSI, τ = 0.5, with memory (ours)",
-        "mean ε_f, p = 99.75 %, μ = 3, f = 3, noise × 1: RSI, τ = 0.5, with memory (ours)",
+        "mean ε_f, p = 99.5 %, μ = 3, f = 3, noise as printed: RSI, τ = 0.5, with memory (ours)",
+        "mean ε_f, p = 99.75 %, μ = 3, f = 3, noise as printed: RSI, τ = 0.5, with memory (ours)",
     ),
     "fsf-confusion": {
         "tables A.1–A.18, brightness noise: recall of the sets": KnownMiss(_RECALL, 13),

@@ -142,7 +142,9 @@ def _estimate_rows(result: Results, kind: str) -> list[Row]:
             ("ours", result["fine"]),
         )
     }
-    errors = {name: float(boresight_error(corner[0], corner[1], *_CORNER)) for name, corner in corners.items()}
+    errors = {
+        name: float(boresight_error(corner[0], corner[1], *_CORNER)) for name, corner in corners.items()
+    }
     error = f"error of the estimate ε_f ({word})"
     return [
         _compared(

@@ -208,7 +208,7 @@ def test_each_head_has_its_own_page_on_a_shared_clock(run):
             await second.ask(do="control", request={"do": "fault", "device": {"stuck": True}})
             assert (await second.ask(do="read", row="device_status"))["outcome"] == "no_reply"
             assert (await first.ask(do="read", row="device_status"))["outcome"] == "ok"
-            assert run.launched.heads[0].faults.describe() == {}
+            assert run.first_head().faults.describe() == {}
             slew = {"kind": "slew", "to": {"star": "rigel", "roll_deg": 20.0}, "max_rate_deg_s": 5.0}
             await second.ask(do="point", **slew)
             await emulation.stepper.step(60.0)

@@ -5,10 +5,10 @@ import pickle
 
 import pytest
 
-from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
 from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageRequest, PipelineReady
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
 from tests.emulator.workers import ANSWERING, WORKER
 

@@ -151,7 +151,7 @@ MUTANTS = (
     Mutant("RPDO acts in PRE-OPERATIONAL", "rpdo", "slave", "if self.state is NmtState.OPERATIONAL and not frame.remote:\n                receive", "if self._context.communicates and not frame.remote:\n                receive"),
     Mutant("synchronous RPDO acts at once", "rpdo", "pdo", "            self._pending = data\n", "            self._apply(data)\n"),
     Mutant("short RPDO processed", "rpdo", "pdo", "if len(data) < self._size:", "if not data:"),
-    Mutant("short RPDO not reported", "rpdo", "pdo", "            self._emergency.raise_error(\n                ErrorCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key\n            )\n", ""),
+    Mutant("short RPDO not reported", "rpdo", "pdo", "            self._emergency.raise_error(\n                EmergencyCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key\n            )\n", ""),
     Mutant("long RPDO not reported", "rpdo", "pdo", "        if len(data) > self._size:\n", "        if False:\n"),
     Mutant("place holders do not count", "rpdo", "pdo", "                position += mapped.size\n", "                position += mapped.size if mapped.entry is not None else 0\n"),
     Mutant("RPDO deadline ignored", "rpdo", "pdo", "self._context.now + self.records.event_s if self.records.event_s else None\n        if", "None\n        if"),
