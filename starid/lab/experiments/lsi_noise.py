@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.lab.experiments.author_noise import identification_noise
+from starid.lab.experiments.author_noise import IDENTIFICATION_CONSTANTS, identification_noise
 from starid.lab.experiments.comparison import Readings, agreement, same, sampling, shown
 from starid.lab.experiments.experiment import (
     Context,
@@ -267,6 +267,7 @@ def _noise_row(
         **values,
         unit="%",
         remark=remark,
+        fitted=IDENTIFICATION_CONSTANTS if level else "",
     )
 
 
