@@ -18,7 +18,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.communication import TPDO_CAN_IDS
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, in_order, span_of
 from starhil.protocol.canopen.dictionary import type_size
-from starhil.protocol.canopen.layout import PackedField
+from starhil.protocol.canopen_schema import PackedField
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import Value
