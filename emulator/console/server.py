@@ -140,6 +140,8 @@ class ConsoleServer:
             response = await handler(request)
         except EmulatorError as error:
             return web.Response(status=400, text=f"{error}\n", headers=HEADERS)
+        except UnicodeEncodeError:  # aiohttp quotes a header that is not text
+            return web.Response(status=400, text="400: a header is not text\n", headers=HEADERS)
         except ConnectionError:  # the page is closed, and nobody reads the response
             return web.Response()
         if not response.prepared:
