@@ -18,13 +18,12 @@ from starhil.protocol.canopen.communication import (
     variable,
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from starhil.protocol.canopen.layout import (
+from starhil.protocol.canopen_schema import (
     CanopenModel,
     PackedField,
     PdoModel,
     PlacedMember,
     PlacedObject,
-    read_layout,
 )
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
@@ -425,8 +424,13 @@ class _Packer:
 
 
 def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:
-    """Build the object dictionary of the device that serves a definition, with the definition's layout."""
-    return DeviceDictionary(icd, read_layout(icd), application)
+    """Build the object dictionary of the device that serves a definition, with the definition's layout.
+
+    Raises IcdError for a definition without `[canopen]`, and for a layout that does not fit its rows.
+    """
+    if icd.canopen is None:
+        raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
+    return DeviceDictionary(icd, icd.canopen, application)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

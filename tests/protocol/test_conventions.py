@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from starhil.protocol.export import export
 from starhil.protocol.icd import IcdError, load_unit
+from starhil.protocol.unit_examples import check_unit
 from starhil.protocol.values import Section
 from starid.attitude import Attitude
 
@@ -120,6 +121,16 @@ def test_human_readable_exports_contain_the_convention(name):
         assert section.heading in said
         for cell in (cell for row in section.rows for cell in row if re.fullmatch(r"[-0-9., ]+", cell)):
             assert cell in said
+
+
+def test_an_unknown_key_hides_what_it_may_cause(tmp_path):
+    (tmp_path / "a.toml").write_text(
+        'unit = { name = "x", version = "1", doc = "x" }\n'
+        '[[section]]\nheading = "Frames"\ncolums = 1\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
+    )
+    assert check_unit(tmp_path) == [
+        f"{tmp_path}/a.toml: section.Frames.colums: unknown key; did you mean columns?"
+    ]
 
 
 def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
