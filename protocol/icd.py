@@ -120,18 +120,31 @@ def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDe
     return definition, reader.errors if files else [f"{path}: no .toml file in this folder"]
 
 
-def _texts(file: Path, document: object, error: ValidationError) -> Iterator[str]:
+def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
+    """Return the keys that lead to an error; pydantic also names the kinds of unions, such as `crc` of a check."""
+    steps: list[int | str] = []
+    for step in error["loc"][:-1]:
+        try:
+            document = document[step]
+        except (KeyError, IndexError, TypeError):
+            continue
+        steps.append(step)
+    return (*steps, *error["loc"][-1:])
+
+
+def _texts(file: Path, document: Any, error: ValidationError) -> Iterator[str]:
     for item in error.errors():
-        where = f"{file}: {_key_path(document, item['loc'])}"
+        location = _location(document, item)
+        where = f"{file}: {_key_path(document, location)}"
         if item["type"] == "extra_forbidden":
-            yield f"{where}: unknown key{did_you_mean(str(item['loc'][-1]), _known_keys(item['loc']))}"
+            yield f"{where}: unknown key{did_you_mean(str(location[-1]), _known_keys(location))}"
         else:
             yield f"{where}: {item['msg']}"
 
 
-def _place(error: ErrorDetails) -> tuple[int | str, ...]:
+def _place(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
     """Return the place of what cannot be used because of an error: a key, a field, a table."""
-    location = error["loc"]
+    location = _location(document, error)
     if error["type"] == "extra_forbidden":
         return location
     if len(location) > 3 and location[2] == "fields":
@@ -222,7 +235,9 @@ class _Reader:
                 if not said:  # later ones may be caused by what was removed
                     self.errors += _texts(file, document, error)
                 said = True
-                for place in sorted({_place(item) for item in error.errors()}, key=_order, reverse=True):
+                for place in sorted(
+                    {_place(document, item) for item in error.errors()}, key=_order, reverse=True
+                ):
                     self._remove(document, place)
             else:
                 return

@@ -102,8 +102,8 @@ def test_telemetry_that_nobody_has_subscribed_to_is_found(monkeypatch):
         row for row in load_unit("cubestar").telecommands.values() if row.action == "select_unsolicited"
     )
     data = row.encode({"telemetry": 160, "rate": 1.0}).hex()
-    select = {"do": "request", "link": "serial", "row": ["", row.id, "telecommand"], "data": data}
-    life = Life("cubestar", 1, ("serial",), {}, ({"do": "wait", "s": 5.0}, select, {"do": "wait", "s": 5.0}))
+    select = {"do": "request", "link": "can", "row": ["", row.id, "telecommand"], "data": data}
+    life = Life("cubestar", 1, ("can",), {}, ({"do": "wait", "s": 5.0}, select, {"do": "wait", "s": 5.0}))
     assert run_once(life).violation.endswith("without a subscription")
 
 
