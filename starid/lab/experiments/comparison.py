@@ -3,7 +3,7 @@
 `published.csv` holds numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
 tolerance, remark, and the constant that was fitted to them, if any. `compared` makes the check of a quantity from
 what an experiment measured. The tolerance is ``digit`` (half of the last of the digits shown), ``rounding N`` (of N
-digits), ``the same``, or a number and its origin.
+digits), ``sampling`` (see `sampling`), ``the same``, or a number and its origin.
 
 Two things can make an agreement worthless. A constant may have been fitted to the number it explains: such a
 check names the constants and is of the class "fitted", outside the totals. And one constant answer may agree
@@ -218,6 +218,7 @@ def compared(
     author: Any = None,
     printed: Any = None,
     ours: Any = None,
+    trials: int = 0,
     remark: str = "",
 ) -> Row:
     """Check a quantity of `published.csv`; several numbers must agree one by one.
@@ -228,19 +229,23 @@ def compared(
         Key in `published.csv`.
     author, printed, ours
         The number, or as many as are published; the first that is given is checked.
+    trials
+        Number of trials, for the tolerance ``sampling``.
     remark
-        By default that of the table.
+        Added to that of the table.
     """
     line, numbers = _published()[experiment, quantity], published(experiment, quantity)
     unit, digits, rule, remark = (
         line["unit"],
         int(line["digits"]),
         line["tolerance"],
-        remark or line["remark"],
+        f"{line['remark']} {remark}".strip(),
     )
     if len(numbers) == 1 and rule != "the same":
         word, _, rest = rule.partition(" ")
-        if word in ("digit", "rounding"):
+        if word == "sampling":
+            tolerance = sampling(numbers[0], trials)
+        elif word in ("digit", "rounding"):
             tolerance = rounding(digits if word == "digit" else int(rest), unit)
         else:
             tolerance = float(word), rest
