@@ -16,6 +16,8 @@ import os
 import re
 import sys
 import tempfile
+import traceback
+import zlib
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,21 +88,34 @@ def load_targets() -> dict[str, Target]:
     return TARGETS
 
 
-def in_child(target: Target, options: list[str], log: Path) -> int:
-    """Run libFuzzer on a target in a fork of this process; return its exit status."""
+def in_child(target: Target, options: list[str], log: Path, failure: str) -> int:
+    """Run libFuzzer on a target in a fork; return its exit status. A failing input becomes a file whose name begins so."""
     import atheris
 
     child = os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    with log.open("wb") as stream:
-        for descriptor in (1, 2):
-            os.dup2(stream.fileno(), descriptor)
-    limits = [f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}", f"-max_len={LONGEST}"]
-    with tempfile.TemporaryDirectory() as folder:
-        atheris.Setup([sys.argv[0], *limits, *options], target.runner(Path(folder)))
-        atheris.Fuzz()  # ends the process
-    return 1
+    try:
+        with log.open("wb") as stream:
+            for descriptor in (1, 2):
+                os.dup2(stream.fileno(), descriptor)
+        limits = [f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}", f"-max_len={LONGEST}"]
+        with tempfile.TemporaryDirectory() as folder:
+            run = target.runner(Path(folder))
+
+            def reporting(data: bytes) -> None:
+                try:
+                    run(data)
+                except BaseException:
+                    Path(f"{failure}{zlib.crc32(data):08x}").write_bytes(data)
+                    raise
+
+            atheris.Setup([sys.argv[0], f"-artifact_prefix={failure}", *limits, *options], reporting)
+            atheris.Fuzz()  # ends the process
+    except Exception:  # noqa: BLE001 (whatever keeps a target from starting)
+        traceback.print_exc()
+    finally:
+        os._exit(1)
 
 
 def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
@@ -108,7 +123,7 @@ def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
     files = sorted(found.iterdir(), key=lambda path: (path.stat().st_size, path.name))
     control = scratch / "control"
     control.write_text("".join(f"{line}\n" for line in (len(files), 0, *files)), "ascii")
-    in_child(target, ["-merge_inner=1", f"-merge_control_file={control}"], scratch / "merge.log")
+    in_child(target, ["-merge_inner=1", f"-merge_control_file={control}"], scratch / "merge", f"{scratch}/")
     reached: dict[Path, set[str]] = {}
     for line in control.read_text("ascii").splitlines()[len(files) + 2 :]:
         kind, number, *features = line.split()
@@ -138,12 +153,8 @@ def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
         for number, data in enumerate([*target.seeds(), *kept]):
             (found / f"seed{number}").write_bytes(data)
         before = set(FAILURES.glob(f"{name}-*"))
-        options = [
-            f"-max_total_time={seconds:.0f}",
-            f"-artifact_prefix={FAILURES}/{name}-",
-            "-print_final_stats=1",
-        ]
-        begin, status = os.times(), in_child(target, [*options, str(found)], log)
+        options = [f"-max_total_time={seconds:.0f}", "-print_final_stats=1", str(found)]
+        begin, status = os.times(), in_child(target, options, log, f"{FAILURES}/{name}-")
         end, text = os.times(), log.read_text("utf-8", "replace")
         failures = sorted(set(FAILURES.glob(f"{name}-*")) - before)
         if status or failures:

@@ -4,7 +4,8 @@ python tools/mutation.py [PATH …] [--sample 40] [--seed 1] [--jobs 1]     PATH
 
 Of each module, a random sample of its mutants is tried. Only the tests that execute the changed line run, quickest first, up to
 60 s of them; which do is measured first. out/mutation holds each mutant (mutants.jsonl) and the table (table.md).
-Each mutant runs in a fork whose functions, or else modules, are exchanged: no file is changed.
+Each mutant runs in a fork whose functions, or else modules, are exchanged: no file is changed. A module without a change must
+pass first.
 Texts, annotations and log messages are not changed.
 """
 
@@ -19,6 +20,7 @@ import random
 import resource
 import sys
 import time
+import traceback
 import types
 from collections.abc import Callable, Iterator
 from importlib.machinery import SourceFileLoader
@@ -38,6 +40,7 @@ GROUPS = {
 """Folders of modules, and the tests among which those of a line are found; of `protocol`, only CODECS."""
 PYTEST = [
     "-q",
+    "--assert=plain",  # pytest would load what it rewrites past the mutant
     "-p",
     "no:cacheprovider",
     "-m",
@@ -46,6 +49,8 @@ PYTEST = [
     "not mutant and not fuzz",
 ]
 TESTS_S = 60.0
+UNJUDGED = 70
+"""Exit status of a process that failed before its tests ran."""
 MEMORY = 6_000_000_000
 _SWAPS = "Lt LtE, Gt GtE, Eq NotEq, Is IsNot, In NotIn, Add Sub, LShift RShift, BitAnd BitOr, And Or, Mult Add, Div Mult, FloorDiv Mult, Mod Mult, BitXor BitOr"
 SWAPS: dict[type, type] = {}
@@ -170,7 +175,7 @@ def change_functions(tree: ast.AST, line: int, module: str) -> bool:
     new = {(code.co_firstlineno, code.co_qualname): code for code in codes(compile(tree, file, "exec"))}
     changed = False
     for function in gc.get_objects():
-        if isinstance(function, types.FunctionType) and function.__code__.co_filename == file:
+        if type(function) is types.FunctionType and function.__code__.co_filename == file:
             code = new.get((function.__code__.co_firstlineno, function.__code__.co_qualname))
             lines = {at for each in codes(function.__code__) for _, _, at in each.co_lines()}
             if code is not None and line in lines and code.co_freevars == function.__code__.co_freevars:
@@ -202,14 +207,18 @@ def run(module: str, tree: ast.AST, line: int, tests: list[str], log: Path) -> i
     with log.open("wb") as stream:
         os.dup2(stream.fileno(), 1)
         os.dup2(stream.fileno(), 2)
-    status = 1
+    status = UNJUDGED
     try:
-        # a survivor is tried again as what was done on import may depend on it
+        # what was done on import may depend on the change: a survivor is tried again
         status = pytest.main(["-x", *PYTEST, *tests]) if change_functions(tree, line, module) else 0
         if status == 0:
             import_again(tree, module)
             status = pytest.main(["-x", *PYTEST, *tests])
+    except BaseException:
+        traceback.print_exc()
     finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
         os._exit(int(status))
 
 
@@ -218,7 +227,10 @@ def judge(child: int, deadline: float) -> str:
     while time.monotonic() < deadline:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
-            return "survived" if os.waitstatus_to_exitcode(status) == 0 else "killed"
+            code = os.waitstatus_to_exitcode(status)
+            if code in (UNJUDGED, pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+                raise SystemExit(f"the tests could not run; see {OUT}/*.log")
+            return "killed" if code else "survived"
         time.sleep(0.02)
     os.killpg(child, 9)
     os.waitpid(child, 0)
@@ -247,12 +259,17 @@ def in_fork(function: Callable[..., object], *arguments: object) -> None:
     """Call a function in a fork, and wait for it."""
     child = os.fork()
     if not child:
+        status = 1
         try:
             function(*arguments)
+            status = 0
+        except (Exception, SystemExit) as error:  # noqa: BLE001 (a fork must not return)
+            print(error)
         finally:
             sys.stdout.flush()
-            os._exit(0)
-    os.waitpid(child, 0)
+            os._exit(status)
+    if os.waitpid(child, 0)[1]:
+        sys.exit(1)
 
 
 def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None:
@@ -265,12 +282,15 @@ def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None
             child = next(iter(running))
             item = running.pop(child)
             item["result"] = judge(child, item.pop("deadline"))
+            if item["line"] == 0:
+                if item["result"] != "survived":
+                    raise SystemExit(f"{item['module']}: its tests fail without a change; see {OUT}/*.log")
+                continue
             with (OUT / "mutants.jsonl").open("a", encoding="utf-8") as stream:
                 stream.write(json.dumps(item) + "\n")
             print(f"{item['module']}:{item['line']}: {item['result']}: {item['change']}", flush=True)
 
     pytest.main(["--collect-only", "-qq", *PYTEST[1:], *tests])  # imports everything once
-    gc.freeze()
     for path in sorted((ROOT / group).glob("*.py")):
         module = str(path.relative_to(ROOT))
         if not module.startswith(tuple(options.modules)) or (
@@ -278,9 +298,10 @@ def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None
         ):
             continue
         count = len(list(changes(ast.parse(path.read_text("utf-8")))))
+        control = ast.parse(path.read_text("utf-8")), 0, "nothing"
         chosen = random.Random(f"{options.seed} {module}").sample(range(count), min(options.sample, count))
-        for number in sorted(chosen):
-            tree, line, change = mutant(path, number)
+        for number in [-1, *sorted(chosen)]:
+            tree, line, change = control if number < 0 else mutant(path, number)
             covering = tests_of(measured, module, line)
             limit = 60.0 + 10.0 * sum(measured["seconds"][test] for test in covering)
             finish(options.jobs - 1)

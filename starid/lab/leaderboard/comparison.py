@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from typing import Any, Final
 
 import numpy as np
@@ -204,7 +204,7 @@ def run(
     -------
     dict
         `rows` (list of `Tally.report`), `solvers` (what each takes for each field: database, time to build or
-        load it, growth of resident memory), `skipped`, `versions`, `seed`, `date`.
+        load it, growth of resident memory), `skipped`, `versions`, `seed`, `frames` and `date`.
     """
     if frames < 1:
         raise StaridError(f"--frames {frames}: must be at least 1")
@@ -226,8 +226,9 @@ def run(
             tallies += _run_row(row, frames, seed, field_of, budget_s)
     tallies.sort(key=lambda tally: list(rows).index(tally.row))
     return {
+        "date": dt.datetime.now(dt.UTC).date().isoformat(),
+        "frames": frames,
         "seed": seed,
-        "date": datetime.now(UTC).date().isoformat(),
         "rows": [tally.report() for tally in tallies],
         "solvers": made,
         "skipped": skipped,
