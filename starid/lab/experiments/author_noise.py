@@ -2,7 +2,7 @@
 
 The printed noise of the factor μ is a standard deviation of μ pixels and μ units of the 8-bit intensity. The
 published numbers follow √μ, as if μ had been passed to a function that expects a variance, and are smaller.
-The constants are fitted to published numbers: what they explain is of the class "fitted".
+The constants are fitted to published numbers (`choices`).
 """
 
 from __future__ import annotations
@@ -23,9 +23,6 @@ BRIGHTNESS_ROOT_PX: Final = 0.13
 
 IDENTIFICATION_ROOT: Final = 0.27
 """Experiments on identification: σ = this·√μ, pixels and units of intensity."""
-
-FILTER_CONSTANTS: Final = "0.333·√μ px, 0.13·√μ px, whole pixels"
-IDENTIFICATION_CONSTANTS: Final = "0.27·√μ"
 
 
 def filter_noise(

@@ -1,26 +1,52 @@
-"""The free choices behind the column "as the author ran it", and the published numbers that depend on each.
+"""The free choices behind the column "as the author ran it", and the published numbers that each bears on.
 
-`choices.csv` lists choices that the text of the thesis does not make, with the experiment and the beginning of the
-quantities that are computed with them. Constants that were fitted to published numbers are named by the rows
-themselves (`Row.fitted`).
+`choices.csv` lists them, with the experiment and the beginning of the quantities. A number is *used* with a choice
+if it is computed with it. It is *fitted* if the choice was made so that this very number comes out: that it then
+agrees proves nothing, and such numbers form a class of their own, outside the totals.
 """
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
-from starid.lab.experiments.experiment import Row
-
-CHOICES_FILE: Final = Path(__file__).with_name("choices.csv")
+from starid.lab.experiments.experiment import Kind, Row
 
 
-def choices() -> list[tuple[str, str, str]]:
-    """Return the lines of `choices.csv`: choice, experiment, beginning of the quantities."""
-    with CHOICES_FILE.open(encoding="utf-8", newline="") as stream:
-        return [(line["choice"], line["experiment"], line["quantity"]) for line in csv.DictReader(stream)]
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A line of `choices.csv`."""
+
+    choice: str
+    role: Literal["fitted", "used"]
+    experiment: str
+    quantity: str
+
+    def bears_on(self, experiment: str, row: Row) -> bool:
+        """Whether a check of a published number depends on this choice."""
+        return (
+            row.kind == "agrees"
+            and row.author != "—"
+            and self.experiment == experiment
+            and row.quantity.startswith(self.quantity)
+        )
+
+
+def _read() -> tuple[Choice, ...]:
+    with Path(__file__).with_name("choices.csv").open(encoding="utf-8", newline="") as stream:
+        return tuple(Choice(**line) for line in csv.DictReader(stream))  # type: ignore[arg-type]
+
+
+CHOICES: Final = _read()
+
+
+def class_of(experiment: str, row: Row) -> Kind:
+    """Return the class of a check: "fitted" instead of "agrees" if a choice was fitted to its number."""
+    fitted = any(each.role == "fitted" and each.bears_on(experiment, row) for each in CHOICES)
+    return "fitted" if fitted else row.kind
 
 
 def numbers_by_choice(rows: Iterable[tuple[str, Row]]) -> dict[str, dict[str, int]]:
@@ -31,17 +57,18 @@ def numbers_by_choice(rows: Iterable[tuple[str, Row]]) -> dict[str, dict[str, in
     rows
         Rows with the names of their experiments.
     """
-    lines = choices()
+    known = list(rows)
     found: dict[str, dict[str, int]] = {}
-    for experiment, row in rows:
-        if row.author == "—" or row.kind not in ("agrees", "fitted"):
-            continue
-        used = [
-            name for name, where, start in lines if where == experiment and row.quantity.startswith(start)
+    for name in dict.fromkeys(each.choice for each in CHOICES):
+        lines = [each for each in CHOICES if each.choice == name]
+        bearing = [
+            (row, any(each.role == "fitted" and each.bears_on(experiment, row) for each in lines))
+            for experiment, row in known
+            if any(each.bears_on(experiment, row) for each in lines)
         ]
-        for name in dict.fromkeys([*used, *([row.fitted] if row.fitted else [])]):
-            entry = found.setdefault(name, {"numbers": 0, "agree": 0, "fitted": 0})
-            entry["numbers"] += row.of
-            entry["agree"] += row.met
-            entry["fitted"] += row.of if name == row.fitted else 0
+        found[name] = {
+            "numbers": sum(row.of for row, _ in bearing),
+            "agree": sum(row.met for row, _ in bearing),
+            "fitted": sum(row.of for row, fitted in bearing if fitted),
+        }
     return found

@@ -1,13 +1,12 @@
 """Checks against published numbers: agreement within a stated tolerance, or improvement on the number.
 
-`published.csv` holds numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
-tolerance, remark, and the constant that was fitted to them, if any. `compared` makes the check of a quantity from
-what an experiment measured. The tolerance is ``digit`` (half of the last of the digits shown), ``rounding N`` (of N
-digits), ``the same``, or a number and its origin.
+An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
+and marks the checks that it meets as weak. (Constants fitted to published numbers: see `choices`.)
 
-Two things can make an agreement worthless. A constant may have been fitted to the number it explains: such a
-check names the constants and is of the class "fitted", outside the totals. And one constant answer may agree
-with a whole column of a table: `null_model` finds the best one and marks the checks that it meets as weak.
+`published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
+tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
+``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``sampling`` (see `sampling`), ``the
+same``, or a number and its origin.
 """
 
 from __future__ import annotations
@@ -90,13 +89,6 @@ def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -
     return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
 
 
-def _agreeing(informing: Row, target: str, matches: Sequence[bool], fitted: str) -> Row:
-    if fitted:
-        made = _checked(informing, "fitted", f"{target}; fitted: {fitted}", matches)
-        return replace(made, fitted=fitted)
-    return _checked(informing, "agrees", target, matches)
-
-
 def best_constant(intervals: Iterable[Sequence[float]]) -> float:
     """Value in most of the intervals: the best answer that ignores all that varies within a table."""
     known = list(intervals)
@@ -129,12 +121,10 @@ def agreement(
     unit: str = "",
     digits: int = 2,
     remark: str = "",
-    fitted: str = "",
 ) -> Row:
     """Make a check for agreement with a published number.
 
-    The value checked is the author's version, or else the printed one, or else ours. `fitted` names the
-    constants that were fitted to published numbers, and on which the value depends.
+    The value checked is the author's version, or else the printed one, or else ours.
 
     Raises
     ------
@@ -149,7 +139,7 @@ def agreement(
     largest, origin = tolerance
     readings = {"published": published, "author": author, "printed": printed, "ours": ours}
     informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
-    made = _agreeing(informing, f"± {origin}", [abs(checked - published) <= largest], fitted)
+    made = _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
     return replace(made, interval=(published - largest, published + largest))
 
 
@@ -163,17 +153,16 @@ def same(
     matches: Sequence[bool],
     target: str,
     remark: str = "",
-    fitted: str = "",
     null: Sequence[bool] = (),
 ) -> Row:
     """Make one row for several published numbers; `target` names the rule by which each agrees or not.
 
-    `null` says which of the numbers the null model meets, `fitted` is as in `agreement`.
+    `null` says which of the numbers the null model meets.
     """
     met, of = sum(map(bool, matches)), len(matches)
     remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
     informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
-    made = _agreeing(informing, target, matches, fitted)
+    made = _checked(informing, "agrees", target, matches)
     weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
     return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
 
@@ -218,6 +207,7 @@ def compared(
     author: Any = None,
     printed: Any = None,
     ours: Any = None,
+    trials: int = 0,
     remark: str = "",
 ) -> Row:
     """Check a quantity of `published.csv`; several numbers must agree one by one.
@@ -228,19 +218,19 @@ def compared(
         Key in `published.csv`.
     author, printed, ours
         The number, or as many as are published; the first that is given is checked.
+    trials
+        Number of trials, for the tolerance ``sampling``.
     remark
-        By default that of the table.
+        Added to that of the table.
     """
     line, numbers = _published()[experiment, quantity], published(experiment, quantity)
-    unit, digits, rule, remark = (
-        line["unit"],
-        int(line["digits"]),
-        line["tolerance"],
-        remark or line["remark"],
-    )
+    unit, digits, rule = line["unit"], int(line["digits"]), line["tolerance"]
+    remark = f"{line['remark']} {remark}".strip()
     if len(numbers) == 1 and rule != "the same":
         word, _, rest = rule.partition(" ")
-        if word in ("digit", "rounding"):
+        if word == "sampling":
+            tolerance = sampling(numbers[0], trials)
+        elif word in ("digit", "rounding"):
             tolerance = rounding(digits if word == "digit" else int(rest), unit)
         else:
             tolerance = float(word), rest
@@ -256,7 +246,6 @@ def compared(
             unit=unit,
             digits=digits,
             remark=remark,
-            fitted=line["fitted"],
         )
 
     def text(values: Any) -> str | None:
@@ -275,5 +264,4 @@ def compared(
         if rule == "the same"
         else f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
         remark=remark,
-        fitted=line["fitted"],
     )

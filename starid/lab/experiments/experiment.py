@@ -33,11 +33,8 @@ EPOCH: Final = 1991.25
 """Epoch of the catalogue: the published numbers are without proper motion."""
 
 Kind = Literal["", "agrees", "fitted", "better", "ours"]
-"""Class of a check, or none ("").
-
-Agreement with a published number; agreement that a constant fitted to published numbers explains; improvement
-on a published number; our own bound.
-"""
+"""Class of a check: agreement with a published number, the same after a constant was fitted to that number (only in
+the report, see `choices`), improvement on it, our own bound, or none ("")."""
 
 
 class ReproduceError(StaridError):
@@ -88,8 +85,6 @@ class Row:
         Class of the check.
     met, of
         How many of the published numbers in the row agree, and how many there are.
-    fitted
-        Constants on which the value depends and that were fitted to published numbers.
     interval
         Lowest and highest value that agrees, for one published number.
     weak, weak_met
@@ -108,7 +103,6 @@ class Row:
     kind: Kind = ""
     met: int = 0
     of: int = 0
-    fitted: str = ""
     interval: tuple[float, ...] = ()
     weak: int = 0
     weak_met: int = 0

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Mask
-from starid.lab.experiments.author_noise import FILTER_CONSTANTS, filter_noise
+from starid.lab.experiments.author_noise import filter_noise
 from starid.lab.experiments.comparison import (
     agreement,
     best_constant,
@@ -327,7 +327,6 @@ def _table_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                     null=null,
                     target="within 3 standard errors at the published 1 000 frames about one first frame",
                     remark=f"A constant {constant:.1f} % agrees with {sum(null)}.",
-                    fitted=FILTER_CONSTANTS,
                 )
             )
     return rows
@@ -376,7 +375,6 @@ def _prediction_rows(context: Context, results: Mapping[str, Results]) -> list[R
                     matches=matches,
                     target="as above",
                     remark=f"The fit is {best:.3f} of the constant used.",
-                    fitted=FILTER_CONSTANTS,
                 )
             )
     return rows
@@ -398,7 +396,6 @@ def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 author=_of_author(results, kind, f, k, indicator),
                 printed=_percent(result["any"][k], indicator),
                 unit="%",
-                fitted=FILTER_CONSTANTS if k else "",
             )
         )
         if published == _ALL:
@@ -429,7 +426,6 @@ def _motion_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             unit="°",
             digits=4,
             remark="Over all pairs in the cluster, about the motion fitted to the inliers.",
-            fitted=FILTER_CONSTANTS,
         ),
         same(
             "figure 6.18: μ_d without noise, median",
@@ -497,7 +493,7 @@ EXPERIMENTS: Final = (
             "first_frames": 7,
             "frames": 150,
         },
-        revision=4,
+        revision=3,
         quick={
             "kinds": ["both"],
             "false_stars": [0, 5],

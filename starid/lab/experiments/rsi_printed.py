@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
-from starid.lab.experiments.author_noise import IDENTIFICATION_CONSTANTS, identification_noise
+from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.comparison import (
     agreement,
     null_model,
@@ -249,7 +249,6 @@ def _error_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                         author=author,
                         unit=unit,
                         remark=f"Median {np.median(values):.2f}{unit}." if what == "mean" else "",
-                        fitted=IDENTIFICATION_CONSTANTS if m else "",
                     )
                 )
     return [row for column in columns.values() for row in null_model(column)]
@@ -275,7 +274,6 @@ def _update_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                     author=100.0 * float(np.mean(psi > limit)),
                     unit="%",
                     digits=1,
-                    fitted=IDENTIFICATION_CONSTANTS if m else "",
                 )
             )
     return [row for column in columns.values() for row in null_model(column)]
@@ -342,7 +340,6 @@ def _gamma_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                         printed=readings[0],
                         unit="°",
                         remark=words,
-                        fitted=IDENTIFICATION_CONSTANTS if m else "",
                     ),
                 ),
                 (
@@ -354,7 +351,6 @@ def _gamma_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                         author=author_sigma,
                         unit="°",
                         digits=3,
-                        fitted=IDENTIFICATION_CONSTANTS if m else "",
                     ),
                 ),
                 (
