@@ -46,7 +46,7 @@ PYTEST = [
     "-m",
     "not process and not socketcan and not browser",
     "-k",
-    "not mutant and not fuzz",
+    "not (mutant or fuzz or conformance or stateful or durand or library or every_unit)",
 ]
 TESTS_S = 60.0
 UNJUDGED = 70
