@@ -194,7 +194,7 @@ def import_again(tree: ast.AST, module: str) -> None:
     )
     SourceFileLoader.get_code = lambda self, full: (
         compile(tree, self.path, "exec") if full == name else original(self, full)
-    )  # type: ignore
+    )
 
 
 def run(module: str, tree: ast.AST, line: int, tests: list[str], log: Path) -> int:
@@ -214,7 +214,7 @@ def run(module: str, tree: ast.AST, line: int, tests: list[str], log: Path) -> i
         if status == 0:
             import_again(tree, module)
             status = pytest.main(["-x", *PYTEST, *tests])
-    except BaseException:
+    except BaseException:  # noqa: BLE001 (a fork must not return)
         traceback.print_exc()
     finally:
         sys.stdout.flush()
@@ -299,7 +299,8 @@ def try_group(group: str, tests: list[str], options: argparse.Namespace) -> None
             continue
         count = len(list(changes(ast.parse(path.read_text("utf-8")))))
         control = ast.parse(path.read_text("utf-8")), 0, "nothing"
-        chosen = random.Random(f"{options.seed} {module}").sample(range(count), min(options.sample, count))
+        draw = random.Random(f"{options.seed} {module}")  # noqa: S311 (a sample)
+        chosen = draw.sample(range(count), min(options.sample, count))
         for number in [-1, *sorted(chosen)]:
             tree, line, change = control if number < 0 else mutant(path, number)
             covering = tests_of(measured, module, line)
