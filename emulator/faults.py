@@ -114,8 +114,6 @@ class Faults:
 
     Parameters
     ----------
-    device
-        Device that the faults affect.
     links
         The links of the device, also those that are opened later.
     """

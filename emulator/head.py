@@ -56,16 +56,10 @@ class Head:
 
     Parameters
     ----------
-    number
-        Number of the head; the first is 1.
-    profile, icd
-        Profile of the device, and interface definition of its unit.
     imager
         Its pipeline, which is not started yet.
     truth
         Truth of the body on which the head is mounted.
-    wiring
-        Connects the head to the world.
     on_warm
         Called when the pipeline is ready, also after a restart.
 

@@ -72,8 +72,6 @@ class Emulator:
     ----------
     profiles
         Profiles of the heads; truth and clock are those of the first.
-    options
-        Options that are not part of the profiles.
     worker
         Pipeline worker that was started earlier; by default one is started here.
 

@@ -22,11 +22,6 @@ log: Final = logging.getLogger("starhil.output")
 class Output:
     """Something that a run writes.
 
-    Parameters
-    ----------
-    name
-        What it is, for messages.
-
     Attributes
     ----------
     failed
@@ -62,10 +57,6 @@ class OutputFile:
         What the file is, for messages: `truth log`.
     path
         The file; created if it does not exist.
-    header
-        First record.
-    overwrite
-        Whether to replace an existing file.
     output
         The output of which this file is a part; after a failure, no part is written. By default it is the whole.
     """

@@ -24,15 +24,7 @@ PEER_PATIENCE_S: Final = 1.0
 
 
 class ClockPump:
-    """Runs each event in the event loop when it is due.
-
-    Parameters
-    ----------
-    clock
-        Clock of the run, which advances by itself.
-    recorder
-        Records the events.
-    """
+    """Runs each event in the event loop when it is due."""
 
     def __init__(self, scheduler: Scheduler, clock: Clock, recorder: Recorder | None = None) -> None:
         self._scheduler = scheduler
@@ -103,8 +95,6 @@ class StepPump:
         transport until it reads again.
     time_passes
         Set when every pipeline is ready; steps wait for it.
-    recorder
-        Records the events.
     """
 
     def __init__(

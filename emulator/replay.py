@@ -252,13 +252,7 @@ class _PlayedSerial(_PlayedTransport[bytes], SerialTransport):
 
 
 class PlayedImager:
-    """A pipeline whose replies wait for their entries.
-
-    Parameters
-    ----------
-    inner
-        Renders and solves the frames.
-    """
+    """A pipeline whose replies wait for their entries."""
 
     def __init__(self, inner: Imager) -> None:
         self._inner = inner
@@ -300,8 +294,6 @@ class ReplayReport:
 
     Attributes
     ----------
-    entries
-        Number of entries played.
     sent
         Number of serial bytes or CAN frames sent, by link.
     differences
@@ -363,8 +355,6 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
 
     Parameters
     ----------
-    folder
-        The recording.
     profile
         Profile of the device, instead of the recorded one; `run` except the algorithm, and `links`, are as recorded.
     """

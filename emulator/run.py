@@ -44,12 +44,8 @@ class Run:
     ----------
     profiles
         Profiles of the heads; truth and clock are those of the first.
-    wiring
-        Connects the run to the world; by default directly.
     worker
         Pipeline worker of the first head that was started earlier; by default it is started here.
-    previews
-        Whether images may be displayed.
 
     Attributes
     ----------

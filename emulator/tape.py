@@ -38,11 +38,6 @@ STATE_FOLDER: Final = "state"
 class Wiring:
     """Connects a run to the world: directly. A recorder or a player takes the place of these connections.
 
-    Parameters
-    ----------
-    clock
-        Clock of the run.
-
     Attributes
     ----------
     plays
@@ -75,13 +70,7 @@ class Wiring:
 
 
 class LatchedClock:
-    """A clock that stops while an entry is processed.
-
-    Parameters
-    ----------
-    source
-        The running clock.
-    """
+    """A clock that stops while an entry is processed."""
 
     def __init__(self, source: Clock) -> None:
         self.source = source
@@ -122,8 +111,6 @@ class Recorder(Wiring):
 
     Parameters
     ----------
-    folder
-        Folder of the recording.
     inner
         Connects the run to the world.
 

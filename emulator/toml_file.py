@@ -15,8 +15,6 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    path
-        The file.
     what
         Kind of file, for messages: `profile`, `scenario`.
     """

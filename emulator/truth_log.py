@@ -82,8 +82,6 @@ class TruthLog:
     ----------
     path
         The file; created if it does not exist.
-    overwrite
-        Whether to replace an existing file.
     wall_times
         Whether to fill the columns in `WALL_TIMES`.
     output

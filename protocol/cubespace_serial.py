@@ -178,8 +178,7 @@ class HostReceiver(EscapedDeframer[Reply]):
         request, size = self._expected
         return request.kind is RequestKind.TELECOMMAND or size != len(body)
 
-    @staticmethod
-    def _interpret_generation_2(body: bytes) -> Reply | LinkFault:
+    def _interpret_generation_2(self, body: bytes) -> Reply | LinkFault:
         start, row_id, data = body[0], body[1], body[2:]
         if start == START:
             if row_id == BURST_ID and len(data) == BURST_SIZE:

@@ -8,7 +8,6 @@ from pathlib import Path
 
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.canopen.device_dictionary import build_dictionary
-from starhil.protocol.canopen.layout import layout_errors
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.cubespace_serial import CubeSpaceStack
@@ -102,13 +101,10 @@ def examine(
             row.encode(row.example(), saturate=row.kind == "telemetry")
         except ProtocolError as error:
             errors.append(f"unit {definition.name}: {row.kind} {row.name}: example: {error}")
-    table = definition.canopen
-    if table is not None:
-        errors += layout_errors(table)
     examples: list[Exchange] = []
     if not errors:
         try:
-            if table is not None:
+            if definition.canopen is not None:
                 build_dictionary(definition)
             examples += exchanges(definition)
         except ProtocolError as error:

@@ -252,8 +252,8 @@ def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
     formats = {
-        "lives": "d", "device_years": ".3f", "imaging_years": ".3f", "frames": "d", "requests": "d", "readings": "d",
-        "attitudes": "d", "violating": "d",
+        "lives": "d", "device_years": ".3f", "imaging_years": ".3f", "frames": "d", "requests": "d", "attitudes": "d",
+        "violating": "d",
     }  # fmt: skip
     table = Table("unit", *(name.removesuffix("_years").replace("_", " ") for name in formats), box=None)
     for name, row in [*figures["units"].items(), ("all", figures)]:

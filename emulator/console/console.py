@@ -44,21 +44,7 @@ CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "cl
 
 
 class Console:
-    """Server side of the pages of a head.
-
-    Parameters
-    ----------
-    run
-        The run; it is open.
-    head
-        The head.
-    client
-        OBC on a link to the device; it is open.
-    stepping
-        Runs the stepped clock; shared by all heads.
-    runs
-        Session and conformance runs; shared by all heads.
-    """
+    """Server side of the pages of a head."""
 
     def __init__(self, run: Run, head: Head, client: ObcClient, stepping: StepRunner, runs: Runs) -> None:
         self._run = run

@@ -41,10 +41,6 @@ class Exchange:
         The outcome in one line; empty if it is `ok`.
     latency_s
         Time from request to reply, seconds; None without a reply.
-    data
-        Data of the reply.
-    refused
-        Whether the device refused the request.
     """
 
     outcome: str
@@ -75,8 +71,6 @@ class ObcPort:
     ----------
     bus
         `can`, `canopen` or `serial`.
-    where
-        Channel or port.
     icd
         Interface definition of the device.
     device_address
@@ -113,12 +107,8 @@ class ConsoleObc:
 
     Parameters
     ----------
-    client
-        OBC on a link.
     icd
         Interface definition of the device.
-    clock
-        Returns a monotonic time in seconds.
     """
 
     def __init__(

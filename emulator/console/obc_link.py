@@ -18,10 +18,6 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
 
     Parameters
     ----------
-    head
-        The head; its links are open.
-    make_client
-        Makes the OBC.
     closers
         Receives a function to close each opened resource, in order of opening.
     """

@@ -76,19 +76,7 @@ INFO: Final = 2
 
 
 class McapRecorder:
-    """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows.
-
-    Parameters
-    ----------
-    head
-        The head; its links are open.
-    client
-        OBC client that reads the telemetry.
-    path
-        File to write.
-    overwrite
-        Whether to replace an existing file.
-    """
+    """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows."""
 
     def __init__(self, head: Head, client: ObcClient, path: Path, *, overwrite: bool = False) -> None:
         self._head = head

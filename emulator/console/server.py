@@ -68,8 +68,6 @@ class ConsoleServer:
 
     Parameters
     ----------
-    consoles
-        A console for each head; they have been started.
     token
         Token that the address of every page must contain; by default a random one.
     """

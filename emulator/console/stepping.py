@@ -19,13 +19,7 @@ FASTEST: Final = 100.0
 
 
 class StepRunner:
-    """Steps the clock until it is paused.
-
-    Parameters
-    ----------
-    execute
-        Executes requests on the control channel.
-    """
+    """Steps the clock until it is paused."""
 
     def __init__(self, execute: Execute) -> None:
         self.execute = execute

@@ -76,10 +76,6 @@ class ControlServer:
 
     Parameters
     ----------
-    run
-        The run; it is open.
-    quit_run
-        Called to end the run.
     token
         Token that each request must carry; empty for none.
     """

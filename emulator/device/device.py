@@ -69,25 +69,7 @@ def run_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None],
 
 
 class Device:
-    """A star sensor without its links.
-
-    Parameters
-    ----------
-    profile
-        Profile of the unit.
-    icd
-        Interface definition.
-    clock
-        Clock of the simulation time.
-    imager
-        Renders and solves the images.
-    store
-        Stores the state that survives a restart.
-    truth
-        Source of the true attitude.
-    background
-        Runs slow writes.
-    """
+    """A star sensor without its links."""
 
     def __init__(
         self,

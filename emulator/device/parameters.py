@@ -77,8 +77,6 @@ class Parameters(Mapping[str, ParameterValue]):
 
     Parameters
     ----------
-    icd
-        Interface definition, with names, types and limits.
     defaults
         Defaults of this device that differ from the definition.
     on_change

@@ -32,14 +32,8 @@ class Surroundings:
 
     Parameters
     ----------
-    profile
-        Date, orbit, radiation and sky.
     truth
         Truth of the sensor; what it describes may change during a run.
-    thermal
-        Temperature of the unit.
-    now_ns
-        Returns the simulation time, nanoseconds.
 
     Attributes
     ----------

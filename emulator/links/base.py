@@ -51,19 +51,7 @@ class Link(Protocol):
 
 
 class DeviceLink(ABC, Generic[Item, Style]):
-    """Connects a device to a transport.
-
-    Parameters
-    ----------
-    requests
-        Request handling of the device.
-    transport
-        Transport of bytes or CAN frames.
-    damage
-        Corrupts items for link faults.
-    seed
-        Seed of the link faults.
-    """
+    """Connects a device to a transport."""
 
     def __init__(
         self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int

@@ -71,15 +71,7 @@ def not_before(deadline: float) -> int:
 
 
 class DeviceApplication:
-    """The application of the object dictionary, `starhil.protocol.canopen.application.Application`.
-
-    Parameters
-    ----------
-    requests
-        The device's handling of requests.
-    finish
-        Called with the result of a deferred write.
-    """
+    """The application of the object dictionary, `starhil.protocol.canopen.application.Application`."""
 
     def __init__(self, requests: Requests, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
         self._requests = requests
@@ -173,17 +165,6 @@ def _storage_refusal(error: EmulatorError | None) -> SdoAbortError | None:
 
 class CanopenLink:
     """Connects a device to a CAN bus as a CANopen slave.
-
-    Parameters
-    ----------
-    requests
-        The device's handling of requests.
-    transport
-        Transport of the bus.
-    storage
-        Storage of the communication parameters across restarts.
-    seed
-        Seed of the wire faults.
 
     The node ID is the parameter `canopen_node` of the device, unless LSS has stored another one.
     """

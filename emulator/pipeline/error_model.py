@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
 from typing import Any, Final
 
 from starhil.emulator.pipeline.imager import PipelineRequest, ReplyCallback
@@ -32,6 +31,7 @@ from starhil.emulator.pipeline.messages import (
     Quaternion,
     Triple,
 )
+from starhil.emulator.signals import Signal
 from starid.camera import Camera
 
 ARCSEC: Final = math.radians(1.0 / 3600.0)
@@ -67,8 +67,8 @@ class ErrorModelImager:
         self._constants: dict[str, Any] = self._camera.to_dict()
         self._running = True
         self._last_image = -1
-        self.on_failure: Callable[[str], None] | None = None
-        """Called with the reason when the pipeline ends unexpectedly."""
+        self.ended = Signal[str]("end of the image pipeline")
+        """The pipeline has ended unexpectedly, and why."""
         self.watchers: set[object] = set()
         """Viewers of the frames, for which this pipeline has no images."""
 
@@ -90,8 +90,7 @@ class ErrorModelImager:
     def end(self, reason: str) -> None:
         """End unexpectedly."""
         self._running = False
-        if self.on_failure is not None:
-            self.on_failure(reason)
+        self.ended.emit(reason)
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Answer a request."""

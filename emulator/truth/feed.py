@@ -41,14 +41,8 @@ class LiveFeed:
 
     Parameters
     ----------
-    truth
-        Receives the messages.
-    now_s
-        Returns the simulation time in seconds.
     step
         Advances the simulation clock, for lock-step; None if time passes by itself.
-    on_message
-        Called with each message before it is processed.
     """
 
     def __init__(

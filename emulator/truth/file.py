@@ -71,8 +71,6 @@ class FileTruth:
     ----------
     times_s
         Times (n,) of the rows, seconds, increasing.
-    attitudes
-        Attitude of each row.
     rates_rad_s
         Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows.
     start_s

@@ -141,13 +141,7 @@ class KeplerOrbit:
 
 
 class TleOrbit:
-    """An orbit from a two-line element set, propagated by SGP4.
-
-    Parameters
-    ----------
-    line1, line2
-        The two lines.
-    """
+    """An orbit from a two-line element set, propagated by SGP4."""
 
     def __init__(self, line1: str, line2: str) -> None:
         from sgp4.api import Satrec

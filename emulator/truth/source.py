@@ -147,10 +147,6 @@ class SlewSegment:
 
     Attributes
     ----------
-    to
-        Final attitude.
-    rate_rad_s
-        Largest rate, rad/s.
     shape
         `smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant
         braking).
@@ -223,10 +219,6 @@ class SlewTruth:
 
     Parameters
     ----------
-    attitude
-        Initial attitude.
-    segments
-        Segments in order.
     start_s
         Simulation time at which the first segment begins; at rest before this.
     repeat

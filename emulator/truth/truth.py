@@ -68,8 +68,6 @@ class Truth:
         The configured truth; `open` builds it.
     folder
         Folder to which relative paths of truth files refer.
-    host
-        The run.
 
     Attributes
     ----------
@@ -105,8 +103,6 @@ class Truth:
 
         Parameters
         ----------
-        config
-            The new truth.
         at_s
             Simulation time at which its motion begins, as in a recorded run; by default now.
         """
@@ -183,8 +179,6 @@ class SensorTruth:
 
     Parameters
     ----------
-    body
-        Truth of the body.
     mount
         Rotation body→sensor, unless the truth's configuration has one; None: the frames are the same.
     """

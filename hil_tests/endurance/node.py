@@ -1,7 +1,8 @@
 """What a CANopen node sends by itself, decoded by the default mapping of its definition: PDOs, EMCY, heartbeats.
 
 A TPDO carries entries of the object dictionary, each a field of a telemetry row or the same in a narrower type. The
-values of the TPDOs of one instant are judged as one row, so that an attitude spread over two of them is compared.
+values of the TPDOs of one instant are judged as one row, so that an attitude spread over two of them is compared, and
+modes that last for no time are left out.
 Lives do not change the mapping.
 """
 
@@ -16,8 +17,7 @@ from starhil.hil_tests.endurance.violation import Violation
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.communication import TPDO_CAN_IDS
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, in_order, span_of
-from starhil.protocol.canopen.dictionary import type_size
-from starhil.protocol.canopen.layout import PackedField
+from starhil.protocol.canopen_schema import PackedField
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.values import Value
@@ -77,17 +77,14 @@ class Node:
         for number, model in enumerate(dictionary.layout.tpdo):
             if model.enabled:
                 can_id = model.can_id or TPDO_CAN_IDS[number]
-                self._tpdos[can_id, model.relative] = [
-                    _mapped(icd, dictionary, name) for name in model.objects
-                ]
-        self._instant_s = -1.0
+                self._tpdos[can_id, model.relative] = [_mapped(dictionary, name) for name in model.objects]
         self._together: Readings = {}
 
     def judge(self, frame: CanFrame, node: int, oracle: Oracle) -> int:
         """Judge a message sent now; return the number of rows read."""
         entries = self._tpdos.get((frame.id - node, True)) or self._tpdos.get((frame.id, False))
         if entries is not None:
-            self._judge_pdo(frame, entries, oracle)
+            self._keep(frame, entries)
             return 1
         if frame.id == EMERGENCY + node and len(frame.data) == 8:
             self._judge_emergency(int.from_bytes(frame.data[:2], "little"), oracle)
@@ -97,31 +94,25 @@ class Node:
             )
         return 0
 
-    def _judge_pdo(self, frame: CanFrame, entries: list[_Mapped], oracle: Oracle) -> None:
-        where = f"TPDO {frame.id:03X}h"
+    def _keep(self, frame: CanFrame, entries: list[_Mapped]) -> None:
         if len(frame.data) != sum(entry.size for entry in entries):
-            raise Violation(f"{where}: {len(frame.data)} bytes")
-        if oracle.now_s != self._instant_s:
-            self.judge_attitude(oracle)
-            self._instant_s = oracle.now_s
+            raise Violation(f"TPDO {frame.id:03X}h: {len(frame.data)} bytes")
         offset = 0
-        read: Readings = {}
         for entry in entries:
-            read |= entry.read(frame.data[offset : offset + entry.size])
+            self._together |= entry.read(frame.data[offset : offset + entry.size])
             offset += entry.size
-        oracle.judge(where, read)
-        self._together |= read
 
-    def judge_attitude(self, oracle: Oracle) -> None:
-        """Judge the attitude in the TPDOs of the last instant, if it is complete."""
+    def judge_instant(self, oracle: Oracle) -> None:
+        """Judge the TPDOs of the last instant; the last value of each quantity counts."""
         read, self._together = self._together, {}
+        oracle.judge("TPDOs", read)
         four = [read.get(f"attitude.{letter}") for letter in "xyzw"]
         if any(item is None for item in four):
             return
         if "attitude.valid" not in read:  # sent only when it changes
             numbers = [item for item in four if item is not None]
             read["attitude.valid"] = (numbers[0][0], any(value != 0.0 for _, value in numbers))
-        oracle.judge_attitude("TPDOs", read, self._instant_s)
+        oracle.judge_attitude("TPDOs", read)
 
     def _judge_emergency(self, code: int, oracle: Oracle) -> None:
         if code and code - DEVICE_ERROR not in self._errors:
@@ -130,24 +121,11 @@ class Node:
             raise Violation(f"canopen: EMCY {code:04X}h in {', '.join(sorted(oracle.modes))}")
 
 
-def _mapped(icd: InterfaceDefinition, dictionary: DeviceDictionary, name: str) -> _Mapped:
+def _mapped(dictionary: DeviceDictionary, name: str) -> _Mapped:
     """Return the entry of a name as in the mapping of a definition, `INDEX.NAME` or `INDEX`."""
-    index, _, member = name.partition(".")
-    placed = next(item for item in dictionary.layout.object if item.index == int(index, 16))
-    packed = next(
-        (item for item in placed.packed if member in (item.name, item.source.partition(".")[2])), None
-    )
-    if placed.telemetry is not None:
-        source = f"{placed.telemetry}.{member}"
-    elif packed is not None:
-        source = packed.source
-    else:
-        named = [item.value for item in placed.members if item.name.lower() == member.lower()]
-        source = str(named[0] if named else placed.value)
-    row_name, _, field_name = source.partition(".")
-    row = icd.telemetry[row_name]
-    size = type_size(dictionary.entries[dictionary.key_of(name)].variable.data_type)
-    field = row.named_fields[field_name]
+    key = dictionary.key_of(name)
+    reading = dictionary.readings[key]
+    field, packed = reading.fields[0], reading.packed
     if packed is not None and field.width == 0:
         field = field.changed(kind="integer", scale=packed.scale)
-    return _Mapped(size or 0, row, field, packed)
+    return _Mapped(dictionary.entries[key].size or 0, reading.row, field, packed)

@@ -127,11 +127,16 @@ class Obc:
             if isinstance(port, CanopenPort):
                 heard += [(at_s, link, frame) for at_s, frame in port.messages()]
         for at_s, link, event in sorted(heard, key=lambda item: item[0]):
+            if at_s > self._oracle.now_s:
+                self._end_instant()
             if link not in self._oracle.disturbed:
                 self._oracle.time_passed(at_s)
                 self._judge_unasked(link, event)
+        self._end_instant()
+
+    def _end_instant(self) -> None:
         if self._node is not None:
-            self._node.judge_attitude(self._oracle)
+            self._node.judge_instant(self._oracle)
 
     def _judge_unasked(self, link: str, event: Reply | LinkFault | CanFrame) -> None:
         port = self._ports[link]

@@ -107,6 +107,7 @@ class Oracle:
             "uptime.milliseconds": partial(self._check_fraction, self._uptime_s, 1e3),
             "boot.count": self._check_boot_count,
             "frame.counter": self._check_frames,
+            "frame.period": self._check_period,
             "selected.id": self._check_selected,
             "request.last": self._check_last,
         }
@@ -212,9 +213,9 @@ class Oracle:
                 return ErrorCode.INTERNAL if self.disk_full else ErrorCode.OK
             case "set_parameters" if any(field.parameter in _BOUND for field in row.fields):
                 return None
-            case "nothing" | None | "reset" | "set_clock" | "clear_counters" | "restore_parameters":
+            case None | "nothing" | "reset" | "set_clock" | "clear_counters":
                 return ErrorCode.OK
-            case "default_parameters" | "set_parameters":
+            case "restore_parameters" | "default_parameters" | "set_parameters":
                 return ErrorCode.OK
             case _:
                 return None
@@ -238,8 +239,9 @@ class Oracle:
 
     def counted(self, kind: str) -> None:
         """A request was received."""
-        count = self.counts[f"{_COUNTER[kind]}"]
-        self.counts[_COUNTER[kind]] = None if count is None else (count + 1) & 0xFFFF
+        name = "telecommands" if kind == "telecommand" else "telemetry"
+        count = self.counts[name]
+        self.counts[name] = None if count is None else (count + 1) & 0xFFFF
 
     def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode) -> None:
         """A telecommand was answered with a code."""
@@ -255,7 +257,7 @@ class Oracle:
 
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
-        if changes.keys() & _BOUND:
+        if changes.keys() & _TIMING:
             self.attitudes.retimed(self.now_s, self.values)
 
     def _parameters_set(self, row: Row, arguments: Mapping[str, Any]) -> None:
@@ -337,7 +339,7 @@ class Oracle:
             if quantity is not None:
                 by_quantity[quantity] = (field, value)
         self.judge(row.name, by_quantity)
-        self.judge_attitude(row.name, by_quantity, self.now_s)
+        self.judge_attitude(row.name, by_quantity)
 
     def judge(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
         """Judge the quantities of a row or PDO, received now, apart from its attitude."""
@@ -348,11 +350,11 @@ class Oracle:
             elif quantity in self._checks:
                 self._checks[quantity](where, field, value)
 
-    def judge_attitude(self, name: str, read: Mapping[str, tuple[Field, Value]], at_s: float) -> None:
-        """Judge the attitude in a row or in the PDOs of a time."""
+    def judge_attitude(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+        """Judge the attitude in a row, or in the PDOs of an instant."""
         if "attitude.valid" in read:
             imaging = bool(self.modes & IMAGING)
-            self.attitudes.judge(name, read, at_s, self.values, imaging=imaging)
+            self.attitudes.judge(name, read, self.now_s, self.values, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
         known = self.values[name]
@@ -453,6 +455,9 @@ class Oracle:
                 raise Violation(f"{where}: {value} after {self._frames}")
             self._frames = value
 
+    def _check_period(self, where: str, field: Field, value: Value) -> None:
+        self.attitudes.check_period(where, field, value, self.now_s, self.values)
+
     def _check_selected(self, where: str, field: Field, value: Value) -> None:
         if self._selected is not None:
             self._expect(where, field, value, self._selected)
@@ -476,19 +481,14 @@ def _by_argument(row: Row, values: Mapping[str, Value]) -> dict[str, Any]:
 _RUNNING: Final = frozenset({"standby", *IMAGING})
 _COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; `_RUNNING` from all others."""
-_BOUND: Final = frozenset({"update_rate", "exposure", "delay_time"})
-"""Parameters that bound each other."""
-_COUNTER: Final = {"telecommand": "telecommands", "telemetry": "telemetry"}
+_TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
+_PAIRS: Final = frozenset(
+    {"min_star_pixels", "max_star_pixels", "orbit_semi_major_axis", "orbit_eccentricity"}
+)
+_BOUND: Final = _TIMING | _PAIRS
+"""Parameters that bound each other, so that a value within its limits may be refused."""
 _WITHOUT_EFFECT: Final = frozenset(
-    [
-        "nothing",
-        "reset",
-        "save_image",
-        "open_image",
-        "load_image_chunk",
-        "load_file_block",
-        "set_hole_map",
-    ]
+    ["nothing", "reset", "save_image", "open_image", "load_image_chunk", "load_file_block", "set_hole_map"]
 )
 """Actions that leave what the oracle knows as it is."""
 _TIME_UNITS: Final = {

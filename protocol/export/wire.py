@@ -8,7 +8,7 @@ from typing import Final
 from pydantic import BaseModel
 
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
-from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, read_layout
+from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
 from starhil.protocol.cubespace_serial import encode_reply, encode_request
 from starhil.protocol.definition import InterfaceDefinition
@@ -61,8 +61,7 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
-        layout = read_layout(icd)
-        found += [_objects(layout), _pdos(layout)]
+        found += [_objects(icd.canopen), _pdos(icd.canopen)]
     return tuple(found)
 
 

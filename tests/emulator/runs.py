@@ -8,6 +8,7 @@ from dataclasses import replace
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady
+from starhil.emulator.signals import Signal
 from starhil.protocol.messages import ErrorCode, Request
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
@@ -32,11 +33,10 @@ class DirectImager:
 class FakeImager(DirectImager):
     """A pipeline that is ready at once, and makes previews while somebody looks."""
 
-    on_failure = None
-
     def __init__(self, handle: Callable[[PipelineRequest], PipelineReply]) -> None:
         super().__init__(handle)
         self.watchers: set[object] = set()
+        self.ended = Signal[str]("end of the pipeline")
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         if self.watchers and isinstance(request, FrameRequest):

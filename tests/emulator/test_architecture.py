@@ -119,8 +119,3 @@ def test_a_way_visits_no_file_twice(heading, most):
     steps = re.findall(r"^\d+\. `([\w/.]+\.py)`", section(heading), re.MULTILINE)
     assert len(steps) == len(set(steps)) <= most
     assert all((ROOT / file).is_file() for file in steps)
-
-
-def test_every_file_that_the_page_names_exists():
-    for file in re.findall(r"`((?:emulator|protocol|starid|configs)/[\w/.-]*)`", PAGE):
-        assert (ROOT / file).exists(), file

@@ -2,7 +2,7 @@
 
 The printed noise of the factor μ is a standard deviation of μ pixels and μ units of the 8-bit intensity. The
 published numbers follow √μ, as if μ had been passed to a function that expects a variance, and are smaller.
-The constants are fitted to published numbers: what they explain is of the class "fitted".
+The constants are fitted to published numbers (`choices`).
 """
 
 from __future__ import annotations
@@ -21,11 +21,8 @@ POSITION_ROOT_PX: Final = 1.0 / 3.0
 BRIGHTNESS_ROOT_PX: Final = 0.13
 """Experiments on the filter, brightness noise alone, which moves positions too: σ = this·√μ pixels."""
 
-IDENTIFICATION_ROOT: Final = 0.3
+IDENTIFICATION_ROOT: Final = 0.27
 """Experiments on identification: σ = this·√μ, pixels and units of intensity."""
-
-FILTER_CONSTANTS: Final = "0.333·√μ px, 0.13·√μ px, whole pixels"
-IDENTIFICATION_CONSTANTS: Final = "0.3·√μ"
 
 
 def filter_noise(

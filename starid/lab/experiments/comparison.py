@@ -1,16 +1,22 @@
 """Checks against published numbers: agreement within a stated tolerance, or improvement on the number.
 
-Two things can make an agreement worthless. A constant may have been fitted to the number it explains: such a
-check names the constants and is of the class "fitted", outside the totals. And one constant answer may agree
-with a whole column of a table: `null_model` finds the best one and marks the checks that it meets as weak.
+An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
+and marks the checks that it meets as weak. (Constants fitted to published numbers: see `choices`.)
+
+`published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
+tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
+``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``the same``, or a number and its origin.
 """
 
 from __future__ import annotations
 
+import csv
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TypedDict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypedDict
 
 from starid.lab.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
 
@@ -82,12 +88,6 @@ def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -
     return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
 
 
-def _agreeing(informing: Row, target: str, matches: Sequence[bool], fitted: str) -> Row:
-    if fitted:
-        return _checked(informing, "fitted", f"{target}; fitted: {fitted}", matches)
-    return _checked(informing, "agrees", target, matches)
-
-
 def best_constant(intervals: Iterable[Sequence[float]]) -> float:
     """Value in most of the intervals: the best answer that ignores all that varies within a table."""
     known = list(intervals)
@@ -120,12 +120,10 @@ def agreement(
     unit: str = "",
     digits: int = 2,
     remark: str = "",
-    fitted: str = "",
 ) -> Row:
     """Make a check for agreement with a published number.
 
-    The value checked is the author's version, or else the printed one, or else ours. `fitted` names the
-    constants that were fitted to published numbers, and on which the value depends.
+    The value checked is the author's version, or else the printed one, or else ours.
 
     Raises
     ------
@@ -140,7 +138,7 @@ def agreement(
     largest, origin = tolerance
     readings = {"published": published, "author": author, "printed": printed, "ours": ours}
     informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
-    made = _agreeing(informing, f"± {origin}", [abs(checked - published) <= largest], fitted)
+    made = _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
     return replace(made, interval=(published - largest, published + largest))
 
 
@@ -154,17 +152,16 @@ def same(
     matches: Sequence[bool],
     target: str,
     remark: str = "",
-    fitted: str = "",
     null: Sequence[bool] = (),
 ) -> Row:
     """Make one row for several published numbers; `target` names the rule by which each agrees or not.
 
-    `null` says which of the numbers the null model meets, `fitted` is as in `agreement`.
+    `null` says which of the numbers the null model meets.
     """
     met, of = sum(map(bool, matches)), len(matches)
     remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
     informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
-    made = _agreeing(informing, target, matches, fitted)
+    made = _checked(informing, "agrees", target, matches)
     weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
     return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
 
@@ -188,3 +185,81 @@ def improvement(
     remark = f"Better {better}. {remark}".strip() if passed else remark
     informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
     return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])
+
+
+@lru_cache(maxsize=1)
+def _published() -> dict[tuple[str, str], dict[str, str]]:
+    with Path(__file__).with_name("published.csv").open(encoding="utf-8", newline="") as stream:
+        return {(line["experiment"], line["quantity"]): line for line in csv.DictReader(stream)}
+
+
+def published(experiment: str, quantity: str) -> list[float]:
+    """Return the published numbers of a quantity; none if the thesis has none."""
+    line = _published().get((experiment, quantity))
+    return [] if line is None else [float(word) for word in line["published"].split()]
+
+
+def compared(
+    experiment: str,
+    quantity: str,
+    *,
+    author: Any = None,
+    printed: Any = None,
+    ours: Any = None,
+    remark: str = "",
+) -> Row:
+    """Check a quantity of `published.csv`; several numbers must agree one by one.
+
+    Parameters
+    ----------
+    experiment, quantity
+        Key in `published.csv`.
+    author, printed, ours
+        The number, or as many as are published; the first that is given is checked.
+    remark
+        By default that of the table.
+    """
+    line, numbers = _published()[experiment, quantity], published(experiment, quantity)
+    unit, digits, rule, remark = (
+        line["unit"],
+        int(line["digits"]),
+        line["tolerance"],
+        remark or line["remark"],
+    )
+    if len(numbers) == 1 and rule != "the same":
+        word, _, rest = rule.partition(" ")
+        if word in ("digit", "rounding"):
+            tolerance = rounding(digits if word == "digit" else int(rest), unit)
+        else:
+            tolerance = float(word), rest
+        readings = {
+            name: None if value is None else float(value)
+            for name, value in (("author", author), ("printed", printed), ("ours", ours))
+        }
+        return agreement(
+            quantity,
+            published=numbers[0],
+            tolerance=tolerance,
+            **readings,
+            unit=unit,
+            digits=digits,
+            remark=remark,
+        )
+
+    def text(values: Any) -> str | None:
+        return None if values is None else ", ".join(f"{value:.{digits}f}" for value in values) + unit
+
+    checked = next(values for values in (author, printed, ours) if values is not None)
+    largest = 0.0 if rule == "the same" else 0.51 * 10.0**-digits
+    return same(
+        quantity,
+        published=text(numbers) or "",
+        author=text(author),
+        printed=text(printed),
+        ours=text(ours),
+        matches=[bool(abs(a - b) <= largest) for a, b in zip(checked, numbers, strict=True)],
+        target=rule
+        if rule == "the same"
+        else f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
+        remark=remark,
+    )

@@ -33,11 +33,8 @@ EPOCH: Final = 1991.25
 """Epoch of the catalogue: the published numbers are without proper motion."""
 
 Kind = Literal["", "agrees", "fitted", "better", "ours"]
-"""Class of a check, or none ("").
-
-Agreement with a published number; agreement that a constant fitted to published numbers explains; improvement
-on a published number; our own bound.
-"""
+"""Class of a check: agreement with a published number, the same after a constant was fitted to that number (only in
+the report, see `choices`), improvement on it, our own bound, or none ("")."""
 
 
 class ReproduceError(StaridError):

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Mask
-from starid.lab.experiments.author_noise import FILTER_CONSTANTS, filter_noise
+from starid.lab.experiments.author_noise import filter_noise
 from starid.lab.experiments.comparison import (
     agreement,
     best_constant,
@@ -207,13 +207,13 @@ def _largest(results: Mapping[str, Results], kind: str, f: int, k: int, indicato
     starts, frames, _ = counts.shape
     place = {"recall": (0, 2), "precision": (0, 1)}[indicator]
     ratio = np.array([_percent(part, indicator) for part in counts.sum(axis=1)])
-    within = counts[..., place[1]].var(axis=1).mean() / counts[..., place].sum(axis=-1).mean() ** 2
+    members = counts[..., place].sum(axis=-1).mean()
+    within = 1e4 * counts[..., place[1]].var(axis=1).mean() / members**2
     between = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
-    # at least half a star is lost in a published set, so that 100 % has an uncertainty too
-    least = 1e4 * 0.5 / (_PUBLISHED_FRAMES * counts[..., place].sum(axis=-1).mean()) ** 2
-    frame = 1e4 * within
-    once = frame / _PUBLISHED_FRAMES + max(between**2 - frame / frames, 0.0) + least
-    return 3.0 * math.sqrt(once + (frame / frames + between**2) / starts)
+    # one star more or less in either sample, so that 100 % has an uncertainty too
+    least = sum((100.0 / (n * members)) ** 2 for n in (_PUBLISHED_FRAMES, starts * frames))
+    once = within / _PUBLISHED_FRAMES + max(between**2 - within / frames, 0.0)
+    return 3.0 * math.sqrt(once + (within / frames + between**2) / starts + least)
 
 
 def _table(context: Context, results: Mapping[str, Results]) -> str:
@@ -327,7 +327,6 @@ def _table_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                     null=null,
                     target="within 3 standard errors at the published 1 000 frames about one first frame",
                     remark=f"A constant {constant:.1f} % agrees with {sum(null)}.",
-                    fitted=FILTER_CONSTANTS,
                 )
             )
     return rows
@@ -376,7 +375,6 @@ def _prediction_rows(context: Context, results: Mapping[str, Results]) -> list[R
                     matches=matches,
                     target="as above",
                     remark=f"The fit is {best:.3f} of the constant used.",
-                    fitted=FILTER_CONSTANTS,
                 )
             )
     return rows
@@ -398,7 +396,6 @@ def _named_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 author=_of_author(results, kind, f, k, indicator),
                 printed=_percent(result["any"][k], indicator),
                 unit="%",
-                fitted=FILTER_CONSTANTS if k else "",
             )
         )
         if published == _ALL:
@@ -429,7 +426,6 @@ def _motion_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
             unit="°",
             digits=4,
             remark="Over all pairs in the cluster, about the motion fitted to the inliers.",
-            fitted=FILTER_CONSTANTS,
         ),
         same(
             "figure 6.18: μ_d without noise, median",

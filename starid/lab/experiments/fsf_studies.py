@@ -9,7 +9,6 @@ from typing import Final
 
 import numpy as np
 
-from starid.lab.experiments.author_noise import FILTER_CONSTANTS
 from starid.lab.experiments.comparison import (
     Tolerance,
     agreement,
@@ -289,7 +288,6 @@ def _evaluate_correlation(context: Context, results: Mapping[str, Results]) -> O
                 printed=printed,
                 digits=3,
                 remark=f"p-value {p:.1g}.",
-                fitted=FILTER_CONSTANTS if factor else "",
             )
         )
         ax.plot(motion[:50, 0], label="μ_d / °")

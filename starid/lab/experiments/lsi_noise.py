@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from starid.lab.experiments.author_noise import IDENTIFICATION_CONSTANTS, identification_noise
+from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.comparison import Readings, agreement, same, sampling, shown
 from starid.lab.experiments.experiment import (
     Context,
@@ -73,8 +73,8 @@ neighbouring cell. (i) *Six features*: with the polar angle as a sixth feature o
 example of section 5.1, and a brightness unit of 1/255 mag, the nearest cell alone has about the published
 shares within 0.3° at the printed noise, but not those within 0.1° and 0.013°; and a search with the polar
 angle is not invariant to roll, as figure 6.3 is. (ii) *As the author ran it*: with MATLAB's `lasso` and a
-noise of 0.3·√σ, as if a fraction of σ had been passed as a variance, most of the twelve published shares for
-both noises are reproduced; the 0.3 was fitted to them, and the same law explains tables A.1–A.18 and H.1. The percentages 99.99 and 97.99 of section 6.1.2.3
+noise of 0.27·√σ, as if a fraction of σ had been passed as a variance, most of the twelve published shares for
+both noises are reproduced; the 0.27 was fitted to them, and the same law explains tables A.1–A.18 and H.1. The percentages 99.99 and 97.99 of section 6.1.2.3
 cannot be shares of 1 701 frames."""
 
 _TEXT_NOTE: Final = """The thesis's sentence on 0.2°, 0.1° and 0.013° with noise is taken to mean, for each
@@ -267,7 +267,6 @@ def _noise_row(
         **values,
         unit="%",
         remark=remark,
-        fitted=IDENTIFICATION_CONSTANTS if level else "",
     )
 
 

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array
-from starid.lab.experiments.author_noise import IDENTIFICATION_CONSTANTS, identification_noise
+from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.comparison import (
     agreement,
     null_model,
@@ -60,7 +60,7 @@ _OVERLAP_OF_H_1: Final = 0.995
 
 _NOTE: Final = """*As the author ran it*, tables 6.7, H.1 and H.2 are computed for the frames of figure 6.1,
 moved off the grid, with true stars only, as if the filter were perfect: the search of a region of 4° about
-the true position in five features, MATLAB's `lasso`, and noise of 0.3·√μ pixels and units of intensity. If
+the true position in five features, MATLAB's `lasso`, and noise of 0.27·√μ pixels and units of intensity. If
 ε_ψ exceeds τ, the whole database is searched and the answer with the smaller ε_ψ taken; "FSF-aided LSI"
 always searches the whole database. Which frames the thesis's sequences contained is not known. The tolerances
 are three standard errors of means and deviations of 1 001 frames with the published deviation. The published
@@ -74,7 +74,7 @@ The sequences are shown, not checked. Frames move from the first one by U(−25,
 in the experiments on the filter, and objects are visible 1.6° beyond the field of the features. With 25 to 30
 objects in a frame there are half a million disparities, and with every object in the main cluster taken for a
 star about half of the false stars pass. *As the author ran it*, the true stars are the inliers of the affine
-fit, the noise is 0.3·√μ and the solver MATLAB's; frames with unequal clusters are not lost, or nearly all
+fit, the noise is 0.27·√μ and the solver MATLAB's; frames with unequal clusters are not lost, or nearly all
 would be. *As printed*, the noise is μ and the solver exact; a rigid motion is also shown."""
 
 _GAMMA_NOTE: Final = """**Table 6.8 with three interpretations of eq. 6.5.** (a) With the printed "110" the
@@ -249,7 +249,6 @@ def _error_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                         author=author,
                         unit=unit,
                         remark=f"Median {np.median(values):.2f}{unit}." if what == "mean" else "",
-                        fitted=IDENTIFICATION_CONSTANTS if m else "",
                     )
                 )
     return [row for column in columns.values() for row in null_model(column)]
@@ -275,7 +274,6 @@ def _update_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                     author=100.0 * float(np.mean(psi > limit)),
                     unit="%",
                     digits=1,
-                    fitted=IDENTIFICATION_CONSTANTS if m else "",
                 )
             )
     return [row for column in columns.values() for row in null_model(column)]
@@ -342,7 +340,6 @@ def _gamma_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                         printed=readings[0],
                         unit="°",
                         remark=words,
-                        fitted=IDENTIFICATION_CONSTANTS if m else "",
                     ),
                 ),
                 (
@@ -354,7 +351,6 @@ def _gamma_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                         author=author_sigma,
                         unit="°",
                         digits=3,
-                        fitted=IDENTIFICATION_CONSTANTS if m else "",
                     ),
                 ),
                 (

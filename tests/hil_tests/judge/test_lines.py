@@ -9,6 +9,7 @@ from tempfile import TemporaryDirectory
 
 import pytest
 
+from starhil.hil_tests.judge import canopen
 from starhil.hil_tests.judge.can import frames_of, read_answer
 from starhil.hil_tests.judge.definition import Unit, read_unit
 from starhil.hil_tests.judge.messages import Answer
@@ -163,3 +164,26 @@ def test_classes_and_ids_name_the_kind_of_an_unknown_id():
     assert sagitta.request(200, klass="parameter").telemetry
     assert not sagitta.request(200, klass="action").telemetry
     assert not read_unit("cubestar").request(31).telemetry
+
+
+def test_sdo_transfers_have_the_bytes_of_cia_301():
+    """7.2.4.3: initiate upload 40h, its answers 43h and 4Fh, segment 60h and 70h, initiate download 23h and 2Fh."""
+    assert canopen.upload_request(0x1018, 4).hex() == "40181004"
+    assert canopen.expedited_data(bytes.fromhex("4300100092010200")) == bytes.fromhex("92010200")
+    assert canopen.expedited_data(bytes.fromhex("4f01100005000000")) == b"\x05"
+    assert canopen.expedited_data(bytes.fromhex("410810001a000000")) is None
+    assert canopen.segment_request(0x10) == b"\x70"
+    assert canopen.segment_data(bytes.fromhex("0041424344454647")) == (b"ABCDEFG", False)
+    assert canopen.segment_data(bytes.fromhex("1b41420000000000")) == (b"AB", True)
+    assert canopen.expedited_download(0x1017, 0, b"\xe8\x03").hex() == "2b171000e803"
+    assert canopen.abort_code(bytes.fromhex("8000100011000906")) == 0x06090011
+
+
+def test_entries_of_a_dictionary_follow_from_the_definition():
+    """OreSat's 4002h: three numbers, the seconds, a number and a flag; TPDO 5 at 1ADh carries two of them."""
+    unit = read_unit("oresat")
+    found = {entry.name: entry for entry in canopen.entries(unit, unit.canopen)}
+    assert f"{found['4002.attitude_i'].mapping:08X}" == "40020120"
+    assert f"{found['4002.attitude_known'].mapping:08X}" == "40020608"
+    assert canopen.pdo_can_id(0x2C, 0x1804, unit.canopen.tpdo[4]) == 0x1AD
+    assert canopen.pdo_can_id(0x2C, 0x1802, unit.canopen.tpdo[2]) == 0x3AC

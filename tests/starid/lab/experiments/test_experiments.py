@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from starid.cli.app import build_app
 from starid.errors import StaridError
 from starid.lab.experiments import known_misses, registry, report, runner
+from starid.lab.experiments.choices import CHOICES, class_of, numbers_by_choice
 from starid.lab.experiments.comparison import agreement, improvement, null_model, same, sampling
 from starid.lab.experiments.experiment import (
     Context,
@@ -22,6 +23,7 @@ from starid.lab.experiments.experiment import (
     Parameters,
     Part,
     Results,
+    Row,
     row,
     write_csv,
 )
@@ -273,14 +275,6 @@ def test_a_row_of_several_numbers_counts_each():
     assert "2 of 3 agree" in made.remark
 
 
-def test_a_fitted_constant_is_named_and_outside_the_totals():
-    made = agreement("q", published=1.0, tolerance=(0.1, "a tenth"), author=1.0, fitted="c = 1")
-    assert (made.kind, made.passed, made.target) == ("fitted", True, "± a tenth; fitted: c = 1")
-    found = report.counts([_finished((made,))])
-    assert found["fitted"] == {"met": 1, "of": 1}
-    assert found["agrees"] == {"met": 0, "of": 0}
-
-
 def test_the_best_constant_marks_the_checks_that_it_meets():
     rows = [
         agreement(f"q{x}", published=x, tolerance=(0.6, ""), author=value)
@@ -462,3 +456,37 @@ def test_the_experiments_of_the_thesis_need_nothing_else_of_the_emulator():
         for line in module.read_text(encoding="utf-8").splitlines():
             if line.strip().startswith(("from emulator", "import emulator")):
                 assert "starid.lab.experiments" in line, f"{module.name}: {line}"
+
+
+def _rate(quantity: str, published: float) -> Row:
+    return agreement(quantity, published=published, author=99.9, tolerance=(0.1, "a tenth"))
+
+
+def test_a_number_to_which_a_constant_was_fitted_is_no_agreement():
+    fitted, predicted = (
+        "position and brightness noise, σ = 1, on the grid: share",
+        "position noise, σ = 3, on the grid",
+    )
+    assert class_of("lsi-noise", _rate(fitted, 99.9)) == "fitted"
+    assert class_of("lsi-noise", _rate(predicted, 99.9)) == "agrees"
+    assert class_of("lsi-accuracy", _rate(fitted, 99.9)) == "agrees"
+    rows = [("lsi-noise", _rate(fitted, 99.9)), ("lsi-noise", _rate(predicted, 50.0))]
+    assert numbers_by_choice(rows)["noise of 0.27·√σ"] == {"numbers": 2, "agree": 1, "fitted": 1}
+
+
+def test_a_number_without_the_authors_version_depends_on_no_choice():
+    printed = agreement(
+        "position and brightness noise", published=1.0, printed=1.0, tolerance=(0.1, "a tenth")
+    )
+    assert class_of("lsi-noise", printed) == "agrees"
+
+
+def test_every_choice_names_an_experiment_and_every_quick_fitted_number_is_counted_apart(tmp_path):
+    assert {each.experiment for each in CHOICES} <= set(registry.experiments())
+    results = runner.run([registry.experiments()["worked-example"]], tmp_path, quick=True, jobs=1)
+    counts = report.counts(results)
+    assert counts["fitted"] == {"met": 18, "of": 18}
+    assert counts["agrees"] == {"met": 87, "of": 95}
+    text = report.report_text(results, quick=True, seed=1)
+    assert "| λ = 1.00 | 19 | 16 | 9 |" in text
+    assert "| 18 | 18 |" in text
