@@ -155,8 +155,8 @@ def tests_of(measured: dict, module: str, line: int) -> list[str]:
     lines, seconds = measured["lines"].get(module, {}), measured["seconds"]
     found = set(lines.get(str(line), ())) or {test for tests in lines.values() for test in tests}
     chosen, spent = [], 0.0
-    for test in sorted(found, key=lambda test: seconds.get(test, 1e9)):
-        spent += seconds.get(test, 1e9)
+    for test in sorted(found & seconds.keys(), key=seconds.__getitem__):
+        spent += seconds[test]
         if spent > TESTS_S:
             break
         chosen.append(test)
@@ -228,7 +228,10 @@ def judge(child: int, deadline: float) -> str:
         done, status = os.waitpid(child, os.WNOHANG)
         if done:
             code = os.waitstatus_to_exitcode(status)
-            if code in (UNJUDGED, pytest.ExitCode.USAGE_ERROR, pytest.ExitCode.NO_TESTS_COLLECTED):
+            if code in (
+                UNJUDGED,
+                pytest.ExitCode.NO_TESTS_COLLECTED,
+            ):  # a module that cannot be imported is a usage error
                 raise SystemExit(f"the tests could not run; see {OUT}/*.log")
             return "killed" if code else "survived"
         time.sleep(0.02)
