@@ -125,6 +125,8 @@ class ConsoleServer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject other origins and, except for static files, requests without the token."""
+        if not all(value.isascii() for value in request.headers.values()):  # aiohttp fails on some of them
+            return web.Response(status=400, text="400: a header is not ASCII\n", headers=HEADERS)
         if not _is_same_origin(request):
             return web.Response(
                 status=403, text="403: the request comes from a page of another origin\n", headers=HEADERS

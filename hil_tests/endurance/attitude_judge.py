@@ -223,14 +223,34 @@ class AttitudeJudge:
             self._turn_cache = (numbers, product(of_matrix(self._conventions.rows), turn))
         return product(conjugate(self._turn_cache[1]), reported)
 
-    def _window_s(self, now_s: float, values: Mapping[str, Known | None]) -> float:
-        """Return the largest age that a valid attitude may have now; infinite if it is not known."""
-        longest = period_s(values)
+    def check_period(
+        self, where: str, field: Field, value: Value, now_s: float, values: Mapping[str, Known | None]
+    ) -> None:
+        """Check the time between exposures, which changes with the next image after a telecommand."""
+        low, high = field.physical_limits
+        scale = factor("s", field.unit) or 1.0
+        possible = [min(max(period * scale, low), high) for period in self._recent_periods(now_s, values)]
+        if isinstance(value, (str, bytes)) or not all(map(math.isfinite, possible)):
+            return
+        if all(abs(value - period) > resolution(field) + 1e-6 * period for period in possible):
+            raise Violation(f"{where}: {value!r}, not {possible[0]!r}")
+
+    def _recent_periods(self, now_s: float, values: Mapping[str, Known | None]) -> list[float]:
+        """Return the periods in use when the last image may have been taken; infinite if not known."""
+        recent = [period_s(values)]
         for number, (_, period) in enumerate(self._periods):
             until_s = self._periods[number + 1][0] if number + 1 < len(self._periods) else now_s
-            if now_s - until_s <= (STALE_PERIODS + 1) * period + STALE_S + PROCESSING_S:
-                longest = max(longest, period)
-        return (STALE_PERIODS + 1) * longest + STALE_S + PROCESSING_S
+            if now_s - until_s <= _window_of(period):
+                recent.append(period)
+        return recent
+
+    def _window_s(self, now_s: float, values: Mapping[str, Known | None]) -> float:
+        """Return the largest age that a valid attitude may have now; infinite if it is not known."""
+        return _window_of(max(self._recent_periods(now_s, values)))
+
+
+def _window_of(period: float) -> float:
+    return (STALE_PERIODS + 1) * period + STALE_S + PROCESSING_S
 
 
 def period_s(values: Mapping[str, Known | None]) -> float:

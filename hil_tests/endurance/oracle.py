@@ -107,6 +107,7 @@ class Oracle:
             "uptime.milliseconds": partial(self._check_fraction, self._uptime_s, 1e3),
             "boot.count": self._check_boot_count,
             "frame.counter": self._check_frames,
+            "frame.period": self._check_period,
             "selected.id": self._check_selected,
             "request.last": self._check_last,
         }
@@ -453,6 +454,9 @@ class Oracle:
             if self._frames is not None and value < self._frames and self._frames - value < 128:
                 raise Violation(f"{where}: {value} after {self._frames}")
             self._frames = value
+
+    def _check_period(self, where: str, field: Field, value: Value) -> None:
+        self.attitudes.check_period(where, field, value, self.now_s, self.values)
 
     def _check_selected(self, where: str, field: Field, value: Value) -> None:
         if self._selected is not None:

@@ -187,6 +187,7 @@ class _PluginFraming:
     def __init__(self, unit: Unit) -> None:
         link = unit.serial
         self._framing = unit.plugin.framings[link.framing.name]()
+        self.start, self.end = self._framing.start, self._framing.end
         self._sizes = link.max_size or 1 << 16, link.timeout
 
     def encode(self, body: bytes) -> bytes:

@@ -7,6 +7,7 @@ import pytest
 
 from starhil.emulator.cli.endurance import live, read_life, run_once
 from starhil.emulator.device.counters import Counters
+from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.emulator.errors import EmulatorError
@@ -94,6 +95,23 @@ def test_the_attitudes_in_pdos_are_compared(start):
     )
     assert outcome.violation == ""
     assert (outcome.attitudes > 10) is start
+
+
+def test_an_update_rate_that_is_not_used_is_found(monkeypatch):
+    monkeypatch.setattr(FrameCycle, "_period_ns", lambda _self: 1_000_000_000)
+    icd = load_unit("cubestar")
+    command, (field, *_) = icd.telecommands["set_update_rate"], icd.telecommands["set_update_rate"].fields
+    data = command.encode({field.name: 0.1}).hex()
+    period = next(
+        row for row in icd.telemetry.values() if any(field.value == "frame.period" for field in row.fields)
+    )
+    steps = (
+        {"do": "request", "link": "can", "row": ["", command.id, "telecommand"], "data": data},
+        {"do": "wait", "s": 200.0},
+        {"do": "request", "link": "can", "row": ["", period.id, "telemetry"]},
+    )
+    life = Life("cubestar", 1, ("can",), {"parameters": {"start_mode": "lost_in_space"}}, steps)
+    assert "sample_period: 1000, not 9999.9" in run_once(life).violation
 
 
 def test_telemetry_that_nobody_has_subscribed_to_is_found(monkeypatch):
