@@ -5,11 +5,12 @@
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
 # make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 110 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
-# make years       random lives of all units on two processors for HOURS (8), judged by an oracle (docs/endurance.md)
+# make years       random lives of all units on JOBS (2) processors for HOURS (8), judged by an oracle (docs/endurance.md)
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
 MINUTES ?= 15
 HOURS ?= 8
+JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
@@ -70,7 +71,7 @@ soak: $(VENV)/.product
 	$(BIN)/python tools/soak.py --minutes $(MINUTES)
 
 years: $(VENV)/.product
-	$(BIN)/starhil endurance --hours $(HOURS) --jobs 2 --seed $$(date +%s)
+	$(BIN)/starhil endurance --hours $(HOURS) --jobs $(JOBS) --seed $$(date +%s)
 
 SITE := import site; print(site.getsitepackages()[0])
 cosmos: $(VENV)/.developer

@@ -91,13 +91,7 @@ class SteppedClock:
         """Do nothing: time passes on request."""
 
     def set_ns(self, now_ns: int) -> None:
-        """Advance to a time, nanoseconds.
-
-        Raises
-        ------
-        EmulatorError
-            The time is earlier than the current one.
-        """
+        """Advance to a time, nanoseconds."""
         if now_ns < self._now_ns:
             raise EmulatorError(f"clock: cannot go back from {self._now_ns} ns to {now_ns} ns")
         self._now_ns = now_ns

@@ -1,4 +1,7 @@
-"""Base class of the emulator's errors."""
+"""The error of everything that reads a file, opens a port or takes a value from outside, and cannot.
+
+A docstring mentions it only where the reader needs to know more than that.
+"""
 
 
 class EmulatorError(Exception):

@@ -22,11 +22,6 @@ log: Final = logging.getLogger("starhil.output")
 class Output:
     """Something that a run writes.
 
-    Parameters
-    ----------
-    name
-        What it is, for messages.
-
     Attributes
     ----------
     failed
@@ -54,7 +49,7 @@ class Output:
 
 
 class OutputFile:
-    """A file of complete, unbuffered records; only one emulator at a time can write to it.
+    """A file of complete, unbuffered records; only one emulator at a time can write to it. If it is rejected, it is unchanged.
 
     Parameters
     ----------
@@ -62,17 +57,8 @@ class OutputFile:
         What the file is, for messages: `truth log`.
     path
         The file; created if it does not exist.
-    header
-        First record.
-    overwrite
-        Whether to replace an existing file.
     output
         The output of which this file is a part; after a failure, no part is written. By default it is the whole.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
     def __init__(

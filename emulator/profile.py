@@ -367,13 +367,7 @@ def configs_folder() -> Path:
 
 
 def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
-    """Return the path of a profile given by name or path.
-
-    Raises
-    ------
-    EmulatorError
-        There is no such profile; the message lists the known names.
-    """
+    """Return the path of a profile given by name or path."""
     folder = configs_folder() / "profiles"
     if "/" not in name_or_path and not name_or_path.endswith(".toml"):
         path = folder / f"{name_or_path}.toml"
@@ -392,13 +386,7 @@ def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
 
 
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
-    """Read a profile and the profiles it extends, and apply `section.key=value` overrides.
-
-    Raises
-    ------
-    EmulatorError
-        The profile is invalid; one line with file, key and remedy.
-    """
+    """Read a profile and the profiles it extends, and apply `section.key=value` overrides."""
     path = find_profile(name_or_path)
     values = _read_extended(path, 0)
     if any(override.startswith("camera.") for override in overrides):

@@ -12,7 +12,7 @@ from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager
-from starhil.emulator.tape import Tape
+from starhil.emulator.tape import LatchedClock, Recorder
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")
@@ -24,20 +24,13 @@ PEER_PATIENCE_S: Final = 1.0
 
 
 class ClockPump:
-    """Runs each event in the event loop when it is due.
+    """Runs each event in the event loop when it is due."""
 
-    Parameters
-    ----------
-    clock
-        Clock that runs by itself.
-    tape
-        Records the events.
-    """
-
-    def __init__(self, scheduler: Scheduler, clock: Clock, tape: Tape | None = None) -> None:
+    def __init__(self, scheduler: Scheduler, clock: Clock, recorder: Recorder | None = None) -> None:
         self._scheduler = scheduler
         self._clock = clock
-        self._tape = tape
+        self._running_clock = clock.source if isinstance(clock, LatchedClock) else clock
+        self._recorder = recorder
         self._loop = asyncio.get_running_loop()
         self._timer: asyncio.TimerHandle | None = None
         self._running = False
@@ -65,7 +58,8 @@ class ClockPump:
         due_ns = self._scheduler.next_due_ns()
         if due_ns is None:
             return self._loop.time() + LONGEST_SLEEP_S
-        wait_s = (due_ns - self._clock.now_ns()) / NANOSECONDS / self._clock.speed
+        clock = self._running_clock
+        wait_s = (due_ns - clock.now_ns()) / NANOSECONDS / clock.speed
         return self._loop.time() + min(max(wait_s, 0.0), LONGEST_SLEEP_S)
 
     def _schedule_next(self) -> None:
@@ -75,13 +69,12 @@ class ClockPump:
 
     def _run_due_event(self) -> None:
         self._timer = None
-        if self._tape is not None:
-            self._tape.latch()
-        now_ns = self._clock.now_ns() if self._tape is None else self._tape.clock.now_ns()
-        event = self._scheduler.pop_due(now_ns)
+        if self._recorder is not None:
+            self._recorder.latch()
+        event = self._scheduler.pop_due(self._clock.now_ns())
         try:
-            if event is not None and self._tape is not None:
-                self._tape.write("event")
+            if event is not None and self._recorder is not None:
+                self._recorder.write("event")
             if event is not None:  # one at a time, so that the links run in between
                 call_guarded("event", event.action, event.due_ns)
         finally:
@@ -97,24 +90,22 @@ class StepPump:
     devices
         Scheduler and pipeline of each device on the clock. Simultaneous events run in the
         order of the devices.
-    time_passes
-        Set when every pipeline is ready; steps wait for it.
     transports
         Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not wait for its
         transport until it reads again.
-    tape
-        Records the events.
+    time_passes
+        Set when every pipeline is ready; steps wait for it.
     """
 
     def __init__(
         self,
         devices: Sequence[tuple[Scheduler, Imager]],
+        transports: Sequence[Transport[Any]],
         clock: SteppedClock,
         time_passes: asyncio.Event,
-        transports: Sequence[Transport[Any]] = (),
-        tape: Tape | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
-        self._tape = tape
+        self._recorder = recorder
         self._schedulers = [scheduler for scheduler, _ in devices]
         self._clock = clock
         self._time_passes = time_passes
@@ -125,13 +116,7 @@ class StepPump:
         self._lock = asyncio.Lock()
 
     async def step(self, seconds: float) -> int:
-        """Advance simulation time; on return, all events within the step are done. Return their number.
-
-        Raises
-        ------
-        EmulatorError
-            The step is not positive, or larger than `MAX_STEP_S`.
-        """
+        """Advance simulation time; on return, all events within the step are done. Return their number."""
         if not 0.0 < seconds <= MAX_STEP_S:
             raise EmulatorError(f"step: must be seconds in (0, {MAX_STEP_S:g}], not {seconds}")
         await self._time_passes.wait()
@@ -142,8 +127,8 @@ class StepPump:
             while (event := self._pop_next(end_ns)) is not None:
                 events += 1
                 self._clock.set_ns(max(event.due_ns, self._clock.now_ns()))
-                if self._tape is not None:
-                    self._tape.write("event")
+                if self._recorder is not None:
+                    self._recorder.write("event")
                 call_guarded("event", event.action, event.due_ns)
                 await self._settle()
             self._clock.set_ns(end_ns)

@@ -17,16 +17,17 @@ from typing import Annotated, Any, Final, Literal, Self, TypeVar
 
 from pydantic import BaseModel, Field, RootModel, ValidationError, model_validator
 
-from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
-from starhil.emulator.control.faults import FaultRequest, Faults
+from starhil.emulator.clock import NANOSECONDS, SteppedClock
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.device.device import Background, outcome
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import call_guarded
+from starhil.emulator.head import Head
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile
+from starhil.emulator.run import Run
 from starhil.emulator.tape import (
     EVENTS_FILE,
     RUN_FILE,
@@ -34,6 +35,7 @@ from starhil.emulator.tape import (
     STATE_FOLDER,
     TRUTH_FILE,
     Done,
+    Wiring,
     as_json,
     from_json,
 )
@@ -131,13 +133,7 @@ class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
 
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
-    """Make the folder of a recording, with copies of all inputs of the run that may change later.
-
-    Raises
-    ------
-    EmulatorError
-        The folder is not empty or cannot be written.
-    """
+    """Make the folder of a recording, with copies of all inputs of the run that may change later."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
@@ -175,8 +171,8 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     (folder / RUN_FILE).write_text(json.dumps(run, indent=1) + "\n", encoding="utf-8")
 
 
-class Player:
-    """The tape of a recording.
+class Player(Wiring):
+    """Connects a run to a recording instead of the world.
 
     Parameters
     ----------
@@ -184,11 +180,11 @@ class Player:
         Whether slow writes ended at once in the recorded run, as on the stepped clock.
     """
 
-    plays: Final = True
+    plays = repeatable = True
 
     def __init__(self, *, ends_at_once: bool) -> None:
         self.stepped = SteppedClock()
-        self.clock: Clock = self.stepped
+        super().__init__(self.stepped)
         self.sent: dict[str, list[Any]] = {}
         """Items that the device has sent, by link, as JSON."""
         self.receivers: dict[str, Callable[[Any], None]] = {}
@@ -196,18 +192,6 @@ class Player:
         self.writes: deque[Callable[[], None]] = deque()
         """Functions that end pending slow writes."""
         self._ends_at_once = ends_at_once
-
-    def begin(self) -> None:
-        """Do nothing: the entries are played next."""
-
-    def latch(self) -> None:
-        """Do nothing: the clock shows the time of the played entry."""
-
-    def write(self, kind: str, **values: Any) -> None:
-        """Do nothing: a replay is not recorded."""
-
-    def enter(self, kind: str, **values: Any) -> None:
-        """Do nothing: a replay is not recorded."""
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (nothing is opened)
         """Return a serial line that is connected to the tape."""
@@ -268,13 +252,7 @@ class _PlayedSerial(_PlayedTransport[bytes], SerialTransport):
 
 
 class PlayedImager:
-    """A pipeline whose replies wait for their entries.
-
-    Parameters
-    ----------
-    inner
-        Renders and solves the frames.
-    """
+    """A pipeline whose replies wait for their entries."""
 
     def __init__(self, inner: Imager) -> None:
         self._inner = inner
@@ -316,8 +294,6 @@ class ReplayReport:
 
     Attributes
     ----------
-    entries
-        Number of entries played.
     sent
         Number of serial bytes or CAN frames sent, by link.
     differences
@@ -330,13 +306,7 @@ class ReplayReport:
 
 
 def read_run(folder: Path) -> tuple[Profile, bool]:
-    """Return the profile of a recording, and whether its tape ends with the entry `end`.
-
-    Raises
-    ------
-    EmulatorError
-        The folder is not a recording, or is one of another version with a different profile.
-    """
+    """Return the profile of a recording, and whether its tape ends with the entry `end`."""
     path = folder / RUN_FILE
     try:
         text = _read(path)
@@ -367,13 +337,7 @@ def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
 
 
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
-    """Yield the entries of a tape, each with file and line.
-
-    Raises
-    ------
-    EmulatorError
-        The file is missing or damaged.
-    """
+    """Yield the entries of a tape, each with file and line."""
     path = folder / EVENTS_FILE
     try:
         with open_regular(path) as file:
@@ -391,15 +355,8 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
 
     Parameters
     ----------
-    folder
-        The recording.
     profile
         Profile of the device, instead of the recorded one; `run` except the algorithm, and `links`, are as recorded.
-
-    Raises
-    ------
-    EmulatorError
-        The folder is not a recording, or the device cannot be started with the profile.
     """
     recorded, ends = read_run(folder)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
@@ -416,39 +373,33 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
         )
         played = recorded if profile is None else profile
         run = recorded.run.model_copy(update={"state_dir": state, "algorithm": played.run.algorithm})
-        emulation = Emulation(played.model_copy(update={"links": links, "run": run}), tape=player)
+        again = Run([played.model_copy(update={"links": links, "run": run})], player)
         log = TruthLog(truth_log, wall_times=False)
         try:
-            await emulation.open()
-            emulation.device.signals.frame_published.connect(log.write)
-            faults = Faults(emulation.device, emulation.links)
-            _enter_scenario(folder, emulation, faults)
-            warm = await emulation.imager.start()
-            play = _Playing(emulation, player, faults, warm)
+            await again.open()
+            (head,) = again.heads
+            head.device.signals.frame_published.connect(log.write)
+            if (folder / SCENARIO_FILE).exists():
+                text = _read(folder / SCENARIO_FILE)
+                _validated(Scenario, text, folder / SCENARIO_FILE).enter(head, again.truth)
+            play = _Playing(again, head, player, await head.imager.start())
             expected = await play.entries(folder, report, ends=ends)
             to_the_end = not report.differences
             _compare_sent(expected, player.sent, report, to_the_end=to_the_end)
         finally:
-            await emulation.close()
+            await again.close()
             log.close()
         _compare_truth(folder / TRUTH_FILE, truth_log, report, to_the_end=to_the_end)
     return report
 
 
-def _enter_scenario(folder: Path, emulation: Emulation, faults: Faults) -> None:
-    path = folder / SCENARIO_FILE
-    if path.exists():
-        scenario = _validated(Scenario, _read(path), path)
-        scenario.enter(emulation.device.scheduler, faults, emulation.set_truth, emulation.profile.folder)
-
-
 class _Playing:
     """Plays entries one by one."""
 
-    def __init__(self, emulation: Emulation, player: Player, faults: Faults, warm: PipelineReady) -> None:
-        self._emulation = emulation
+    def __init__(self, run: Run, head: Head, player: Player, warm: PipelineReady) -> None:
+        self._truth = run.truth
+        self._head = head
         self._player = player
-        self._faults = faults
         self._warm = warm
 
     async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> dict[str, list[Any]]:
@@ -486,7 +437,6 @@ class _Playing:
         _DeviationError
             The device behaves differently, so that the entry cannot be played.
         """
-        emulation = self._emulation
         match entry:
             case _Plain():
                 await self._plain(entry)
@@ -496,17 +446,17 @@ class _Playing:
                     raise _DeviationError(_deviation(entry, f"the link {entry.link} is off"))
                 receive(entry.item)
             case _Feed():
-                if emulation.feed is None:
+                if self._truth.feed is None:
                     raise _DeviationError(_deviation(entry, "there is no live feed"))
-                await emulation.feed.process(entry.data.encode("latin-1"))
+                await self._truth.feed.process(entry.data.encode("latin-1"))
             case _Truth():
-                await emulation.play_truth(entry.config, entry.start_s)
+                await self._truth.set(entry.config, entry.start_s)
             case _Fault():
-                self._faults.inject(entry.request)
+                self._head.faults.inject(entry.request)
 
     async def _plain(self, entry: _Plain) -> None:
         """Play an entry that consists of its time."""
-        device, player = self._emulation.device, self._player
+        device, player = self._head.device, self._player
         match entry.do:
             case "event":
                 due = device.scheduler.pop_due(player.clock.now_ns())
@@ -520,9 +470,9 @@ class _Playing:
                     raise _DeviationError(_deviation(entry, "nothing is being written"))
                 player.writes.popleft()()
             case "ready":
-                self._emulation.pipeline_ready(self._warm)
+                self._head.pipeline_ready(self._warm)
             case "clear_faults":
-                self._faults.clear()
+                self._head.faults.clear()
 
 
 def _deviation(entry: Entry, why: str) -> str:

@@ -27,13 +27,7 @@ STEADY_S: Final = 60.0
 
 
 class PipelineRevival:
-    """Restarts the pipeline of a device.
-
-    Parameters
-    ----------
-    ready
-        Called when the pipeline is ready again.
-    """
+    """Restarts the pipeline of a device."""
 
     def __init__(
         self, imager: PipelineImager, device: Device, ready: Callable[[PipelineReady], None]
@@ -45,7 +39,7 @@ class PipelineRevival:
         self._ready_at_s = 0.0
         self._lost = False
         self._task: asyncio.Task[None] | None = None
-        imager.on_failure = self._pipeline_lost
+        imager.ended.connect(self._pipeline_lost)
         device.signals.restarted.connect(self._device_reset)
 
     def _pipeline_lost(self, _text: str) -> None:
@@ -102,7 +96,7 @@ class PipelineRevival:
 
     async def close(self) -> None:
         """Cancel an attempt in progress."""
-        self._imager.on_failure = None
+        self._imager.ended.disconnect(self._pipeline_lost)
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait({self._task})

@@ -31,6 +31,11 @@ class Signal(Generic[Message]):
         """Call a function with each further message."""
         self.observers.append(observer)
 
+    def disconnect(self, observer: Callable[[Message], object]) -> None:
+        """Call a function no more, if it is connected."""
+        if observer in self.observers:
+            self.observers.remove(observer)
+
     def emit(self, message: Message) -> None:
         """Report a message."""
         for observer in self.observers:

@@ -22,13 +22,7 @@ _PEER: Final = struct.Struct("3i")
 
 
 def lock_symlink(path: Path) -> socket.socket:
-    """Lock the path of a symlink to a pseudo-terminal until the socket is closed.
-
-    Raises
-    ------
-    EmulatorError
-        Another emulator uses the symlink, it cannot be locked, or it was not made by an emulator.
-    """
+    """Lock the path of a symlink to a pseudo-terminal until the socket is closed."""
     if path.is_symlink() and not str(path.readlink()).startswith("/dev/pts/"):
         raise EmulatorError(
             f"symlink {path}: points to {path.readlink()}, so it was not made by an emulator; choose another name"

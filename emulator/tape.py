@@ -14,7 +14,7 @@ import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, TypeVar
 
 from starhil.emulator.clock import Clock
 from starhil.emulator.device.device import Background
@@ -35,50 +35,42 @@ SCENARIO_FILE: Final = "scenario.json"
 STATE_FOLDER: Final = "state"
 
 
-class Tape(Protocol):
-    """Interface between an emulation and its environment: a recorder or a player."""
+class Wiring:
+    """Connects a run to the world: directly. A recorder or a player takes the place of these connections.
 
-    @property
-    def plays(self) -> bool:
-        """Whether a recording is played, so that no ports or files are opened."""
+    Attributes
+    ----------
+    plays
+        Whether a recording is played, so that no sockets are opened.
+    repeatable
+        Whether results must not depend on the speed of the machine.
+    """
 
-    @property
-    def clock(self) -> Clock:
-        """The clock of the model."""
+    plays = False
+    repeatable = False
 
-    def begin(self) -> None:
-        """Begin: everything is open and time passes."""
-
-    def latch(self) -> None:
-        """Set the clock to the current time."""
-
-    def write(self, kind: str, **values: Any) -> None:
-        """Record an entry with the time of the clock."""
-
-    def enter(self, kind: str, **values: Any) -> None:
-        """Set the clock to the current time, and record an entry."""
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
         """Return the transport of the serial line."""
+        return make()
 
-    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:
+    def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (the name is for others)
         """Return the transport of a CAN link."""
+        return make()
 
     def imager(self, inner: Imager) -> Imager:
         """Return the pipeline for the device."""
+        return inner
 
     def background(self, inner: Background) -> Background:
         """Return the function that runs slow writes."""
+        return inner
 
 
 class LatchedClock:
-    """A clock that stops while an entry is processed.
-
-    Parameters
-    ----------
-    source
-        The running clock.
-    """
+    """A clock that stops while an entry is processed."""
 
     def __init__(self, source: Clock) -> None:
         self.source = source
@@ -114,15 +106,13 @@ def from_json(value: Any) -> bytes | CanFrame:
     return CanFrame(number, bytes.fromhex(data), extended, remote)
 
 
-class Recorder:
+class Recorder(Wiring):
     """Writes the tape of a run.
 
     Parameters
     ----------
-    folder
-        Folder of the recording.
-    clock
-        Clock of the run.
+    inner
+        Connects the run to the world.
 
     Attributes
     ----------
@@ -132,11 +122,12 @@ class Recorder:
         All files of the recording.
     """
 
-    plays: Final = False
+    repeatable = True
 
-    def __init__(self, folder: Path, clock: Clock) -> None:
-        self._latched = LatchedClock(clock) if clock.speed > 0.0 else None
-        self.clock: Clock = self._latched or clock
+    def __init__(self, folder: Path, inner: Wiring) -> None:
+        self._latched = LatchedClock(inner.clock) if inner.clock.speed > 0.0 else None
+        super().__init__(self._latched or inner.clock)
+        self._inner = inner
         self.folder = folder
         self.file: OutputFile | None = None
         self.output = Output(f"recording {folder}")
@@ -144,9 +135,10 @@ class Recorder:
         """Entries that arrived while the links were being opened, which takes no time on the tape; None
         afterwards."""
 
-    def open(self) -> None:
+    def open(self) -> OutputFile:
         """Create the tape in the folder, which must exist."""
         self.file = OutputFile("recording", self.folder / EVENTS_FILE, output=self.output)
+        return self.file
 
     def begin(self) -> None:
         """Process the entries that arrived while the links were being opened."""
@@ -179,18 +171,19 @@ class Recorder:
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
         """Return the transport of the serial line, whose items are recorded."""
-        return _RecordedSerial(make(), self)
+        return _RecordedSerial(self._inner.serial(make), self)
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:
         """Return the transport of a CAN link, whose items are recorded."""
-        return _RecordedTransport(make(), name, self)
+        return _RecordedTransport(self._inner.can(name, make), name, self)
 
     def imager(self, inner: Imager) -> Imager:
         """Return a pipeline whose replies are recorded as entries."""
-        return _RecordedImager(inner, self)
+        return _RecordedImager(self._inner.imager(inner), self)
 
     def background(self, inner: Background) -> Background:
         """Return a function whose writes end with an entry, unless they end at once (stepped clock)."""
+        inner = self._inner.background(inner)
         if self._latched is None:
             return inner
 

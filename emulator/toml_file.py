@@ -15,15 +15,8 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    path
-        The file.
     what
         Kind of file, for messages: `profile`, `scenario`.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be read or is not TOML; one line with the remedy.
     """
     try:
         return tomllib.loads(read_text(path))

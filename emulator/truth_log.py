@@ -82,17 +82,10 @@ class TruthLog:
     ----------
     path
         The file; created if it does not exist.
-    overwrite
-        Whether to replace an existing file.
     wall_times
         Whether to fill the columns in `WALL_TIMES`.
     output
         The recording of which the file is a part; by default it is none.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, is not empty, or another emulator writes to it; it is unchanged.
     """
 
     def __init__(

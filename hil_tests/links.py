@@ -14,8 +14,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
-from starhil.protocol.receiver import Receiver
-from starhil.protocol.serial_interface import HostEnd
+from starhil.protocol.serial_interface import HostEnd, Receiver
 from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect, serial_answers
 from starhil.protocol.transports import Transport, open_can, open_serial
 

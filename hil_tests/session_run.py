@@ -33,7 +33,7 @@ from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import InterfaceDefinition, load_unit
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 SCRIPT_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "sessions"

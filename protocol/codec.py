@@ -60,11 +60,6 @@ class Slot:
         """Format of the slot for `struct`, without the byte order."""
         return STRUCT_CODES.get(self.type) or f"{self.size}s"
 
-    @property
-    def format(self) -> str:
-        """Format of the slot for `struct`."""
-        return BYTE_ORDERS[self.order] + self.code
-
 
 class Field(FieldKeys):
     """One value of a row: a whole slot, or some bits of one."""

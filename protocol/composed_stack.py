@@ -42,8 +42,7 @@ from starhil.protocol.messages import (
     error_code,
 )
 from starhil.protocol.plugin import guarded
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_interface import RowShape, SerialStack
+from starhil.protocol.serial_interface import Dialect, RowShape, SerialStack
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
-from pathlib import Path
 from typing import Final, TypeVar
 
+from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.device_model import DeviceModel, device_model
@@ -47,14 +47,6 @@ class Names(dict[str, _Item]):
 
 
 @dataclass(frozen=True)
-class RawTable:
-    """A table of a definition that another module validates, and its file."""
-
-    file: Path
-    document: Mapping[str, object]
-
-
-@dataclass(frozen=True)
 class InterfaceDefinition:
     """The interface between a device and an OBC: rows, enumerations and parameters."""
 
@@ -70,7 +62,7 @@ class InterfaceDefinition:
     """All parameters of the device; those that the unit exposes have the unit's limits and defaults."""
     sections: tuple[Section, ...] = ()
     """Documentation that accompanies the rows, such as conventions."""
-    canopen: RawTable | None = None
+    canopen: CanopenModel | None = None
     """Layout of the object dictionary, if the unit has CANopen."""
     link: LinkModel = field(default_factory=LinkModel)
     """The links of the unit."""

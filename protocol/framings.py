@@ -11,12 +11,12 @@ import binascii
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum, auto
 from typing import Generic, TypeVar
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, SlipFraming
 from starhil.protocol.messages import FaultKind, LinkFault, check_receiver_limits
-from starhil.protocol.serial_framing import Deframer as EscapeDeframer
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
@@ -127,7 +127,13 @@ class Framing(ABC):
 
 
 class Slip(Framing):
-    """Frames between end bytes, with substituted bytes within (RFC 1055)."""
+    """Frames between end bytes, with substituted bytes within (RFC 1055).
+
+    ::
+
+    [end]  body, end -> escape substitute 1, escape -> escape substitute 2  end
+      C0   01 DB DC 02 DB DD  (the body 01 C0 02 DB)                         C0
+    """
 
     def __init__(self, model: SlipFraming) -> None:
         substitutes = model.escaped
@@ -209,54 +215,213 @@ class _SlipDeframer(_Collector[_Message]):
 
 
 class Escaped(Framing):
-    """`escape start … escape end`, with escape bytes in between doubled."""
+    """`escape start … escape end`, with escape bytes in between doubled (DLE framing).
+
+    ::
+
+    escape start   body, escape doubled   escape end
+      10     02    48 10 10 99              10    03
+    """
 
     def __init__(self, model: EscapedFraming) -> None:
         if len({model.escape, model.start, model.end}) < 3:
             raise IcdError("link.serial.framing: escape, start and end must differ")
-        self._model = model
-        self._escape = bytes((model.escape,))
+        self.escape = bytes((model.escape,))
         self.start = bytes((model.escape, model.start))
         self.end = bytes((model.escape, model.end))
 
     def encode(self, body: bytes) -> bytes:
         """Return start, the body with its escape bytes doubled, and end."""
-        return self.start + body.replace(self._escape, self._escape * 2) + self.end
+        return self.start + body.replace(self.escape, self.escape * 2) + self.end
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer that ignores bytes between messages."""
-        return _EscapedDeframer(receiving, self._model)
+        return EscapedDeframer(receiving, self)
 
 
-class _EscapedDeframer(Deframer[_Message]):
-    def __init__(self, receiving: Receiving[_Message], model: EscapedFraming) -> None:
+class _State(Enum):
+    IDLE = auto()
+    """Outside a message."""
+    IDLE_ESCAPED = auto()
+    """Outside a message, after an escape byte."""
+    FIRST = auto()
+    """At the first byte after the start: the ID, if the message has one."""
+    FIRST_ESCAPED = auto()
+    """After an escape byte at the position of the ID."""
+    BODY = auto()
+    BODY_ESCAPED = auto()
+
+
+class EscapedDeframer(Deframer[_Message]):
+    """Finds bodies between starts and ends; each run of junk yields one fault.
+
+    A run of junk ends at the next start of a message or after a silence of the timeout.
+
+    Parameters
+    ----------
+    starts
+        Bytes that start a message, if there are several; the body then begins with the one that was found.
+    first_is_id
+        Whether a body begins with an ID. An ID that is the escape byte is ambiguous in practice: some senders double
+        it, others do not. Both forms are read as that ID, unless the bytes are a start or an end.
+    """
+
+    def __init__(
+        self,
+        receiving: Receiving[_Message],
+        framing: Escaped,
+        starts: frozenset[int] = frozenset(),
+        *,
+        first_is_id: bool = False,
+    ) -> None:
+        check_receiver_limits(receiving.max_size, receiving.timeout_s)
         self._interpret = receiving.interpret
-        self._packets = EscapeDeframer(
-            frozenset((model.start,)),
-            first_is_id=False,
-            max_size=receiving.max_size,
-            timeout_s=receiving.timeout_s,
-            escape=model.escape,
-            end=model.end,
-        )
+        self._max_size = receiving.max_size
+        self._timeout_s = receiving.timeout_s
+        self._several = bool(starts)
+        self._starts = starts or frozenset(framing.start[1:])
+        self._escape = framing.escape[0]
+        self._end = framing.end[1]
+        self._first_is_id = first_is_id
+        self._state = _State.IDLE
+        self._start = 0
+        self._body = bytearray()
+        self._in_junk = False
+        self._last_time = float("-inf")
+        self._events: list[_Message | LinkFault] = []
 
     @property
     def busy(self) -> bool:
-        return self._packets.busy
+        """Whether a message is incomplete."""
+        return self._state not in (_State.IDLE, _State.IDLE_ESCAPED)
 
     def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        events = (
-            packet if isinstance(packet, LinkFault) else self._interpret(packet.body)
-            for packet in self._packets.feed(data, now)
-        )
-        return [event for event in events if event is not None]
+        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
+        self._events = list(self.flush(now))
+        if data:
+            self._last_time = now
+        position = 0
+        while position < len(data):
+            position = self._advance(data, position)
+        return self._events
 
     def flush(self, now: float) -> list[LinkFault]:
-        return self._packets.flush(now)
+        """Abandon an incomplete message after a silence of the timeout."""
+        if now - self._last_time < self._timeout_s:
+            return []
+        state, in_junk, size = self._state, self._in_junk, len(self._body)
+        self._reset(in_junk=False)
+        if state is _State.IDLE:
+            return []
+        if state is _State.IDLE_ESCAPED:
+            return (
+                []
+                if in_junk
+                else [LinkFault(FaultKind.UART_PROTOCOL, f"escape byte {self._escape:02X} outside a message")]
+            )
+        text = f"message of {size} bytes without end after {self._timeout_s:g} s of silence"
+        return [LinkFault(FaultKind.UART_INCOMPLETE, text)]
+
+    def _advance(self, data: bytes, position: int) -> int:
+        """Process one byte, or all up to the next escape byte; return the position after it."""
+        match self._state:
+            case _State.IDLE | _State.BODY:
+                escape = data.find(self._escape, position)
+                end = len(data) if escape < 0 else escape
+                if end > position:
+                    self._add_plain_bytes(data[position:end])
+                    return end
+                self._state = _State.BODY_ESCAPED if self.busy else _State.IDLE_ESCAPED
+            case _State.FIRST:
+                if data[position] == self._escape:
+                    self._state = _State.FIRST_ESCAPED if self._first_is_id else _State.BODY_ESCAPED
+                else:
+                    self._state = _State.BODY
+                    self._add_plain_bytes(data[position : position + 1])
+            case _State.IDLE_ESCAPED:
+                self._after_idle_escape(data[position])
+            case _State.FIRST_ESCAPED:
+                self._after_first_escape(data[position])
+            case _State.BODY_ESCAPED:
+                self._after_body_escape(data[position])
+        return position + 1
+
+    def _add_plain_bytes(self, run: bytes) -> None:
+        """Add bytes that are neither escape bytes nor escaped."""
+        if self.busy:
+            self._body += run
+            if len(self._body) > self._max_size:
+                self._abandon(FaultKind.UART_OVERLONG, f"message longer than {self._max_size} bytes")
+        else:
+            self._report_junk(run[0])
+
+    def _after_idle_escape(self, byte: int) -> None:
+        if byte in self._starts:
+            self._start_message(byte)
+            return
+        self._report_junk(self._escape)
+        if byte != self._escape:
+            self._state = _State.IDLE
+
+    def _after_first_escape(self, byte: int) -> None:
+        if byte == self._end or byte in self._starts:
+            self._after_body_escape(byte)
+            return
+        self._state = _State.BODY
+        self._add_plain_bytes(bytes((self._escape,) if byte == self._escape else (self._escape, byte)))
+
+    def _after_body_escape(self, byte: int) -> None:
+        self._state = _State.BODY
+        if byte == self._escape:
+            self._add_plain_bytes(bytes((self._escape,)))
+        elif byte == self._end:
+            body = bytes(self._body)
+            self._reset(in_junk=False)
+            self._deliver(body)
+        elif byte in self._starts:
+            text = f"message of {len(self._body)} bytes interrupted by the start of another"
+            self._events.append(LinkFault(FaultKind.UART_INCOMPLETE, text))
+            self._start_message(byte)
+        else:
+            self._abandon(FaultKind.UART_PROTOCOL, f"byte {byte:02X} after an escape byte within a message")
+
+    def _deliver(self, body: bytes) -> None:
+        if not body:
+            self._events.append(LinkFault(FaultKind.UART_PROTOCOL, "message without an ID"))
+            return
+        message = self._interpret(bytes((self._start,)) + body if self._several else body)
+        if message is not None:
+            self._events.append(message)
+
+    def _start_message(self, start: int) -> None:
+        self._reset(in_junk=False)
+        self._state = _State.FIRST
+        self._start = start
+
+    def _reset(self, *, in_junk: bool) -> None:
+        self._state = _State.IDLE
+        self._in_junk = in_junk
+        self._body.clear()
+
+    def _abandon(self, kind: FaultKind, text: str) -> None:
+        """Drop the message; its remaining bytes belong to the same run of junk."""
+        self._events.append(LinkFault(kind, text))
+        self._reset(in_junk=True)
+
+    def _report_junk(self, byte: int) -> None:
+        if not self._in_junk:
+            self._events.append(LinkFault(FaultKind.UART_PROTOCOL, f"byte {byte:02X} outside a message"))
+        self._in_junk = True
 
 
 class Counted(Framing):
-    """`start`, a body whose size is given by its header or its row, `end`."""
+    """`start`, a body whose size is given by its header or its row, `end`.
+
+    ::
+
+    start   body: header (with its length), data, check   end
+    DE AD   00 00 00 02                                   BE EF
+    """
 
     def __init__(self, start: list[int], end: list[int]) -> None:
         self.start = bytes(start)
@@ -361,7 +526,13 @@ class _CountedDeframer(_Collector[_Message]):
 
 
 class Delimited(Framing):
-    """`start`, a body as bytes or hexadecimal digits, `end`."""
+    """`start`, a body as bytes or hexadecimal digits, `end`.
+
+    ::
+
+    start   body, as it is or two digits a byte   end
+      24    30 32 46 46  (the body 02 FF)        0D 0A
+    """
 
     def __init__(self, model: DelimitedFraming) -> None:
         self.start = bytes(model.start)

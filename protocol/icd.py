@@ -17,6 +17,7 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
+from starhil.protocol import canopen_schema
 from starhil.protocol import icd_schema as schema
 from starhil.protocol.codec import Row, RowKind
 from starhil.protocol.conventions import Conventions
@@ -24,7 +25,6 @@ from starhil.protocol.definition import (
     OTHER_ERROR,
     InterfaceDefinition,
     Names,
-    RawTable,
     UnknownNameError,
 )
 from starhil.protocol.device_model import DeviceModel, device_model, did_you_mean
@@ -49,7 +49,6 @@ __all__ = [
     "IcdError",
     "InterfaceDefinition",
     "Names",
-    "RawTable",
     "UnknownNameError",
     "load_unit",
     "read_definition",
@@ -79,6 +78,12 @@ _MODELS: Final[dict[str, type[BaseModel]]] = {
     "bits": schema.BitModel,
     "parameter": schema.ParameterModel,
     "section": Section,
+    "canopen": canopen_schema.CanopenModel,
+    "object": canopen_schema.PlacedObject,
+    "members": canopen_schema.PlacedMember,
+    "packed": canopen_schema.PackedField,
+    "tpdo": canopen_schema.PdoModel,
+    "rpdo": canopen_schema.PdoModel,
 }
 """Table → its schema, to suggest keys."""
 
@@ -115,9 +120,31 @@ def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDe
     return definition, reader.errors if files else [f"{path}: no .toml file in this folder"]
 
 
-def _place(error: ErrorDetails) -> tuple[int | str, ...]:
+def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
+    """Return the keys that lead to an error; pydantic also names the kinds of unions, such as `crc` of a check."""
+    steps: list[int | str] = []
+    for step in error["loc"][:-1]:
+        try:
+            document = document[step]
+        except (KeyError, IndexError, TypeError):
+            continue
+        steps.append(step)
+    return (*steps, *error["loc"][-1:])
+
+
+def _texts(file: Path, document: Any, error: ValidationError) -> Iterator[str]:
+    for item in error.errors():
+        location = _location(document, item)
+        where = f"{file}: {_key_path(document, location)}"
+        if item["type"] == "extra_forbidden":
+            yield f"{where}: unknown key{did_you_mean(str(location[-1]), _known_keys(location))}"
+        else:
+            yield f"{where}: {item['msg'].replace('Tuple', 'List').replace('tuple', 'list')}"  # TOML's word
+
+
+def _place(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
     """Return the place of what cannot be used because of an error: a key, a field, a table."""
-    location = error["loc"]
+    location = _location(document, error)
     if error["type"] == "extra_forbidden":
         return location
     if len(location) > 3 and location[2] == "fields":
@@ -200,20 +227,20 @@ class _Reader:
             self.errors.append(f"{file}: not valid TOML: {error}")
             self._unread = True
             return
-        try:
-            model = schema.FileModel.model_validate(document)
-        except ValidationError as error:
-            for item in error.errors():
-                where = f"{file}: {_key_path(document, item['loc'])}"
-                if item["type"] == "extra_forbidden":
-                    hint = did_you_mean(str(item["loc"][-1]), _known_keys(item["loc"]))
-                    self.errors.append(f"{where}: unknown key{hint}")
-                else:
-                    self.errors.append(f"{where}: {item['msg']}")
-            for place in sorted({_place(item) for item in error.errors()}, key=_order, reverse=True):
-                self._remove(document, place)
-            model = schema.FileModel.model_validate(document)
-        self._files.append((file, model))
+        said = False
+        while True:
+            try:
+                self._files.append((file, schema.FileModel.model_validate(document)))
+            except ValidationError as error:
+                if not said:  # later ones may be caused by what was removed
+                    self.errors += _texts(file, document, error)
+                said = True
+                for place in sorted(
+                    {_place(document, item) for item in error.errors()}, key=_order, reverse=True
+                ):
+                    self._remove(document, place)
+            else:
+                return
 
     def _remove(self, document: Any, place: tuple[int | str, ...]) -> None:
         """Remove what is invalid from a document, and record the names that are missing because of that."""
@@ -264,7 +291,6 @@ class _Reader:
         conventions = self._single("conventions", Conventions())[1]
         errors_file, errors = self._single("errors", dict[str, int]())
         link_file, self._link = self._single("link", LinkModel())
-        canopen_file, canopen = self._single("canopen", None)
         for file, item in self._every("classes"):
             if not self._attempt(self._add_class, file, item):
                 self._broken |= {CLASS, item.name}
@@ -297,7 +323,7 @@ class _Reader:
             parameters=Names("parameter", self._parameters.items()),
             device_parameters=Names("parameter", {**self._device_parameters, **self._parameters}.items()),
             sections=tuple(sections.values()),
-            canopen=None if canopen is None else RawTable(canopen_file, canopen),
+            canopen=self._single("canopen", None)[1],
             link=self._link,
             conventions=conventions,
             classes=tuple(self._classes.values()),

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
+from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.conventions import Conventions, Order
 from starhil.protocol.link_schema import LinkModel, MessageClass
 from starhil.protocol.values import (
@@ -221,8 +222,7 @@ class FileModel(DefinitionModel):
     parameter: list[ParameterModel] = []
     section: list[Section] = []
     link: LinkModel | None = None
-    canopen: dict[str, object] | None = None
-    """Mapping to the object dictionary, read by `starhil.protocol.canopen.layout`."""
+    canopen: CanopenModel | None = None
 
 
 class QuantityModel(DefinitionModel):

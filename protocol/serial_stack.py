@@ -1,75 +1,23 @@
 """The serial link of a unit according to its definition, sans-I/O.
 
-Units of the CubeSpace family use the codec in `serial_framing`, with its three reply dialects. The link of any
-other unit is composed of parts from `framings`, `checks` and `envelope` (`composed_stack`).
+A link is composed of a framing (`framings`), a check (`checks`) and headers (`envelope`) in `composed_stack`. The
+framing `cubespace` has three dialects of replies and so a stack of its own (`cubespace_serial`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
 
 from starhil.protocol.checks import CheckFunction
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.conventions import Order
+from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.link_schema import CubeSpaceFraming, MessageClass, SerialLinkModel
-from starhil.protocol.messages import (
-    DEFAULT_MAX_SIZE,
-    Reply,
-    ReplyKind,
-    Request,
-    RequestKind,
-)
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect, HostReceiver
-from starhil.protocol.serial_framing import encode_reply as encode_cubespace_reply
-from starhil.protocol.serial_framing import encode_request as encode_cubespace_request
-from starhil.protocol.serial_interface import RowShape, SerialStack
+from starhil.protocol.messages import RequestKind
+from starhil.protocol.serial_interface import Dialect, RowShape, SerialStack
 from starhil.protocol.values import IcdError
-
-
-class CubeSpaceStack(SerialStack):
-    """The serial link of the CubeSpace family; its style is the reply dialect, by default b.
-
-    Attributes
-    ----------
-    dialect
-        The only dialect of the unit, used for any style; None if it has all three.
-    """
-
-    def __init__(self, link: SerialLinkModel, rows: Sequence[RowShape] = ()) -> None:
-        self.baud = link.baud
-        self._timeout_s = link.timeout
-        self._max_size = link.max_size or DEFAULT_MAX_SIZE
-        given = link.framing.dialect if isinstance(link.framing, CubeSpaceFraming) else None
-        self.dialect: Final = None if given is None else Dialect(given)
-        self._silent = frozenset(row.id for row in rows if not row.answers)
-
-    def device(self) -> DeviceReceiver:
-        """Return a receiver for the device's end."""
-        return DeviceReceiver(max_size=self._max_size, timeout_s=self._timeout_s)
-
-    def host(self, style: Dialect | None = None) -> HostReceiver:
-        """Return a receiver for the OBC's end, in a dialect."""
-        return HostReceiver(self._style(style), max_size=self._max_size, timeout_s=self._timeout_s)
-
-    def supports_unsolicited(self, style: Dialect | None = None) -> bool:
-        """Return whether this dialect has unsolicited telemetry."""
-        return self._style(style).supports_unsolicited
-
-    def encode_request(self, request: Request) -> bytes:
-        """Return a request as bytes on the line."""
-        return encode_cubespace_request(request)
-
-    def encode_reply(self, reply: Reply, style: Dialect | None = None) -> bytes:
-        """Return a reply as bytes on the line, in a dialect; empty if the row has no answer."""
-        if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) and reply.id in self._silent:
-            return b""
-        return encode_cubespace_reply(reply, self._style(style))
-
-    def _style(self, style: Dialect | None) -> Dialect:
-        return self.dialect or style or Dialect.B
 
 
 def build_stack(

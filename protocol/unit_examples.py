@@ -8,9 +8,9 @@ from pathlib import Path
 
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.canopen.device_dictionary import build_dictionary
-from starhil.protocol.canopen.layout import layout_errors
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import read_definition
@@ -19,7 +19,7 @@ from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
 from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack, serial_answers
+from starhil.protocol.serial_stack import build_serial_stack, serial_answers
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
@@ -101,13 +101,10 @@ def examine(
             row.encode(row.example(), saturate=row.kind == "telemetry")
         except ProtocolError as error:
             errors.append(f"unit {definition.name}: {row.kind} {row.name}: example: {error}")
-    table = definition.canopen
-    if table is not None:
-        errors += layout_errors(table)
     examples: list[Exchange] = []
     if not errors:
         try:
-            if table is not None:
+            if definition.canopen is not None:
                 build_dictionary(definition)
             examples += exchanges(definition)
         except ProtocolError as error:

@@ -20,8 +20,8 @@ import cv2
 import pytest
 
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import render

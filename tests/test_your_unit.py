@@ -9,8 +9,7 @@ import serial
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
-from starhil.emulator.emulation import Emulation
-from starhil.emulator.launch import Run, RunOptions
+from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.profile import Profile
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import load_unit
@@ -45,7 +44,9 @@ def test_the_unit_of_the_page_has_no_errors_and_the_exchange_that_is_shown(tmp_p
 
 
 def test_the_client_of_the_page_prints_the_output_shown(tmp_path, monkeypatch):
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(FakePipeline().handle))
+    monkeypatch.setattr(
+        "starhil.emulator.run.make_imager", lambda *_, **__: FakeImager(FakePipeline().handle)
+    )
     profile = Profile.model_validate(
         {
             "unit": str(written(tmp_path / "lynx")),
@@ -57,11 +58,11 @@ def test_the_client_of_the_page_prints_the_output_shown(tmp_path, monkeypatch):
     ((client, printed),) = programs(PAGE)
 
     async def read() -> str:
-        emulator = Run(profile, RunOptions())
+        emulator = Emulator([profile], RunOptions())
         try:
             await emulator.start()
-            await emulator.emulation.ready()
-            port = emulator.emulation.ready_fields["serial"]
+            await emulator.ready()
+            port = emulator.run.heads[0].ready_fields["serial"]
             return await asyncio.to_thread(run, client, {"PORT": port})
         finally:
             await emulator.close()
@@ -99,7 +100,9 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
 
 
 def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(FakePipeline().handle))
+    monkeypatch.setattr(
+        "starhil.emulator.run.make_imager", lambda *_, **__: FakeImager(FakePipeline().handle)
+    )
     folder = written(tmp_path / "lynx")
     (more,) = [block.text for block in blocks(PAGE, "toml") if block.heading == STREAMING]
     (folder / "more.toml").write_text(more, encoding="utf-8")
@@ -110,11 +113,11 @@ def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
             return line.read(200)
 
     async def read() -> bytes:
-        emulator = Run(profile, RunOptions())
+        emulator = Emulator([profile], RunOptions())
         try:
             await emulator.start()
-            await emulator.emulation.ready()
-            return await asyncio.to_thread(listen, emulator.emulation.ready_fields["serial"])
+            await emulator.ready()
+            return await asyncio.to_thread(listen, emulator.run.heads[0].ready_fields["serial"])
         finally:
             await emulator.close()
 

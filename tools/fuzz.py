@@ -11,12 +11,13 @@ size, at most 3 KB; `tests/fuzzing/test_corpus.py` repeats it.
 from __future__ import annotations
 
 import argparse
-import ast
 import io
 import os
 import re
 import sys
 import tempfile
+import traceback
+import zlib
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -72,12 +73,6 @@ def modules() -> list[str]:
     ]
 
 
-def read_corpus(name: str) -> list[bytes]:
-    """Return the inputs of a target that were kept."""
-    path = CORPUS / f"{name}.txt"
-    return [ast.literal_eval(line) for line in path.read_text("ascii").splitlines()] if path.exists() else []
-
-
 def load_targets() -> dict[str, Target]:
     """Import the targets with instrumented modules, once for all."""
     import atheris
@@ -93,21 +88,34 @@ def load_targets() -> dict[str, Target]:
     return TARGETS
 
 
-def in_child(target: Target, options: list[str], log: Path) -> int:
-    """Run libFuzzer on a target in a fork of this process; return its exit status."""
+def in_child(target: Target, options: list[str], log: Path, failure: str) -> int:
+    """Run libFuzzer on a target in a fork; return its exit status. A failing input becomes a file whose name begins so."""
     import atheris
 
     child = os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    with log.open("wb") as stream:
-        for descriptor in (1, 2):
-            os.dup2(stream.fileno(), descriptor)
-    limits = [f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}", f"-max_len={LONGEST}"]
-    with tempfile.TemporaryDirectory() as folder:
-        atheris.Setup([sys.argv[0], *limits, *options], target.runner(Path(folder)))
-        atheris.Fuzz()  # ends the process
-    return 1
+    try:
+        with log.open("wb") as stream:
+            for descriptor in (1, 2):
+                os.dup2(stream.fileno(), descriptor)
+        limits = [f"-timeout={SLOWEST_S}", f"-rss_limit_mb={MEMORY_MB}", f"-max_len={LONGEST}"]
+        with tempfile.TemporaryDirectory() as folder:
+            run = target.runner(Path(folder))
+
+            def reporting(data: bytes) -> None:
+                try:
+                    run(data)
+                except BaseException:
+                    Path(f"{failure}{zlib.crc32(data):08x}").write_bytes(data)
+                    raise
+
+            atheris.Setup([sys.argv[0], f"-artifact_prefix={failure}", *limits, *options], reporting)
+            atheris.Fuzz()  # ends the process
+    except Exception:  # noqa: BLE001 (whatever keeps a target from starting)
+        traceback.print_exc()
+    finally:
+        os._exit(1)
 
 
 def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
@@ -115,7 +123,7 @@ def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
     files = sorted(found.iterdir(), key=lambda path: (path.stat().st_size, path.name))
     control = scratch / "control"
     control.write_text("".join(f"{line}\n" for line in (len(files), 0, *files)), "ascii")
-    in_child(target, ["-merge_inner=1", f"-merge_control_file={control}"], scratch / "merge.log")
+    in_child(target, ["-merge_inner=1", f"-merge_control_file={control}"], scratch / "merge", f"{scratch}/")
     reached: dict[Path, set[str]] = {}
     for line in control.read_text("ascii").splitlines()[len(files) + 2 :]:
         kind, number, *features = line.split()
@@ -135,22 +143,18 @@ def keep(name: str, target: Target, found: Path, scratch: Path) -> int:
     return CORPUS_BYTES - left
 
 
-def fuzz(name: str, target: Target, seconds: float) -> bool:
+def fuzz(name: str, target: Target, kept: list[bytes], seconds: float) -> bool:
     """Fuzz a target and renew its corpus; return whether no input failed."""
     FAILURES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         found, log = scratch / "found", scratch / "log"
         found.mkdir()
-        for number, data in enumerate([*target.seeds(), *read_corpus(name)]):
+        for number, data in enumerate([*target.seeds(), *kept]):
             (found / f"seed{number}").write_bytes(data)
         before = set(FAILURES.glob(f"{name}-*"))
-        options = [
-            f"-max_total_time={seconds:.0f}",
-            f"-artifact_prefix={FAILURES}/{name}-",
-            "-print_final_stats=1",
-        ]
-        begin, status = os.times(), in_child(target, [*options, str(found)], log)
+        options = [f"-max_total_time={seconds:.0f}", "-print_final_stats=1", str(found)]
+        begin, status = os.times(), in_child(target, options, log, f"{FAILURES}/{name}-")
         end, text = os.times(), log.read_text("utf-8", "replace")
         failures = sorted(set(FAILURES.glob(f"{name}-*")) - before)
         if status or failures:
@@ -175,6 +179,8 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="print the targets")
     options = parser.parse_args()
     targets = load_targets()
+    from tests.fuzzing.targets import read_corpus
+
     wanted = [
         name
         for name in targets
@@ -182,7 +188,7 @@ def main() -> None:
     ]
     if options.list or not wanted:
         sys.exit("\n".join(targets) if options.list else "no such target; see --list")
-    failed = [name for name in wanted if not fuzz(name, targets[name], options.seconds)]
+    failed = [name for name in wanted if not fuzz(name, targets[name], read_corpus(name), options.seconds)]
     print(f"{len(wanted) - len(failed)} of {len(wanted)} targets without a failure {' '.join(failed)}")
     sys.exit(bool(failed))
 

@@ -24,10 +24,10 @@ from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.device.surroundings import orbit_of
-from starhil.emulator.emulation import camera_constants, pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, PipelineReady, SolverSettings
 from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
 from starhil.emulator.profile import load_profile
 from starhil.protocol.icd import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude

@@ -206,7 +206,7 @@ def bus(
     from starhil.emulator.cli.bench_bus import Target, check_rows, measure, print_figures, started_device
     from starhil.hil_tests.realtime import set_realtime_priority
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.serial_framing import Dialect
+    from starhil.protocol.serial_interface import Dialect
 
     if dialect is not None:
         one_of("--dialect", dialect, DIALECTS)

@@ -19,7 +19,7 @@ from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.serial_load import load_serial
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 
 UPDATE_RATE_HZ = 10.0
 NODE = 44
@@ -42,13 +42,7 @@ REQUIRED_ROWS = (
 
 
 def check_rows(icd: InterfaceDefinition) -> None:
-    """Check that a unit has the rows that the load requests.
-
-    Raises
-    ------
-    BenchError
-        The unit lacks some of them.
-    """
+    """Check that a unit has the rows that the load requests."""
     missing = [name for name in REQUIRED_ROWS if name not in icd.telemetry and name not in icd.telecommands]
     if missing:
         raise BenchError(

@@ -62,9 +62,9 @@ def warm(
     """
     from dataclasses import replace
 
-    from starhil.emulator.emulation import pipeline_setup
     from starhil.emulator.pipeline.imager import ProcessImager
     from starhil.emulator.pipeline.worker_process import WorkerProcess
+    from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starid.cache import cache_dir, kernels_written_since
 

@@ -13,13 +13,7 @@ from starhil.protocol.codec import Row
 
 
 class ConsoleClient:
-    """An OBC for console and recording.
-
-    Parameters
-    ----------
-    port
-        Bus and address of the device.
-    """
+    """An OBC for console and recording."""
 
     def __init__(self, port: ObcPort) -> None:
         self._port = port

@@ -23,6 +23,8 @@ IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made t
 """Folder for the state of the units, if there is one: a stored parameter then costs no time on a disk."""
 RENDERED_STEPS: Final = 40
 """Steps of a life whose images are rendered."""
+LONG_STEPS: Final = 150
+"""Steps of a long life."""
 SIGMA_ARCSEC: Final = {False: (10.0, 33.0), True: (60.0, 300.0)}
 """Largest standard deviations across and about the boresight of the error model, and of rendered images."""
 YEAR_S: Final = 365.25 * 86_400.0
@@ -41,7 +43,8 @@ def command(
     steps: Annotated[int, typer.Option(min=1, help="Steps of a life.")] = 400,
     rendered: Annotated[
         int, typer.Option(min=0, help="One life in this number is rendered and solved; 0: none.")
-    ] = 100,
+    ] = 97,
+    long: Annotated[int, typer.Option(min=0, help="One life in this number lasts for months; 0: none.")] = 25,
     jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
     life: Annotated[
         Path | None, typer.Option(help="Repeat one life, a file that an earlier run has written.")
@@ -61,13 +64,12 @@ def command(
 
     if life is not None:
         found = read_life(life)
-        outcomes = [live(found.unit, found, rendered=False, folder=output)]
+        outcomes = [{**live(found.unit, found, rendered=False, folder=output), "kind": "usual"}]
     else:
-        plan = _plan(
-            unit or sorted(bundled_units()), seed, None if hours is not None else lives, steps, rendered
-        )
+        kinds = {"rendered": (rendered, RENDERED_STEPS), "long": (long, LONG_STEPS), "usual": (1, steps)}
+        plan = _plan(unit or sorted(bundled_units()), seed, None if hours is not None else lives, kinds)
         outcomes = list(_run(plan, output, jobs, lives, hours))
-    figures = summary(outcomes)
+    figures = {"seed": seed, **summary(outcomes)}
     if as_json:
         print(json.dumps({**figures, "violations": [item for item in outcomes if item["violation"]]}))
     else:
@@ -77,17 +79,20 @@ def command(
 
 
 def _plan(
-    units: list[str], seed: int, lives: int | None, steps: int, rendered: int
-) -> Iterator[tuple[str, int, int, bool]]:
+    units: list[str], seed: int, lives: int | None, kinds: dict[str, tuple[int, int]]
+) -> Iterator[tuple[str, int, int, str]]:
+    """Generate unit, seed, steps and kind of each life; a kind has a period, in which its last life is of it."""
     number = 0
     while lives is None or number < lives:
-        whole = rendered > 0 and number % rendered == rendered - 1
-        yield units[number % len(units)], seed + number, RENDERED_STEPS if whole else steps, whole
+        kind, steps = next(
+            (name, steps) for name, (period, steps) in kinds.items() if period and not (number + 1) % period
+        )
+        yield units[number % len(units)], seed + number, steps, kind
         number += 1
 
 
 def _run(
-    plan: Iterator[tuple[str, int, int, bool]], folder: Path, jobs: int, lives: int, hours: float | None
+    plan: Iterator[tuple[str, int, int, str]], folder: Path, jobs: int, lives: int, hours: float | None
 ) -> Iterator[dict[str, Any]]:
     """Run the lives of a plan in processes, until its end or that of the time."""
     from rich.console import Console
@@ -115,14 +120,15 @@ def _run(
                 yield future.result()
 
 
-def live_from_seed(unit: str, seed: int, steps: int, rendered: bool, folder: Path) -> dict[str, Any]:
+def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) -> dict[str, Any]:
     """Generate a life and live it."""
     from starhil.emulator.endurance.unit_under_test import links_of
     from starhil.hil_tests.endurance.life import make_life
     from starhil.protocol.icd import load_unit
 
     icd = load_unit(unit)
-    return live(unit, make_life(icd, unit, links_of(icd), seed, steps), rendered=rendered, folder=folder)
+    life = make_life(icd, unit, links_of(icd), seed, steps, is_long=kind == "long")
+    return {**live(unit, life, rendered=kind == "rendered", folder=folder), "kind": kind}
 
 
 def live(unit: str, life: Any, *, rendered: bool, folder: Path) -> dict[str, Any]:
@@ -230,7 +236,10 @@ def _of(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "lives": len(outcomes),
         "device_years": device_s / YEAR_S,
+        "imaging_years": sum(item["exposed_s"] for item in outcomes) / YEAR_S,
         "factor": device_s / max(cpu_s, 1e-9),
+        "cpu_hours": cpu_s / 3600.0,
+        "frames": sum(item["frames"] for item in outcomes),
         "requests": sum(item["requests"] for item in outcomes),
         "readings": sum(item["readings"] for item in outcomes),
         "attitudes": sum(item["attitudes"] for item in outcomes),
@@ -243,14 +252,20 @@ def _print(figures: dict[str, Any], outcomes: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
     formats = {
-        "lives": "d", "device_years": ".4f", "factor": ".0f", "requests": "d", "readings": "d", "attitudes": "d",
+        "lives": "d", "device_years": ".3f", "imaging_years": ".3f", "frames": "d", "requests": "d", "attitudes": "d",
         "violating": "d",
     }  # fmt: skip
-    table = Table("unit", *(name.replace("device_", "") for name in formats), box=None)
+    table = Table("unit", *(name.removesuffix("_years").replace("_", " ") for name in formats), box=None)
     for name, row in [*figures["units"].items(), ("all", figures)]:
         table.add_row(name, *(format(row[key], text) for key, text in formats.items()))
     Console().print(table)
+    print(
+        f"Years under power, and taking images. Seed {figures['seed']}; {figures['cpu_hours']:.2f} h of processor time, "
+        f"device time : processor time {figures['factor']:.0f}"
+    )
     for item in outcomes:
         if item["violation"]:
             print(f"{item['unit']} seed {item['seed']}: {item['violation']}")
             print(f"  {item['steps']} steps; {' '.join(item['files'])}")
+            kind = f"--rendered {int(item['kind'] == 'rendered')} --long {int(item['kind'] == 'long')}"
+            print(f"  starhil endurance --unit {item['unit']} --seed {item['seed']} --lives 1 {kind}")

@@ -127,7 +127,7 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
         from starhil.emulator.device.device import profile_defaults
         from starhil.emulator.device.parameters import Parameters
         from starhil.emulator.device.surroundings import orbit_of
-        from starhil.emulator.emulation import pipeline_setup
+        from starhil.emulator.pipeline_setup import pipeline_setup
         from starhil.emulator.profile import load_profile
         from starhil.protocol.icd import load_unit
 

@@ -133,7 +133,7 @@ def command(
     from starhil.emulator.cli.console_client import ConsoleClient
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.guard import log_loop_errors_once
-    from starhil.emulator.launch import Run, RunOptions, path_of_head, with_own_seeds
+    from starhil.emulator.launch import Emulator, RunOptions, path_of_head, with_own_seeds
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
 
     levels = ("debug", "info", "warning", "error")
@@ -197,7 +197,7 @@ def command(
     async def run() -> int:
         import signal
 
-        emulator = Run(profiles[0], options, worker, profiles[1:])
+        emulator = Emulator(profiles, options, worker)
         loop = asyncio.get_running_loop()
         log_loop_errors_once(loop)
         ends = [signal.SIGINT, signal.SIGTERM]

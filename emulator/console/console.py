@@ -21,9 +21,10 @@ from starhil.emulator.console.trace import RequestEncoder, WireTrace
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import log_internal_error, one_line
+from starhil.emulator.head import Head
+from starhil.emulator.run import Run
 from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 
@@ -43,36 +44,20 @@ CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "cl
 
 
 class Console:
-    """Server side of the pages of a head.
+    """Server side of the pages of a head."""
 
-    Parameters
-    ----------
-    emulation
-        Emulation of the head; it is open.
-    number
-        Number of the head, 1 for the first.
-    client
-        OBC on a link to the device; it is open.
-    stepping
-        Runs the stepped clock; shared by all heads.
-    runs
-        Session and conformance runs; shared by all heads.
-    """
-
-    def __init__(
-        self, emulation: Emulation, number: int, client: ObcClient, stepping: StepRunner, runs: Runs
-    ) -> None:
-        self._emulation = emulation
-        self._number = number
-        device = emulation.device
+    def __init__(self, run: Run, head: Head, client: ObcClient, stepping: StepRunner, runs: Runs) -> None:
+        self._run = run
+        self._head = head
+        device = head.device
         self.obc = ConsoleObc(client, device.icd)
         self.history = History()
         self.runs = runs
         runs.listeners.append(self._broadcast)
         self.trace = WireTrace(
             device.icd,
-            emulation.links,
-            lambda: None if emulation.serial is None else emulation.serial.dialect,
+            head.links,
+            lambda: None if head.serial is None else head.serial.dialect,
         )
         self.stepping = stepping
         self._requests = RequestEncoder(device.icd)
@@ -97,10 +82,10 @@ class Console:
 
     def start(self) -> None:
         """Start listening."""
-        device = self._emulation.device
+        device = self._head.device
         device.signals.frame_published.connect(self._frame_published)
         device.signals.mode_changed.connect(self._mode_changed)
-        profile = self._emulation.profile
+        profile = self._head.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
         self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, profile.epoch))
         loops = (self._deliver_trace, self._report_status, self._poll_telemetry)
@@ -126,7 +111,7 @@ class Console:
 
     async def _execute(self, request: dict[str, Any]) -> dict[str, Any]:
         """Execute a request on the control channel for this head."""
-        return await self.stepping.execute({**request, "head": self._number})
+        return await self.stepping.execute({**request, "head": self._head.number})
 
     # --- pages ---
 
@@ -142,7 +127,7 @@ class Console:
 
     def _viewers_changed(self) -> None:
         """Make previews and record traffic only while a page is open."""
-        watchers = self._emulation.imager.watchers
+        watchers = self._head.imager.watchers
         if any(viewer.frames for viewer in self.viewers):
             watchers.add(self)
         else:
@@ -160,7 +145,7 @@ class Console:
     async def welcome(self, viewer: Viewer) -> bytes:
         """Send the description of the run to a page; return the history as rows of 64-bit floats."""
         stars = await self._stars if self._stars is not None else {}
-        content = describe(self._emulation, self._number) | stars | {"session_steps": self.obc.steps}
+        content = describe(self._run, self._head) | stars | {"session_steps": self.obc.steps}
         viewer.send(json.dumps({"type": "hello", **content}))
         viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
         for message in self.runs.messages():
@@ -193,7 +178,7 @@ class Console:
                 viewer.send_frame(data)
 
     def _mode_changed(self, transition: Transition) -> None:
-        now_s = self._emulation.clock.now_ns() / NANOSECONDS
+        now_s = self._run.clock.now_ns() / NANOSECONDS
         text = f"{transition.before.value} → {transition.after.value} ({transition.cause.value})"
         self._broadcast({"type": "event", "run_s": now_s, "what": "mode", "text": text})
 
@@ -265,7 +250,7 @@ class Console:
         begins, viewer.wire = not viewer.wire, bool(request.get("wire"))
         if begins and viewer.wire:
             viewer.send(json.dumps({"type": "wire", "lines": self.trace.recent(), "left_out": 0}))
-        known = self._emulation.device.icd.telemetry
+        known = self._head.device.icd.telemetry
         viewer.rows = frozenset(name for name in rows if name in known)
         self._viewers_changed()
         return {}
@@ -277,7 +262,7 @@ class Console:
         return await self._execute(wanted)
 
     async def _point(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
-        profile = self._emulation.profile
+        profile = self._head.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
         mount = None if profile.truth.mount is None else profile.truth.mount.build()
         _table(request, "to")
@@ -286,15 +271,15 @@ class Console:
         return await self._execute(wanted)
 
     async def _set_clock(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
-        if self._emulation.leader.stepper is None:
-            raise EmulatorError(f"the clock is {self._emulation.clock.name} and cannot be stopped")
+        if self._run.stepper is None:
+            raise EmulatorError(f"the clock is {self._run.clock.name} and cannot be stopped")
         speed = request.get("speed")
         self.stepping.run(float(speed) if isinstance(speed, (int, float)) else 0.0)
         return {"speed": self.stepping.speed}
 
     async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
-        address = int(self._emulation.device.parameters[self._address])
+        address = int(self._head.device.parameters[self._address])
         return {"problem": problem, **self._requests.encode(row, data, HOST_ADDRESS, address)}
 
     async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:

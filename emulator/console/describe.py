@@ -10,9 +10,10 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.console.history import COLUMNS, MODES
-from starhil.emulator.control.faults import NO_ERROR, DeviceFault, WireFault
-from starhil.emulator.emulation import Emulation
+from starhil.emulator.faults import NO_ERROR, DeviceFault, WireFault
+from starhil.emulator.head import Head
 from starhil.emulator.profile import configs_folder
+from starhil.emulator.run import Run
 from starhil.emulator.sky.objects import SkyObjects, range_of
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
@@ -30,26 +31,20 @@ def load_bright_stars(path: str | None, epoch: float) -> dict[str, Any]:
     return {"map": stars.round(2).tolist(), "star_names": STAR_NAMES}
 
 
-def describe(emulation: Emulation, number: int) -> dict[str, Any]:
-    """Return the description of a head of a run, by its number, as JSON data."""
-    icd = emulation.device.icd
-    links = {
-        key: emulation.ready_fields[key]
-        for key in ("serial", "can", "canopen")
-        if key in emulation.ready_fields
-    }
+def describe(run: Run, head: Head) -> dict[str, Any]:
+    """Return the description of a head of a run as JSON data."""
+    icd = head.icd
+    links = {key: head.ready_fields[key] for key in ("serial", "can", "canopen") if key in head.ready_fields}
     return {
-        "head": number,
-        "heads": [
-            f"{each}: {head.profile.name}" for each, head in enumerate(emulation.leader.heads, start=1)
-        ],
+        "head": head.number,
+        "heads": [f"{each.number}: {each.profile.name}" for each in run.heads],
         "columns": COLUMNS,
         "modes": MODES,
-        "profile": emulation.profile.name,
-        "seed": emulation.profile.run.seed,
-        "clock": emulation.clock.name,
+        "profile": head.profile.name,
+        "seed": head.profile.run.seed,
+        "clock": run.clock.name,
         "links": links,
-        "camera": emulation.warm.camera if emulation.warm is not None else emulation.profile.camera.values(),
+        "camera": head.warm.camera if head.warm is not None else head.profile.camera.values(),
         "unit": {"name": icd.name, "version": icd.version},
         "telecommands": [describe_row(row, icd) for row in icd.rows if row.kind == "telecommand"],
         "telemetry": [describe_row(row, icd) for row in icd.rows if row.kind == "telemetry"],
@@ -57,7 +52,7 @@ def describe(emulation: Emulation, number: int) -> dict[str, Any]:
             {"id": item.id, "name": item.name, "unit": item.unit, "min": item.minimum, "max": item.maximum}
             for item in icd.parameters.values()
         ],
-        "faults": fault_controls(icd, [link.bus for link in emulation.links]),
+        "faults": fault_controls(icd, [link.bus for link in head.links]),
         "scenarios": sorted(path.stem for path in (configs_folder() / "scenarios").glob("*.toml")),
     }
 

@@ -35,13 +35,7 @@ Numbers = npt.NDArray[np.float64]
 
 
 class History:
-    """The latest rows, oldest first, in memory of fixed size.
-
-    Parameters
-    ----------
-    kept
-        Maximum number of rows.
-    """
+    """The latest rows, oldest first, in memory of fixed size."""
 
     def __init__(self, kept: int = KEPT_ROWS) -> None:
         self._rows: Numbers = np.zeros((kept, len(COLUMNS)))

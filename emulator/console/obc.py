@@ -14,7 +14,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import InterfaceDefinition
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError, Value
 
 Bus = Literal["can", "canopen", "serial"]
@@ -41,10 +41,6 @@ class Exchange:
         The outcome in one line; empty if it is `ok`.
     latency_s
         Time from request to reply, seconds; None without a reply.
-    data
-        Data of the reply.
-    refused
-        Whether the device refused the request.
     """
 
     outcome: str
@@ -75,8 +71,6 @@ class ObcPort:
     ----------
     bus
         `can`, `canopen` or `serial`.
-    where
-        Channel or port.
     icd
         Interface definition of the device.
     device_address
@@ -113,12 +107,8 @@ class ConsoleObc:
 
     Parameters
     ----------
-    client
-        OBC on a link.
     icd
         Interface definition of the device.
-    clock
-        Returns a monotonic time in seconds.
     """
 
     def __init__(
@@ -145,11 +135,6 @@ class ConsoleObc:
         -------
         row, data, values, problem
             The row, its bytes, the values by field, and a violation of the definition, or an empty text.
-
-        Raises
-        ------
-        EmulatorError
-            The type of a field cannot hold its value.
         """
         row = self._row("telecommand", name)
         try:
@@ -168,13 +153,7 @@ class ConsoleObc:
         return row, data, physical, ""
 
     async def send(self, name: str, values: Mapping[str, Any]) -> Exchange:
-        """Send a telecommand.
-
-        Raises
-        ------
-        EmulatorError
-            A value cannot be encoded; nothing was sent.
-        """
+        """Send a telecommand."""
         row, data, physical, _ = self.encode(name, values)
         return await self._exchange(row, data, physical)
 
@@ -203,13 +182,7 @@ class ConsoleObc:
         return rows[name]
 
     def session(self, title: str) -> str:
-        """Return the recorded transactions as a session script (TOML); pauses between them become waits.
-
-        Raises
-        ------
-        EmulatorError
-            Nothing was sent.
-        """
+        """Return the recorded transactions as a session script (TOML); pauses between them become waits."""
         if not self._steps:
             raise EmulatorError("nothing has been sent yet: send a telecommand or read a row first")
         lines = [f"title = {toml(title)}", "", "[defaults]", "timeout_s = 2.0"]

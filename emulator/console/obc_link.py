@@ -6,38 +6,32 @@ import os
 from collections.abc import Callable
 
 from starhil.emulator.console.obc import Bus, MakeClient, ObcClient, ObcPort
-from starhil.emulator.emulation import Emulation
+from starhil.emulator.head import Head
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.protocol.icd import InterfaceDefinition
 
 
-async def open_obc(
-    emulation: Emulation, make_client: MakeClient, closers: list[Callable[[], object]]
-) -> ObcClient:
+async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[], object]]) -> ObcClient:
     """Open an OBC on the CAN bus of the run, or on a separate link if the run has no CAN bus.
 
     Parameters
     ----------
-    emulation
-        The emulation; it is open.
-    make_client
-        Makes the OBC.
     closers
         Receives a function to close each opened resource, in order of opening.
     """
-    icd, parameters = emulation.icd, emulation.device.parameters
+    icd, parameters = head.icd, head.device.parameters
     separate: Link | None = None
     where, bus = "", obc_bus(icd)
     if bus == "serial":
         from starhil.protocol.transports.serial import open_serial
 
-        separate = SerialLink(emulation.requests, open_serial("auto", paced=False))
-    elif emulation.canopen if icd.canopen_only else emulation.can:
-        where = emulation.ready_fields["can"]
+        separate = SerialLink(head.requests, open_serial("auto", paced=False))
+    elif head.canopen if icd.canopen_only else head.can:
+        where = head.ready_fields["can"]
     else:
-        separate = _open_virtual_bus(emulation)
+        separate = _open_virtual_bus(head)
     if separate is not None:
         closers.append(separate.close)
         where = await separate.start()
@@ -55,16 +49,16 @@ async def open_obc(
     return client
 
 
-def _open_virtual_bus(emulation: Emulation) -> Link:
+def _open_virtual_bus(head: Head) -> Link:
     """Return a link of the device to a private virtual CAN bus."""
     from starhil.protocol.transports.can import open_can
 
-    transport = open_can(f"virtual:starhil-console-{os.getpid()}-{id(emulation)}")
-    if not emulation.icd.canopen_only:
-        return CanLink(emulation.requests, transport)
+    transport = open_can(f"virtual:starhil-console-{os.getpid()}-{id(head)}")
+    if not head.icd.canopen_only:
+        return CanLink(head.requests, transport)
     from starhil.emulator.links.canopen import CanopenLink
 
-    return CanopenLink(emulation.requests, transport)
+    return CanopenLink(head.requests, transport)
 
 
 def obc_bus(icd: InterfaceDefinition) -> Bus:

@@ -42,11 +42,6 @@ def pointing_request(
         Rotation body→sensor; None if the frames are equal.
     catalog_path, epoch
         The star catalogue.
-
-    Raises
-    ------
-    EmulatorError
-        Star or kind is unknown, or a value is out of range.
     """
     to_body = np.eye(3) if mount is None else mount.matrix.T
     here = Attitude(np.array(truth["quaternion_xyzw"]))
@@ -93,13 +88,7 @@ def _target(to: dict[str, Any], here: Attitude, catalog_path: str | None, epoch:
 
 
 def find_star(text: str, catalog_path: str | None, epoch: float) -> tuple[float, float]:
-    """Return right ascension and declination, degrees, of a star by name or Hipparcos number.
-
-    Raises
-    ------
-    EmulatorError
-        The star is unknown.
-    """
+    """Return right ascension and declination, degrees, of a star by name or Hipparcos number."""
     wanted = text.strip()
     named = {name.lower(): hip for hip, name in STAR_NAMES.items()}
     number = _HIP.fullmatch(wanted)

@@ -21,8 +21,8 @@ from starhil.emulator.console.history import COLUMNS, MODES, History, json_row
 from starhil.emulator.console.obc import ObcClient, decode
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.guard import log_internal_error
+from starhil.emulator.head import Head
 from starhil.emulator.output_file import OutputFile
 
 log = logging.getLogger("starhil.record")
@@ -76,33 +76,14 @@ INFO: Final = 2
 
 
 class McapRecorder:
-    """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows.
+    """Records a run. Log times are simulation time since `run.start_unix_s`, whatever the device's clock shows."""
 
-    Parameters
-    ----------
-    emulation
-        The emulation; it has been started.
-    client
-        OBC client that reads the telemetry.
-    path
-        File to write.
-    overwrite
-        Whether to replace an existing file.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, or exists and is not empty.
-    """
-
-    def __init__(
-        self, emulation: Emulation, client: ObcClient, path: Path, *, overwrite: bool = False
-    ) -> None:
-        self._emulation = emulation
+    def __init__(self, head: Head, client: ObcClient, path: Path, *, overwrite: bool = False) -> None:
+        self._head = head
         self._client = client
         self._history = History(1)
         self._room = threading.Semaphore(MAX_PENDING)
-        self._start_ns = round(emulation.profile.run.start_unix_s * NANOSECONDS)
+        self._start_ns = round(head.profile.run.start_unix_s * NANOSECONDS)
         """Unix time of the start of the simulation, to which all log times refer."""
         self._stamp_missing = False
         self.dropped = 0
@@ -125,15 +106,15 @@ class McapRecorder:
 
     def start(self) -> None:
         """Start recording."""
-        emulation = self._emulation
-        emulation.imager.watchers.add(self)
-        emulation.device.signals.frame_published.connect(self._record_frame)
-        emulation.device.signals.mode_changed.connect(self._record_mode)
+        head = self._head
+        head.imager.watchers.add(self)
+        head.device.signals.frame_published.connect(self._record_frame)
+        head.device.signals.mode_changed.connect(self._record_mode)
         self._task = asyncio.create_task(self._record_telemetry())
 
     async def close(self) -> None:
         """Write pending messages and the index, and close the file."""
-        self._emulation.imager.watchers.discard(self)
+        self._head.imager.watchers.discard(self)
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -173,14 +154,14 @@ class McapRecorder:
         self._write("/measurement", "starhil.Measurement", at_ns, values)
 
     def _record_mode(self, transition: Transition) -> None:
-        device = self._emulation.device
+        device = self._head.device
         text = f"mode {transition.before.value} → {transition.after.value} ({transition.cause.value})"
         content = {**self._stamp(device.time.unix_ns()), "level": INFO, "message": text, "name": "device"}
         self._write("/events", "foxglove.Log", device.clock.now_ns(), content)
 
     async def _record_telemetry(self) -> None:
         """Read the telemetry rows in turn."""
-        device = self._emulation.device
+        device = self._head.device
         rows = list(device.icd.telemetry.values())
         while True:
             for row in rows:

@@ -51,13 +51,7 @@ class Runs:
         self._runs: OrderedDict[str, Run] = OrderedDict()
 
     def report(self, event: object) -> None:
-        """Record a report of a run: its begin, a result or its end.
-
-        Raises
-        ------
-        EmulatorError
-            The report is invalid.
-        """
+        """Record a report of a run: its begin, a result or its end."""
         if not isinstance(event, dict) or not isinstance(event.get("run"), str):
             raise EmulatorError("report: must be an object with `run` and `event`")
         match event.get("event"):

@@ -68,8 +68,6 @@ class ConsoleServer:
 
     Parameters
     ----------
-    consoles
-        A console for each head; they have been started.
     token
         Token that the address of every page must contain; by default a random one.
     """
@@ -81,13 +79,7 @@ class ConsoleServer:
         self._listener: asyncio.Server | None = None
 
     async def start(self, where: str) -> str:
-        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page.
-
-        Raises
-        ------
-        EmulatorError
-            The port is in use, or `where` is not an address.
-        """
+        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page."""
         host, port = parse_address(where)
         app = web.Application(middlewares=[self._guard], client_max_size=LARGEST_REPORT)
         for path in ("/", "/runs"):
@@ -133,6 +125,8 @@ class ConsoleServer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject other origins and, except for static files, requests without the token."""
+        if not all(value.isascii() for value in request.headers.values()):  # aiohttp fails on some of them
+            return web.Response(status=400, text="400: a header is not ASCII\n", headers=HEADERS)
         if not _is_same_origin(request):
             return web.Response(
                 status=403, text="403: the request comes from a page of another origin\n", headers=HEADERS
@@ -289,13 +283,7 @@ def _download(text: str, name: str, kind: str) -> web.Response:
 
 
 def parse_address(where: str) -> tuple[str, int]:
-    """Return host and port of `auto` or HOST:PORT.
-
-    Raises
-    ------
-    EmulatorError
-        The address is invalid.
-    """
+    """Return host and port of `auto` or HOST:PORT."""
     if where == "auto":
         return "127.0.0.1", 0
     host, _, port = where.rpartition(":")

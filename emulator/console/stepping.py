@@ -19,13 +19,7 @@ FASTEST: Final = 100.0
 
 
 class StepRunner:
-    """Steps the clock until it is paused.
-
-    Parameters
-    ----------
-    execute
-        Executes requests on the control channel.
-    """
+    """Steps the clock until it is paused."""
 
     def __init__(self, execute: Execute) -> None:
         self.execute = execute
@@ -34,13 +28,7 @@ class StepRunner:
         """Simulation seconds per second; 0 while paused."""
 
     def run(self, speed: float) -> None:
-        """Run at a speed; 0 pauses.
-
-        Raises
-        ------
-        EmulatorError
-            The speed is out of range.
-        """
+        """Run at a speed; 0 pauses."""
         if not 0.0 <= speed <= FASTEST:
             raise EmulatorError(f"speed: {speed:g} is outside 0 … {FASTEST:g}")
         self.pause()

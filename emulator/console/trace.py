@@ -28,8 +28,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_interface import HostEnd
+from starhil.protocol.serial_interface import Dialect, HostEnd
 from starhil.protocol.serial_stack import build_serial_stack
 
 KEPT_ITEMS: Final = 20_000
@@ -84,17 +83,7 @@ class WireItem:
 
 
 class WireTrace:
-    """Records the traffic on the device's links while a console page is open.
-
-    Parameters
-    ----------
-    icd
-        Interface definition, for the names.
-    links
-        Links of the device.
-    dialect
-        Returns the current dialect of serial replies; None for a unit without dialects.
-    """
+    """Records the traffic on the device's links while a console page is open."""
 
     def __init__(
         self, icd: InterfaceDefinition, links: Sequence[Link], dialect: Callable[[], Dialect | None]
@@ -159,15 +148,7 @@ class WireTrace:
 
 
 class Decoder:
-    """Decodes the items of a trace, in order.
-
-    Parameters
-    ----------
-    icd
-        Interface definition.
-    dialect
-        Returns the current dialect of serial replies; None for a unit without dialects.
-    """
+    """Decodes the items of a trace, in order."""
 
     def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect | None]) -> None:
         self._icd = icd
@@ -291,13 +272,7 @@ def canopen_text(frame: CanFrame) -> str:
 
 
 class RequestEncoder:
-    """Encodes telecommands for the links of a unit.
-
-    Parameters
-    ----------
-    icd
-        Interface definition.
-    """
+    """Encodes telecommands for the links of a unit."""
 
     def __init__(self, icd: InterfaceDefinition) -> None:
         self._icd = icd

@@ -23,11 +23,6 @@ class Socket(Protocol):
 class Viewer:
     """The server side of a page; a page that reads too slowly loses messages but delays nothing.
 
-    Parameters
-    ----------
-    socket
-        Connection to the page.
-
     Attributes
     ----------
     frames, wire

@@ -37,8 +37,7 @@ import hmac
 import json
 import logging
 from collections import deque
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,17 +45,17 @@ import numpy as np
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.measurement import Measurement, as_quaternion
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import until_cancelled
+from starhil.emulator.head import Head
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
+from starhil.emulator.run import Run
 from starhil.emulator.truth.config import FixedConfig, TruthConfig
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth.source import TruthState
 from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError, reason
@@ -72,42 +71,19 @@ BUSY: Final = b'{"ok": false, "error": "too many connections to the control chan
 Answer = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class ControlTarget:
-    """A head that the control channel controls.
-
-    Attributes
-    ----------
-    emulation
-        Emulation of the head; it is open.
-    faults
-        Faults of the head.
-    frames
-        Latest measurements of the head.
-    """
-
-    emulation: Emulation
-    faults: Faults
-    frames: deque[Measurement] = field(default_factory=lambda: deque(maxlen=KEPT_FRAMES))
-
-
 class ControlServer:
     """Serves the control channel of a run.
 
     Parameters
     ----------
-    targets
-        The heads of the run.
-    quit_run
-        Called to end the run.
     token
         Token that each request must carry; empty for none.
     """
 
-    def __init__(
-        self, targets: Sequence[ControlTarget], quit_run: Callable[[], None], token: str = ""
-    ) -> None:
-        self._targets = targets
+    def __init__(self, run: Run, quit_run: Callable[[], None], token: str = "") -> None:
+        self._run = run
+        self._frames = {head.number: deque[Measurement](maxlen=KEPT_FRAMES) for head in run.heads}
+        """Latest measurements by number of the head."""
         self._token = token
         self._socket: ControlSocket | None = None
         self._opening = asyncio.Lock()
@@ -115,7 +91,7 @@ class ControlServer:
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("control channel", BUSY)
-        self._actions: dict[str, Callable[[ControlTarget, dict[str, Any]], Awaitable[Answer]]] = {
+        self._actions: dict[str, Callable[[Head, dict[str, Any]], Awaitable[Answer]]] = {
             "status": self._status,
             "truth": self._truth,
             "frames": self._last_frames,
@@ -126,17 +102,11 @@ class ControlServer:
             "scenario": self._run_scenario,
             "quit": self._quit_run,
         }
-        for target in targets:
-            target.emulation.device.signals.frame_published.connect(target.frames.append)
+        for head in run.heads:
+            head.device.signals.frame_published.connect(self._frames[head.number].append)
 
     async def start(self, where: str) -> str:
-        """Listen on `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT.
-
-        Raises
-        ------
-        EmulatorError
-            The path or port is in use, or `where` is not an address.
-        """
+        """Listen on `auto`, unix:/PATH or HOST:PORT; return unix:/PATH or HOST:PORT."""
         if where == "auto" or where.startswith("unix:"):
             path = automatic_path() if where == "auto" else Path(where.removeprefix("unix:"))
             self._socket = ControlSocket(path)
@@ -214,10 +184,10 @@ class ControlServer:
         if action is None:
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
         try:
-            target = self._target(request)
-            if target.emulation.tape is not None:
-                target.emulation.tape.latch()
-            return {"ok": True, **await action(target, request)}
+            head = self._head(request)
+            if self._run.recorder is not None:
+                self._run.recorder.latch()
+            return {"ok": True, **await action(head, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
             return {"ok": False, "error": str(error)}
         except Exception as error:  # an internal error ends neither the run nor the connection
@@ -230,58 +200,58 @@ class ControlServer:
             return True
         return isinstance(token, str) and hmac.compare_digest(token.encode(), self._token.encode())
 
-    def _target(self, request: dict[str, Any]) -> ControlTarget:
+    def _head(self, request: dict[str, Any]) -> Head:
         """Return the head that a request selects."""
-        number = request.pop("head", 1)
-        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(self._targets):
-            raise EmulatorError(f"head: must be 1 to {len(self._targets)}, not {number!r}")
-        return self._targets[number - 1]
+        number, heads = request.pop("head", 1), self._run.heads
+        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= len(heads):
+            raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
+        return heads[number - 1]
 
-    async def _status(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _status(self, head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request)
-        emulation, device = target.emulation, target.emulation.device
-        truth = _state(emulation, device.clock.now_ns())
-        feed = emulation.leader.body_truth
+        profile, device = head.profile, head.device
+        truth = device.surroundings.truth.state(device.clock.now_ns() / NANOSECONDS)
+        source = self._run.truth.source
         answer: Answer = {
             "mode": device.modes.mode.value,
             "error_cause": device.modes.error,
             "run_time_s": device.clock.now_ns() / NANOSECONDS,
             "unix_s": device.time.unix_ns() / NANOSECONDS,
-            "seed": emulation.profile.run.seed,
+            "seed": profile.run.seed,
             "clock": device.clock.name,
-            "profile": emulation.profile.name,
-            "algorithm": emulation.profile.run.algorithm,
+            "profile": profile.name,
+            "algorithm": profile.run.algorithm,
             "frames": device.cycle.published,
             "frames_valid": device.frames_valid,
             "frames_left_out": device.cycle.skipped,
             "telecommands": device.counters.telecommands,
             "telemetry": device.counters.telemetry,
             "link_faults": {kind.value: count for kind, count in device.counters.faults.items()},
-            "truth_kind": feed.kind,
+            "truth_kind": source.kind,
             "truth_status": truth.status.value,
-            "faults": target.faults.describe(),
+            "faults": head.faults.describe(),
         }
-        if len(self._targets) > 1:
-            answer["heads"] = len(self._targets)
-        if isinstance(feed, LiveTruth):
+        if len(self._run.heads) > 1:
+            answer["heads"] = len(self._run.heads)
+        if isinstance(source, LiveTruth):
             answer["feed"] = {
-                "accepted": feed.accepted,
-                "refused": feed.refused,
-                "last_fault": feed.last_fault,
-                "speed": feed.speed.ratio,
-                "address": emulation.leader.ready_fields.get("truth", ""),
+                "accepted": source.accepted,
+                "refused": source.refused,
+                "last_fault": source.last_fault,
+                "speed": source.speed.ratio,
+                "address": self._run.truth.address,
             }
         return answer
 
-    async def _truth(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _truth(self, head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request, "run_time_s", "unix_s")
-        device = target.emulation.device
+        device = head.device
         run_ns = device.clock.now_ns()
         if "run_time_s" in request:
             run_ns = round(_number(request, "run_time_s") * NANOSECONDS)
         elif "unix_s" in request:
             run_ns = round(_number(request, "unix_s") * NANOSECONDS) - device.time.offset_ns
-        state = _state(target.emulation, run_ns)
+        state = device.surroundings.truth.state(run_ns / NANOSECONDS)
         return {
             "run_time_s": run_ns / NANOSECONDS,
             "unix_s": device.time.unix_ns(run_ns) / NANOSECONDS,
@@ -293,71 +263,57 @@ class ControlServer:
             "status": state.status.value,
         }
 
-    async def _last_frames(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _last_frames(self, head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request, "count")
         count = int(_number(request, "count", 1.0))
         if not 1 <= count <= KEPT_FRAMES:
             raise EmulatorError(f"count: {count} is outside 1 … {KEPT_FRAMES}")
-        return {"frames": [compare(measurement) for measurement in list(target.frames)[-count:]]}
+        return {"frames": [compare(measurement) for measurement in list(self._frames[head.number])[-count:]]}
 
-    async def _set_truth(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _set_truth(self, _head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request, "truth")
-        config = target.emulation.leader.profile.truth
+        config = self._run.truth.configured
         if "truth" in request:
             if not isinstance(request["truth"], dict):
                 raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
             config = _parse(_TRUTH, _Truth, request["truth"], "truth")
         async with self._opening:  # reading a file takes time, so the last request wins
-            await target.emulation.change_truth(config)
-        return {"kind": config.kind, "address": target.emulation.leader.ready_fields.get("truth", "")}
+            await self._run.truth.set(config)
+        return {"kind": config.kind, "address": self._run.truth.address}
 
-    async def _step(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _step(self, _head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request, "seconds")
-        emulation = target.emulation.leader
-        stepper = emulation.stepper
+        clock, stepper = self._run.clock, self._run.stepper
         if stepper is None:
-            raise EmulatorError(f"step: the clock is {emulation.clock.name}; run with --clock stepped")
+            raise EmulatorError(f"step: the clock is {clock.name}; run with --clock stepped")
         await stepper.step(_number(request, "seconds"))
-        return {"run_time_s": emulation.clock.now_ns() / NANOSECONDS}
+        return {"run_time_s": clock.now_ns() / NANOSECONDS}
 
-    async def _fault(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
         wanted = _parse(_FAULT, FaultRequest, request)
-        target.faults.check(wanted)
-        _record_command(target, "fault", request=request)
-        target.faults.inject(wanted)
-        return {"faults": target.faults.describe()}
+        head.faults.check(wanted)
+        self._run.record("fault", request=request)
+        head.faults.inject(wanted)
+        return {"faults": head.faults.describe()}
 
-    async def _clear_faults(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _clear_faults(self, head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request)
-        _record_command(target, "clear_faults")
-        target.faults.clear()
-        return {"faults": target.faults.describe()}
+        self._run.record("clear_faults")
+        head.faults.clear()
+        return {"faults": head.faults.describe()}
 
-    async def _run_scenario(self, target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _run_scenario(self, head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request, "name")
-        emulation = target.emulation
-        if emulation.tape is not None:
+        if self._run.recorder is not None:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
-        scheduler, clock = emulation.device.scheduler, emulation.clock
-        set_truth, folder = emulation.leader.set_truth, emulation.profile.folder
-        scenario.enter(scheduler, target.faults, set_truth, folder, start_s=clock.now_ns() / NANOSECONDS)
+        scenario.enter(head, self._run.truth, start_s=self._run.clock.now_ns() / NANOSECONDS)
         return {"events": len(scenario.at)}
 
-    async def _quit_run(self, _target: ControlTarget, request: dict[str, Any]) -> Answer:
+    async def _quit_run(self, _head: Head, request: dict[str, Any]) -> Answer:
         _check_keys(request)
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
-
-
-def _record_command(target: ControlTarget, kind: str, **values: Any) -> None:
-    """Record a command on the tape, if there is one."""
-    if target.emulation.tape is not None:
-        target.emulation.tape.enter(kind, **values)
-
-
-def _state(emulation: Emulation, run_ns: int) -> TruthState:
-    return emulation.device.surroundings.truth.state(run_ns / NANOSECONDS)
 
 
 class _Truth(BaseModel):

@@ -20,27 +20,25 @@ cannot set a live feed, because opening a socket takes time.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.control.faults import FaultRequest, Faults
-from starhil.emulator.device.scheduler import Action, Scheduler
+from starhil.emulator.device.scheduler import Action
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.faults import FaultRequest
+from starhil.emulator.head import Head
 from starhil.emulator.profile import configs_folder
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
-from starhil.emulator.truth.source import TruthSource
+from starhil.emulator.truth.truth import Truth
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import reason
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
-
-SetTruth = Callable[[TruthSource, TruthConfig], None]
 
 
 class ScenarioEvent(Strict):
@@ -63,20 +61,20 @@ class ScenarioEvent(Strict):
             raise ValueError("a scenario cannot set a live feed; set it in the profile")  # noqa: TRY004
         return self
 
-    def prepare(self, faults: Faults, set_truth: SetTruth, folder: Path, at_s: float) -> Action:
+    def prepare(self, head: Head, truth: Truth | None, at_s: float) -> Action:
         """Return the action of the event; files and values are read and checked now."""
+        faults, config = head.faults, self.truth
         if self.fault is not None:
             faults.check(self.fault)
-        config = self.truth
-        truth = None if config is None else config.build(at_s, folder)
+        source = None if config is None else config.build(at_s, head.profile.folder)
 
         def act(_due_ns: int) -> None:
             if self.clear_faults:
                 faults.clear()
             if self.fault is not None:
                 faults.inject(self.fault)
-            if config is not None and truth is not None:
-                set_truth(truth, config)
+            if config is not None and source is not None and truth is not None:
+                truth.put(source, config)
             log.info("scenario at %g s", at_s)
 
         return act
@@ -90,51 +88,29 @@ class Scenario(Strict):
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
     """Events, in any order."""
 
-    def enter(
-        self,
-        scheduler: Scheduler,
-        faults: Faults,
-        set_truth: SetTruth,
-        folder: Path,
-        start_s: float = 0.0,
-    ) -> None:
+    def enter(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> None:
         """Schedule all events; their files are read and checked now.
 
         Parameters
         ----------
-        scheduler
-            Scheduler of the device.
-        faults
-            Faults of the run, whose links are open.
-        set_truth
-            Called with a new truth source and its configuration.
-        folder
-            Folder to which relative paths of truth files refer.
+        head
+            The head that the faults affect; its links are open.
+        truth
+            The truth of the run; None if another head sets it.
         start_s
             Simulation time to which the times of the events are added, seconds.
-
-        Raises
-        ------
-        EmulatorError
-            An event refers to a link that this run does not have, or to a file that cannot be read.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             at_s = start_s + event.run_time_s
             try:
-                action = event.prepare(faults, set_truth, folder, at_s)
+                action = event.prepare(head, truth, at_s)
             except (EmulatorError, StaridError) as error:
                 raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
-            scheduler.at(round(at_s * NANOSECONDS), action)
+            head.device.scheduler.at(round(at_s * NANOSECONDS), action)
 
 
 def load_scenario(name_or_path: str) -> Scenario:
-    """Read a scenario from a path, or by the name of one in `configs/scenarios`.
-
-    Raises
-    ------
-    EmulatorError
-        The file is missing or invalid; one line with file, key and remedy.
-    """
+    """Read a scenario from a path, or by the name of one in `configs/scenarios`."""
     try:
         path = Path(name_or_path).expanduser()
         if "/" not in name_or_path and not name_or_path.endswith(".toml"):

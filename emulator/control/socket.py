@@ -19,13 +19,7 @@ PRIVATE_SOCKET: Final = 0o600
 
 
 class ControlSocket:
-    """A listening socket and its file.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be created, is not a socket, or another program listens on it.
-    """
+    """A listening socket and its file."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_absolute() or any(character.isspace() or character == "\0" for character in str(path)):
@@ -85,13 +79,7 @@ class ControlSocket:
 
 
 def automatic_path() -> Path:
-    """Return the default socket path of this process, in a folder private to its user.
-
-    Raises
-    ------
-    EmulatorError
-        The folder cannot be created, or belongs to another user.
-    """
+    """Return the default socket path of this process, in a folder private to its user."""
     base = Path(os.environ.get("XDG_RUNTIME_DIR") or "/nonexistent")
     if _is_own_folder(base):
         folder = base / "starhil"

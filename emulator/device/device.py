@@ -69,30 +69,7 @@ def run_at_once(work: Callable[[], None], done: Callable[[EmulatorError | None],
 
 
 class Device:
-    """A star sensor without its links.
-
-    Parameters
-    ----------
-    profile
-        Profile of the unit.
-    icd
-        Interface definition.
-    clock
-        Clock of the simulation time.
-    imager
-        Renders and solves the images.
-    store
-        Stores the state that survives a restart.
-    truth
-        Source of the true attitude.
-    background
-        Runs slow writes.
-
-    Raises
-    ------
-    EmulatorError
-        A parameter in the profile is unknown or out of its limits.
-    """
+    """A star sensor without its links."""
 
     def __init__(
         self,
@@ -346,13 +323,7 @@ def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
-    """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`.
-
-    Raises
-    ------
-    EmulatorError
-        The table contains an unknown parameter.
-    """
+    """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`."""
     links = profile.links
     serial, unit_serial = links.serial, icd.link.serial
     baud = serial.baud if unit_serial is None or "baud" in serial.model_fields_set else unit_serial.baud

@@ -46,15 +46,7 @@ class FileInfo(NamedTuple):
 
 
 class FileDownload:
-    """The list of files, the loaded block, and the map of its packets that have arrived.
-
-    Parameters
-    ----------
-    images
-        The stored images.
-    now_ns
-        Returns the simulation time.
-    """
+    """The list of files, the loaded block, and the map of its packets that have arrived."""
 
     def __init__(self, images: ImageStore, now_ns: Callable[[], int]) -> None:
         self._images = images

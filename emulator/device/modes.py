@@ -69,13 +69,7 @@ class Transition:
 
 
 class Modes:
-    """The current mode, and the rules for changing it.
-
-    Parameters
-    ----------
-    on_change
-        Called after each change.
-    """
+    """The current mode, and the rules for changing it."""
 
     def __init__(self, on_change: Callable[[Transition], None] | None = None) -> None:
         self.mode = Mode.BOOT
@@ -88,8 +82,6 @@ class Modes:
 
         Parameters
         ----------
-        wanted
-            The commanded mode.
         has_attitude
             Whether there is an attitude from which tracking can start.
         """

@@ -17,13 +17,6 @@ ParameterValue = bool | int | float | str
 def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> NDArray[np.float64] | None:
     """Return the velocity (3,) that the device assumes, relative to the barycentre, ICRS, m/s.
 
-    Parameters
-    ----------
-    parameters
-        Parameters of the device.
-    unix_s
-        Unix time on the device's clock.
-
     Returns
     -------
     ndarray (3,) or None

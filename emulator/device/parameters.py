@@ -77,17 +77,10 @@ class Parameters(Mapping[str, ParameterValue]):
 
     Parameters
     ----------
-    icd
-        Interface definition, with names, types and limits.
     defaults
         Defaults of this device that differ from the definition.
     on_change
         Called after each change with the names of the changed parameters.
-
-    Raises
-    ------
-    EmulatorError
-        A default is unknown or outside its limits.
     """
 
     def __init__(

@@ -27,11 +27,6 @@ class Requests:
     """Executes telecommands and answers telemetry requests for the rows of the interface definition.
 
     Refusals carry an `ErrorCode`; each link translates it for its bus.
-
-    Parameters
-    ----------
-    device
-        The device that executes the requests.
     """
 
     def __init__(self, device: Device) -> None:

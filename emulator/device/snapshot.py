@@ -32,13 +32,7 @@ class once(Generic[Result]):  # noqa: N801 (used like a function)
 
 
 class Snapshot:
-    """The device at the moment of a request.
-
-    Attributes
-    ----------
-    device
-        The device.
-    """
+    """The device at the moment of a request."""
 
     def __init__(self, device: Device) -> None:
         self.device = device

@@ -61,13 +61,7 @@ class MemoryStore:
 
 
 class FileStore:
-    """State in a folder, which only one process at a time can use.
-
-    Raises
-    ------
-    EmulatorError
-        The folder cannot be created or written, or another emulator uses it.
-    """
+    """State in a folder, which only one process at a time can use."""
 
     def __init__(self, folder: Path) -> None:
         self.corrupt = False

@@ -32,14 +32,8 @@ class Surroundings:
 
     Parameters
     ----------
-    profile
-        Date, orbit, radiation and sky.
     truth
         Truth of the sensor; what it describes may change during a run.
-    thermal
-        Temperature of the unit.
-    now_ns
-        Returns the simulation time, nanoseconds.
 
     Attributes
     ----------
@@ -86,13 +80,7 @@ class Surroundings:
 
 
 def orbit_of(profile: Profile) -> Orbit | None:
-    """Return the true orbit of a profile, or None.
-
-    Raises
-    ------
-    EmulatorError
-        The values do not describe an orbit.
-    """
+    """Return the true orbit of a profile, or None."""
     if profile.orbit is None:
         return None
     try:

@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import resource
 import shutil
+import signal
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
 from pydantic import TypeAdapter
 
-from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
-from starhil.emulator.control.faults import FaultRequest, Faults
-from starhil.emulator.device.device import Background
-from starhil.emulator.emulation import Emulation
+from starhil.emulator.clock import NANOSECONDS, SteppedClock
+from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.endurance.simulated_loop import WORKER_WAIT_S
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.faults import FaultRequest
+from starhil.emulator.head import Head
 from starhil.emulator.pipeline.error_model import ErrorModelImager
-from starhil.emulator.pipeline.imager import Imager
+from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import MAX_STEP_S, StepPump
 from starhil.emulator.replay import prepare_recording
-from starhil.emulator.tape import TRUTH_FILE, Recorder
+from starhil.emulator.run import Run
+from starhil.emulator.tape import TRUTH_FILE, Recorder, Wiring
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.can_framing import CanFrame
@@ -33,6 +38,8 @@ from starhil.protocol.transports.paced import SerialTransport
 Item = TypeVar("Item", bytes, CanFrame)
 
 STATE_FOLDER: Final = "state"
+LONGEST_START_S: Final = 120.0
+"""Longest wall time for which a killed pipeline may take to be missed, or to be ready again, seconds."""
 TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 
 
@@ -42,16 +49,17 @@ class MemoryTransport(Transport[Item]):
     Attributes
     ----------
     sent
-        Items that the device has sent and nobody has taken.
+        Items that the device has sent and nobody has taken, each with its time, seconds.
     reads
         Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader.
     """
 
     immediate: ClassVar[bool] = True
 
-    def __init__(self, description: str) -> None:
+    def __init__(self, description: str, now_s: Callable[[], float]) -> None:
         super().__init__(description)
-        self.sent: list[Item] = []
+        self._now_s = now_s
+        self.sent: list[tuple[float, Item]] = []
         self.reads = True
 
     async def _open(self) -> None:
@@ -64,7 +72,7 @@ class MemoryTransport(Transport[Item]):
             self.statistics.dropped += count
             return False
         self.statistics.sent += count
-        self.sent.append(item)
+        self.sent.append((self._now_s(), item))
         return True
 
     def deliver(self, item: Item) -> None:
@@ -85,53 +93,23 @@ class MemorySerial(MemoryTransport[bytes], SerialTransport):
         """Do nothing: bytes take no time."""
 
 
-class MemoryTape:
-    """Connects an emulation to transports in memory, and records it if a recorder is given."""
+class MemoryWiring(Wiring):
+    """Connects a run to transports in memory."""
 
-    plays: Final = False
+    repeatable = True
 
-    def __init__(
-        self, port: MemorySerial, buses: Mapping[str, MemoryTransport[CanFrame]], recorder: Recorder | None
-    ) -> None:
-        self.port = port
+    def __init__(self, port: MemorySerial, buses: Mapping[str, MemoryTransport[CanFrame]]) -> None:
+        super().__init__(SteppedClock())
+        self._port = port
         self._buses = buses
-        self._recorder = recorder
-        self.clock: Clock = SteppedClock() if recorder is None else recorder.clock
-
-    def begin(self) -> None:
-        """Begin: time passes."""
-        if self._recorder is not None:
-            self._recorder.begin()
-
-    def latch(self) -> None:
-        """Do nothing: the clock is stepped."""
-
-    def write(self, kind: str, **values: Any) -> None:
-        """Record an entry."""
-        if self._recorder is not None:
-            self._recorder.write(kind, **values)
-
-    def enter(self, kind: str, **values: Any) -> None:
-        """Record an entry."""
-        self.write(kind, **values)
 
     def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
         """Return the serial line."""
-        port = self.port
-        return port if self._recorder is None else self._recorder.serial(lambda: port)
+        return self._port
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (no bus is opened)
         """Return a CAN bus."""
-        bus = self._buses[name]
-        return bus if self._recorder is None else self._recorder.can(name, lambda: bus)
-
-    def imager(self, inner: Imager) -> Imager:
-        """Return the pipeline."""
-        return inner if self._recorder is None else self._recorder.imager(inner)
-
-    def background(self, inner: Background) -> Background:
-        """Return the function that runs writes."""
-        return inner if self._recorder is None else self._recorder.background(inner)
+        return self._buses[name]
 
 
 class _InternalErrors(logging.Handler):
@@ -164,10 +142,14 @@ class UnitUnderTest:
     folder
         Folder of the state, best in memory (tmpfs).
     rendered
-        Whether images are rendered and solved; otherwise the pipeline is an error model.
+        Whether images are rendered and solved, in a process; otherwise the pipeline is an error model.
     record
         Folder of a recording, which holds the time since power was last switched on.
 
+    Attributes
+    ----------
+    frames, exposed_s
+        Number of images solved in all, and the sum of their periods, seconds.
     """
 
     def __init__(
@@ -187,7 +169,7 @@ class UnitUnderTest:
             **profile.get("run", {}),
             "seed": seed,
             "clock": "stepped",
-            "worker": "thread" if rendered else "error_model",
+            "worker": "process" if rendered else "error_model",
             "state_dir": str(folder.resolve() / STATE_FOLDER),
         }
         channels: dict[str, Any] = {
@@ -200,60 +182,60 @@ class UnitUnderTest:
         self._record = record
         self._recorder: Recorder | None = None
         self._truth_log: TruthLog | None = None
-        self._emulation: Emulation | None = None
-        self._faults: Faults | None = None
+        self._run: Run | None = None
+        self.frames = 0
+        self.exposed_s = 0.0
         self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
         self._transports: dict[str, MemoryTransport[Any]] = {}
         self._errors = _InternalErrors()
         logging.getLogger("starhil.internal").addHandler(self._errors)
 
     @property
-    def emulation(self) -> Emulation:
-        """The emulation; power must be on."""
-        if self._emulation is None:
+    def run(self) -> Run:
+        """The run; power must be on."""
+        if self._run is None:
             raise EmulatorError("endurance: power is off")
-        return self._emulation
+        return self._run
 
     @property
-    def faults(self) -> Faults:
-        """The faults of the unit; power must be on."""
-        if self._faults is None:
-            raise EmulatorError("endurance: power is off")
-        return self._faults
+    def head(self) -> Head:
+        """The head of the run; power must be on."""
+        return self.run.heads[0]
 
     # --- power ---
 
     async def power_on(self) -> None:
         """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
         reads = {name: transport.reads for name, transport in self._transports.items()}
-        port = MemorySerial("serial")
+        self._run = None
+        port = MemorySerial("serial", self._time_s)
         buses: dict[str, MemoryTransport[CanFrame]] = {
-            name: MemoryTransport(name) for name in ("can", "canopen")
+            name: MemoryTransport(name, self._time_s) for name in ("can", "canopen")
         }
         self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():
             transport.reads = reads.get(name, True)
+        wiring = MemoryWiring(port, buses)
         if self._record is not None:
             shutil.rmtree(self._record, ignore_errors=True)
             prepare_recording(self._record, self.profile, "")
-            self._recorder = Recorder(self._record, SteppedClock())
+            self._recorder = Recorder(self._record, wiring)
             self._recorder.open()
-        tape = MemoryTape(port, buses, self._recorder)
-        self._emulation = Emulation(self.profile, tape=tape)
-        await self._emulation.open()
-        self._faults = Faults(self._emulation.device, self._emulation.links)
+        self._run = Run([self.profile], self._recorder or wiring)
+        await self._run.open()
+        self.head.device.signals.frame_published.connect(self._count_frame)
         if self._recorder is not None:
             path = self._recorder.folder / TRUTH_FILE
             self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
-            self._emulation.device.signals.frame_published.connect(self._truth_log.write)
-        self._emulation.begin()
-        await self._emulation.ready()
+            self.head.device.signals.frame_published.connect(self._truth_log.write)
+        self._run.begin()
+        await self._run.ready()
 
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
         if self._recorder is not None:
             self._recorder.end()
-        await self.emulation.close()
+        await self.run.close()
         files = (getattr(self._recorder, "file", None), getattr(self._truth_log, "file", None))
         for file in files:
             if file is not None:
@@ -266,7 +248,15 @@ class UnitUnderTest:
     @property
     def now_s(self) -> float:
         """Simulation time since power was switched on, seconds."""
-        return self.emulation.clock.now_ns() / NANOSECONDS
+        return self.run.clock.now_ns() / NANOSECONDS
+
+    def _time_s(self) -> float:
+        """Return the simulation time; it is zero while the run is being opened."""
+        return 0.0 if self._run is None else self.now_s
+
+    def _count_frame(self, measurement: Measurement) -> None:
+        self.frames += 1
+        self.exposed_s += measurement.period_s
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
         """Let simulation time pass, and the same time of the event loop.
@@ -291,7 +281,7 @@ class UnitUnderTest:
 
     @property
     def _stepper(self) -> StepPump:
-        stepper = self.emulation.stepper
+        stepper = self.run.stepper
         if stepper is None:
             raise EmulatorError("endurance: the clock is not stepped")
         return stepper
@@ -300,8 +290,8 @@ class UnitUnderTest:
         """Pass bytes or a frame to the device."""
         self._transports[link].deliver(item)
 
-    def take(self, link: str) -> list[Any]:
-        """Return what the device has sent on a link since the last call."""
+    def take(self, link: str) -> list[tuple[float, Any]]:
+        """Return what the device has sent on a link since the last call, each item with its time, seconds."""
         sent = self._transports[link].sent
         taken = list(sent)
         sent.clear()
@@ -311,28 +301,35 @@ class UnitUnderTest:
 
     async def set_truth(self, truth: Mapping[str, Any]) -> None:
         """Replace the truth by a table as `[truth]` in a profile."""
-        await self.emulation.change_truth(TRUTH.validate_python(dict(truth)))
+        await self.run.truth.set(TRUTH.validate_python(dict(truth)))
 
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults, a request as on the control channel."""
         request = FaultRequest.model_validate(dict(fault))
-        if self._recorder is not None:
-            self._recorder.enter("fault", request=request.model_dump(mode="json"))
-        self.faults.inject(request)
+        self.run.record("fault", request=request.model_dump(mode="json"))
+        self.head.faults.inject(request)
 
     def clear_faults(self) -> None:
         """End all faults."""
-        if self._recorder is not None:
-            self._recorder.enter("clear_faults")
-        self.faults.clear()
+        self.run.record("clear_faults")
+        self.head.faults.clear()
 
-    def end_pipeline(self) -> bool:
-        """End the image pipeline, as the death of its process does; return False if it renders images."""
-        imager = self.emulation.imager
-        if not isinstance(imager, ErrorModelImager):
-            return False
-        imager.end("pipeline: ended by an endurance run")
-        return True
+    async def end_pipeline(self) -> None:
+        """End the image pipeline; a process is killed, and its successor awaited, which takes no simulation time."""
+        imager, device = self.head.imager, self.head.device
+        if isinstance(imager, ErrorModelImager):
+            imager.end("pipeline: ended by an endurance run")
+            return
+        if not isinstance(imager, ProcessImager):
+            raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
+        os.kill(imager.pid, signal.SIGKILL)
+        for ready in (False, True):
+            until_s = time.monotonic() + LONGEST_START_S
+            while device.warm is not ready:
+                if time.monotonic() > until_s:
+                    raise EmulatorError("endurance: the pipeline has not been restarted")
+                await asyncio.sleep(WORKER_WAIT_S)
+                time.sleep(WORKER_WAIT_S)
 
     def set_disk(self, *, full: bool) -> None:
         """Set whether this process can write to files; by the kernel, so that it concerns every writer."""
@@ -356,7 +353,12 @@ class UnitUnderTest:
 
     def queued_events(self) -> int:
         """Return the number of events in the queue of the device."""
-        return self.emulation.device.scheduler.count
+        return self.head.device.scheduler.count
+
+    def memory_bytes(self) -> int:
+        """Return the resident memory of this process."""
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
+        return pages * resource.getpagesize()
 
     def dispose(self) -> None:
         """Remove the log handler and the limit of files."""

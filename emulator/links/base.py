@@ -17,7 +17,7 @@ from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, Request
-from starhil.protocol.receiver import Receiver
+from starhil.protocol.serial_interface import Receiver
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
@@ -51,19 +51,7 @@ class Link(Protocol):
 
 
 class DeviceLink(ABC, Generic[Item, Style]):
-    """Connects a device to a transport.
-
-    Parameters
-    ----------
-    requests
-        Request handling of the device.
-    transport
-        Transport of bytes or CAN frames.
-    damage
-        Corrupts items for link faults.
-    seed
-        Seed of the link faults.
-    """
+    """Connects a device to a transport."""
 
     def __init__(
         self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int

@@ -27,7 +27,7 @@ from starhil.protocol.canopen.application import GreyImage, abort_of, check_stat
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
-from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
@@ -71,15 +71,7 @@ def not_before(deadline: float) -> int:
 
 
 class DeviceApplication:
-    """The application of the object dictionary, `starhil.protocol.canopen.application.Application`.
-
-    Parameters
-    ----------
-    requests
-        The device's handling of requests.
-    finish
-        Called with the result of a deferred write.
-    """
+    """The application of the object dictionary, `starhil.protocol.canopen.application.Application`."""
 
     def __init__(self, requests: Requests, finish: Callable[[Deferred, SdoAbortError | None], None]) -> None:
         self._requests = requests
@@ -174,17 +166,6 @@ def _storage_refusal(error: EmulatorError | None) -> SdoAbortError | None:
 class CanopenLink:
     """Connects a device to a CAN bus as a CANopen slave.
 
-    Parameters
-    ----------
-    requests
-        The device's handling of requests.
-    transport
-        Transport of the bus.
-    storage
-        Storage of the communication parameters across restarts.
-    seed
-        Seed of the wire faults.
-
     The node ID is the parameter `canopen_node` of the device, unless LSS has stored another one.
     """
 
@@ -199,14 +180,17 @@ class CanopenLink:
     ) -> None:
         device = self._device = requests.device
         self.transport: Final = transport
-        dictionary = build_dictionary(device.icd)
         self.application = DeviceApplication(requests, self._finish_write)
-        dictionary.application = self.application
-        bit_rates = frozenset(dictionary.layout.bit_rates)
-        self.slave = CanopenSlave(dictionary, self._wanted_node, storage=storage, bit_rates=bit_rates)
-        self.slave.store.on_save = self.application.save
-        self.slave.store.on_restore = self.application.restore
-        self.slave.on_reset = self._reset_device
+        dictionary = build_dictionary(device.icd, self.application)
+        self.slave = CanopenSlave(
+            dictionary,
+            self._wanted_node,
+            storage=storage,
+            bit_rates=frozenset(dictionary.layout.bit_rates),
+            on_save=self.application.save,
+            on_restore=self.application.restore,
+            on_reset=self._reset_device,
+        )
         self._dictionary = dictionary
         self._actions: deque[Action] = deque()
         self._busy = False
@@ -289,9 +273,9 @@ class CanopenLink:
         if reconnects != self._reconnects:
             self._reconnects = reconnects
             self._run_action(
-                partial(self._raise_emergency, ErrorCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION)
+                partial(self._raise_emergency, EmergencyCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION)
             )
-            self._run_action(partial(self._clear_emergency, ErrorCode.BUS_OFF_RECOVERED))
+            self._run_action(partial(self._clear_emergency, EmergencyCode.BUS_OFF_RECOVERED))
         self._run_action(self.slave.tick)
 
     def _raise_emergency(self, code: int, bits: int, now: float) -> list[CanFrame]:

@@ -8,10 +8,10 @@ from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
+from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.messages import Reply, Request
-from starhil.protocol.receiver import Receiver
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_stack import CubeSpaceStack, build_serial_stack
+from starhil.protocol.serial_interface import Dialect, Receiver
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports.paced import SerialTransport
 
 JUNK_BYTES: Final = 8

@@ -63,14 +63,8 @@ class WireFaults(Generic[Item]):
 
     Parameters
     ----------
-    send
-        Sends an item on the transport.
-    damage
-        Corrupts items of this link.
     clock, scheduler
         Clock and scheduler of the device; delays are in simulation time.
-    seed
-        Seed of the random faults.
     """
 
     def __init__(

@@ -8,14 +8,14 @@ of a frame depends only on the request and the seed:
 - A frame with fewer stars than `min_stars_matched` fails with `too_few_stars`; a camera calibration that is wrong
   by more than `validation_margin` pixels within the field fails with `no_match`; a predicted attitude beyond
   `tracking_margin` plus `search_width` pixels fails with `prediction_lost`.
-- Otherwise each axis of the error is normal, cut off at `LARGEST_SIGMA`, with the stated standard deviation.
+- Otherwise the brightest `REPORTED_STARS` are somewhere in the field, measured with the error of a centroid; their
+  numbers and magnitudes are chance. Each axis of the attitude's error is normal, cut off at `LARGEST_SIGMA`, with the stated standard deviation.
 """
 
 from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
 from typing import Any, Final
 
 from starhil.emulator.pipeline.imager import PipelineRequest, ReplyCallback
@@ -25,10 +25,13 @@ from starhil.emulator.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
+    MatchedStar,
     PipelineReady,
     PipelineSetup,
     Quaternion,
+    Triple,
 )
+from starhil.emulator.signals import Signal
 from starid.camera import Camera
 
 ARCSEC: Final = math.radians(1.0 / 3600.0)
@@ -42,6 +45,10 @@ CENTROID_PX: Final = 0.1
 ROLL_ARM: Final = 0.4
 """Root mean square distance of the stars from the boresight along one axis, as a share of the field's width."""
 LARGEST_SIGMA: Final = 4.0
+REPORTED_STARS: Final = 3
+"""Number of stars with measured and catalogue directions."""
+STARS_IN_CATALOGUE: Final = 118_218
+"""Largest Hipparcos number of a star."""
 SMEAR_PX: Final = 3.0
 """Length of a trail at which the light per pixel is halved, pixels."""
 
@@ -60,8 +67,8 @@ class ErrorModelImager:
         self._constants: dict[str, Any] = self._camera.to_dict()
         self._running = True
         self._last_image = -1
-        self.on_failure: Callable[[str], None] | None = None
-        """Called with the reason when the pipeline ends unexpectedly."""
+        self.ended = Signal[str]("end of the image pipeline")
+        """The pipeline has ended unexpectedly, and why."""
         self.watchers: set[object] = set()
         """Viewers of the frames, for which this pipeline has no images."""
 
@@ -83,8 +90,7 @@ class ErrorModelImager:
     def end(self, reason: str) -> None:
         """End unexpectedly."""
         self._running = False
-        if self.on_failure is not None:
-            self.on_failure(reason)
+        self.ended.emit(reason)
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Answer a request."""
@@ -131,9 +137,36 @@ class ErrorModelImager:
             sigma_roll_arcsec=roll_rad / ARCSEC,
             detected=detected,
             matched=matched,
+            stars=self._stars(request, random_of_frame),
             probability_false=1e-12,
             rms_px=CENTROID_PX,
         )
+
+    def _stars(self, request: FrameRequest, random_of_frame: random.Random) -> tuple[MatchedStar, ...]:
+        """Return stars somewhere in the field, each measured with the error of a centroid."""
+        focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
+        centre_x, centre_y = self._constants["centre_px"]
+        stars = []
+        for _ in range(REPORTED_STARS):
+            true_x = random_of_frame.uniform(0.0, self._camera.width - 1.0)
+            true_y = random_of_frame.uniform(0.0, self._camera.height - 1.0)
+            x, y = (
+                true + CENTROID_PX * min(max(random_of_frame.gauss(0.0, 1.0), -LARGEST_SIGMA), LARGEST_SIGMA)
+                for true in (true_x, true_y)
+            )
+            true = unit_vector(true_x - centre_x, true_y - centre_y, focal_px)
+            stars.append(
+                MatchedStar(
+                    hip=random_of_frame.randint(1, STARS_IN_CATALOGUE),
+                    x=x,
+                    y=y,
+                    magnitude=random_of_frame.uniform(2.0, LIMIT_V),
+                    snr=50.0,
+                    vector=unit_vector(x - centre_x, y - centre_y, focal_px),
+                    icrs=in_icrs(true, request.attitude_xyzw),
+                )
+            )
+        return tuple(sorted(stars, key=lambda star: star.magnitude))
 
     def _expected_stars(self, request: FrameRequest) -> float:
         """Return the mean number of detected stars in the field."""
@@ -193,6 +226,25 @@ def turned(attitude: Quaternion, turn_rad: list[float]) -> Quaternion:
     )
     length = math.copysign(math.hypot(*product), product[3])
     return (product[0] / length, product[1] / length, product[2] / length, product[3] / length)
+
+
+def unit_vector(x: float, y: float, z: float) -> Triple:
+    """Return the direction of a vector."""
+    length = math.sqrt(x * x + y * y + z * z)
+    return (x / length, y / length, z / length)
+
+
+def in_icrs(vector: Triple, attitude: Quaternion) -> Triple:
+    """Return a vector of the sensor frame in ICRS, by the inverse rotation of an attitude."""
+    x, y, z, w = attitude
+    a, b, c = vector
+    i, j, k = b * z - c * y, c * x - a * z, a * y - b * x  # v × u, with u the vector part of the quaternion
+    # v + 2w (v × u) + 2 (v × u) × u
+    return (
+        a + 2.0 * (w * i + j * z - k * y),
+        b + 2.0 * (w * j + k * x - i * z),
+        c + 2.0 * (w * k + i * y - j * x),
+    )
 
 
 def angle_between(one: Quaternion, other: Quaternion) -> float:

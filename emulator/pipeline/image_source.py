@@ -23,24 +23,12 @@ class ImageSource(Protocol):
     """A source of images."""
 
     def image(self, index: int) -> Counts:
-        """Return the image (h, w) of an exposure, uint8 or uint16.
-
-        Raises
-        ------
-        EmulatorError, StaridError
-            There is no such image; one line.
-        """
+        """Return the image (h, w) of an exposure, uint8 or uint16."""
         ...
 
 
 class FolderImages:
-    """The images in a folder in the order of their names, one for each exposure.
-
-    Raises
-    ------
-    EmulatorError
-        The folder does not exist or contains no images.
-    """
+    """The images in a folder in the order of their names, one for each exposure."""
 
     def __init__(self, folder: Path, *, repeat: bool) -> None:
         if not folder.is_dir():
@@ -64,13 +52,7 @@ class FolderImages:
 
 
 class CapturedImages:
-    """Images from a camera or a video, captured by OpenCV.
-
-    Raises
-    ------
-    EmulatorError
-        The camera or video cannot be opened.
-    """
+    """Images from a camera or a video, captured by OpenCV."""
 
     def __init__(self, capture: str) -> None:
         import cv2
@@ -111,13 +93,7 @@ class CheckedImages:
 
 
 def open_images(settings: Mapping[str, Any], camera: Camera) -> ImageSource | None:
-    """Open the images named in `[images]` of a profile; None if there are none.
-
-    Raises
-    ------
-    EmulatorError, StaridError
-        The images cannot be opened.
-    """
+    """Open the images named in `[images]` of a profile; None if there are none."""
     folder, capture, dark = (str(settings.get(key, "")) for key in ("folder", "capture", "dark"))
     source: ImageSource
     if folder:

@@ -30,6 +30,7 @@ from starhil.emulator.pipeline.messages import (
     PipelineSetup,
 )
 from starhil.emulator.pipeline.worker_process import EXIT_GRACE_S, WorkerProcess
+from starhil.emulator.signals import Signal
 
 log = logging.getLogger("starhil.pipeline")
 
@@ -58,8 +59,8 @@ class Imager(Protocol):
 class PipelineImager(Imager, Protocol):
     """An image pipeline that can be started, and started again after an unexpected end."""
 
-    on_failure: Callable[[str], None] | None
-    """Called with the reason if the pipeline ends after it was ready; a failed start raises instead."""
+    ended: Signal[str]
+    """The pipeline has ended after it was ready, and why; a failed start raises instead."""
     watchers: set[object]
     """Viewers of the frames; frames come with a preview unless this is empty."""
 
@@ -84,8 +85,8 @@ class _RequestQueue:
         self._idle = asyncio.Event()
         self._idle.set()
         self._started: asyncio.Future[PipelineReady] = asyncio.get_running_loop().create_future()
-        self.on_failure: Callable[[str], None] | None = None
-        """Called with the reason if the pipeline ends after it was ready; a failed start raises instead."""
+        self.ended = Signal[str]("end of the image pipeline")
+        """The pipeline has ended after it was ready, and why; a failed start raises instead."""
         self.watchers: set[object] = set()
         """Viewers of the frames; frames come with a preview unless this is empty."""
 
@@ -122,7 +123,7 @@ class _RequestQueue:
             self._started.set_exception(EmulatorError(text))
 
     def _pipeline_ended(self, text: str) -> None:
-        """Let all pending requests fail, and report the end to the caller of `start` or to `on_failure`."""
+        """Let all pending requests fail, and report the end to the caller of `start` or by the signal `ended`."""
         started = self._started
         was_ready = started.done() and not started.cancelled() and started.exception() is None
         self._start_failed(text)
@@ -130,8 +131,7 @@ class _RequestQueue:
             self._deliver_reply(Failure(text))
         if was_ready:
             log.error("%s", text)
-            if self.on_failure is not None:
-                call_guarded("end of the image pipeline", self.on_failure, text)
+            self.ended.emit(text)
 
     def _mark_start_failure_retrieved(self) -> None:
         """Prevent asyncio from reporting a failed start again at exit."""
@@ -160,13 +160,7 @@ class ProcessImager(_RequestQueue):
         return self._worker.process.pid
 
     async def start(self) -> PipelineReady:
-        """Wait until the pipeline is ready.
-
-        Raises
-        ------
-        EmulatorError
-            The start failed; the text is the worker's reason in one line.
-        """
+        """Wait until the pipeline is ready."""
         self._started = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self._worker.socket)
         self._writer.write(_with_length(self._setup))
@@ -247,13 +241,7 @@ class ThreadImager(_RequestQueue):
         """Queue of requests; None before the start and after an unexpected end."""
 
     async def start(self) -> PipelineReady:
-        """Wait until the pipeline is ready.
-
-        Raises
-        ------
-        EmulatorError
-            The start failed; one line.
-        """
+        """Wait until the pipeline is ready."""
         self._started = self._loop.create_future()
         self._requests = queue.SimpleQueue()
         self._thread = threading.Thread(
@@ -263,13 +251,7 @@ class ThreadImager(_RequestQueue):
         return await self._started
 
     async def restart(self) -> PipelineReady:
-        """Start another thread after one has ended, and wait until it is ready.
-
-        Raises
-        ------
-        EmulatorError
-            The start failed.
-        """
+        """Start another thread after one has ended, and wait until it is ready."""
         return await self.start()
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:

@@ -93,13 +93,7 @@ def make_preview(
     found: Detections | None = None,
     solution: Solution | None = None,
 ) -> Preview:
-    """Make the preview of a frame, without detections if it was not solved.
-
-    Raises
-    ------
-    EmulatorError
-        The image cannot be compressed.
-    """
+    """Make the preview of a frame, without detections if it was not solved."""
     background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
     noise = max(1.0, 0.0 if found is None else found.noise)
     overlay = make_overlay(frame, camera, sensor, sky, found, solution)
@@ -142,13 +136,7 @@ def make_overlay(
 def compress(
     image: NDArray[np.uint8] | NDArray[np.uint16], background: float, noise: float, bits: int
 ) -> bytes:
-    """Compress an image (h, w) as JPEG, on a scale linear for faint and logarithmic for bright pixels.
-
-    Raises
-    ------
-    EmulatorError
-        The image cannot be compressed.
-    """
+    """Compress an image (h, w) as JPEG, on a scale linear for faint and logarithmic for bright pixels."""
     import cv2
 
     levels = np.arange(1 << bits, dtype=np.float64)

@@ -60,13 +60,7 @@ class StarIdentifierSetup:
     upsets: tuple[CatalogUpset, ...] = ()
 
     def make(self, catalog: StarCatalog) -> StarIdentifier:
-        """Make the star identifier, which takes seconds if its index is not cached on disk.
-
-        Raises
-        ------
-        EmulatorError, StaridError
-            An option is unknown, or no index can be built from these values.
-        """
+        """Make the star identifier, which takes seconds if its index is not cached on disk."""
         options = dict(self.options)
         self._check_options(options)
         if self.algorithm != "geometric":
@@ -148,13 +142,7 @@ class StarIdentifiers:
         self._build: _Build | None = None
 
     def get(self, setup: StarIdentifierSetup) -> tuple[StarIdentifier, bool]:
-        """Return the current star identifier, and whether it is the one for this setup.
-
-        Raises
-        ------
-        EmulatorError, StaridError
-            No identifier can be made for this setup; raised at each call.
-        """
+        """Return the current star identifier, and whether it is the one for this setup."""
         self._adopt_finished_build()
         if self._current is None or not self._in_background:
             if self._current is None or self._current[0] != setup:

@@ -123,11 +123,6 @@ class SensorModel:
         Seed of the fixed pattern.
     limiting_magnitude : float
         V of the faintest rendered stars; fainter companions within two pixels of one are rendered too.
-
-    Raises
-    ------
-    EmulatorError
-        A value is not a number or is outside its range.
     """
 
     exposure_s: float = 0.2

@@ -242,11 +242,6 @@ class Renderer:
             Sky objects instead of the renderer's default.
         observer : Observer, optional
             Whose place and motion give the stars parallax and aberration; by default they have neither.
-
-        Raises
-        ------
-        EmulatorError
-            A rate, exposure, temperature or index is not a number or out of range.
         """
         given = {"exposure_s": exposure_s, "temperature_c": temperature_c}
         sensor = self.sensor.with_(**{name: value for name, value in given.items() if value is not None})

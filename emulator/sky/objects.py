@@ -251,11 +251,6 @@ class SkyObjects:
         Mean number of particles per second that hit the detector, each leaving a streak.
     blank : bool
         True if no light reaches the detector.
-
-    Raises
-    ------
-    EmulatorError
-        A value is out of range.
     """
 
     moon: Moon | None = None

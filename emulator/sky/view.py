@@ -66,11 +66,6 @@ class Sky:
 
         A table `sun`, `moon` or `earth` without a direction does not place the body, but gives its look wherever the
         date or a fault puts it.
-
-    Raises
-    ------
-    EmulatorError
-        A key or value is invalid.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -113,11 +108,6 @@ class Sky:
             Relative to the Earth's centre, GCRS (3,); None: at the centre.
         faults
             Fields of `SkyObjects` that replace the profile's; of a body, its fields.
-
-        Raises
-        ------
-        EmulatorError
-            A field of `faults` is invalid.
         """
         objects = self._with_faults(faults) if faults else self._typed
         if unix_s is None or not (self.by_date or self._moving):

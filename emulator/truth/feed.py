@@ -41,14 +41,8 @@ class LiveFeed:
 
     Parameters
     ----------
-    truth
-        Receives the messages.
-    now_s
-        Returns the simulation time in seconds.
     step
         Advances the simulation clock, for lock-step; None if time passes by itself.
-    on_message
-        Called with each message before it is processed.
     """
 
     def __init__(
@@ -69,13 +63,7 @@ class LiveFeed:
         self._limit = ConnectionLimit("truth feed")
 
     async def start(self, socket: Socket, host: str, port: int) -> str:
-        """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`.
-
-        Raises
-        ------
-        EmulatorError
-            The address to listen on is not available.
-        """
+        """Listen, or start connecting; return the address as `udp:HOST:PORT` or `tcp:HOST:PORT`."""
         if socket == "connect":
             self._client = asyncio.create_task(self._keep_connected(host, port))
             return f"tcp:{host}:{port}"

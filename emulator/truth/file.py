@@ -17,6 +17,7 @@ Empty lines and lines that begin with ``#`` are ignored.
 
 from __future__ import annotations
 
+import copy
 import csv
 import math
 from pathlib import Path
@@ -70,8 +71,6 @@ class FileTruth:
     ----------
     times_s
         Times (n,) of the rows, seconds, increasing.
-    attitudes
-        Attitude of each row.
     rates_rad_s
         Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows.
     start_s
@@ -102,6 +101,12 @@ class FileTruth:
         self.start_s = start_s
         self.repeat = repeat
         self.orbit = orbit
+
+    def starting_at(self, start_s: float) -> FileTruth:
+        """Return the same truth with another simulation time of the file's time zero."""
+        other = copy.copy(self)
+        other.start_s = start_s
+        return other
 
     def state(self, t_s: float) -> TruthState:
         """Return the truth at a simulation time in seconds."""
@@ -145,12 +150,6 @@ def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -
 
     Messages do not quote the file, because a client of the control channel may name files that it must not
     read.
-
-    Raises
-    ------
-    EmulatorError
-        The file cannot be read or lacks columns, or a row is not numeric, not a rotation, or not later than
-        the previous row; the message names the line.
     """
     try:
         text = read_text(path, MAX_BYTES)

@@ -52,8 +52,6 @@ class LiveTruth:
 
     Parameters
     ----------
-    attitude
-        Attitude before the first message.
     stale_s
         Silence, in seconds of simulation time, after which the attitude is held and flagged stale.
     timeline
@@ -61,8 +59,6 @@ class LiveTruth:
         time.
     message_format
         Format of messages; default: JSON lines.
-    kind
-        Kind of source, as named in a profile.
     """
 
     def __init__(

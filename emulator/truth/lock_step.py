@@ -20,17 +20,7 @@ Step = Callable[[float], Awaitable[None]]
 
 
 class LockStep:
-    """Advances the simulation clock with the messages of a live feed.
-
-    Parameters
-    ----------
-    truth
-        Receives the messages, which set the timeline of the run.
-    now_s
-        Returns the simulation time in seconds.
-    step
-        Advances the simulation time.
-    """
+    """Advances the simulation clock with the messages of a live feed."""
 
     def __init__(self, truth: LiveTruth, now_s: Callable[[], float], step: Step) -> None:
         self._truth = truth

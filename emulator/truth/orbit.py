@@ -39,13 +39,7 @@ class Orbit(Protocol):
     """Position and velocity of the spacecraft at any time."""
 
     def state(self, unix_s: float) -> OrbitState:
-        """Return position and velocity at a Unix time.
-
-        Raises
-        ------
-        EmulatorError
-            The orbit cannot be propagated to this time.
-        """
+        """Return position and velocity at a Unix time."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +56,6 @@ class KeplerOrbit:
         Angles at the epoch, radians.
     j2
         Whether node, perigee and mean anomaly drift at the secular rates due to the Earth's oblateness.
-
-    Raises
-    ------
-    EmulatorError
-        The orbit is not an ellipse, or its perigee is below the Earth's surface.
     """
 
     epoch_unix_s: float
@@ -92,13 +81,7 @@ class KeplerOrbit:
 
     @classmethod
     def from_state(cls, epoch_unix_s: float, state: OrbitState, *, j2: bool = True) -> Self:
-        """Return the orbit with a position and velocity (osculating elements).
-
-        Raises
-        ------
-        EmulatorError
-            The state is not on an elliptic orbit above the Earth's surface.
-        """
+        """Return the orbit with a position and velocity (osculating elements)."""
         r, v = state.position_m, state.velocity_m_s
         distance, speed2 = float(np.linalg.norm(r)), float(v @ v)
         momentum = np.cross(r, v)
@@ -158,18 +141,7 @@ class KeplerOrbit:
 
 
 class TleOrbit:
-    """An orbit from a two-line element set, propagated by SGP4.
-
-    Parameters
-    ----------
-    line1, line2
-        The two lines.
-
-    Raises
-    ------
-    EmulatorError
-        The lines are not a valid element set.
-    """
+    """An orbit from a two-line element set, propagated by SGP4."""
 
     def __init__(self, line1: str, line2: str) -> None:
         from sgp4.api import Satrec
@@ -190,13 +162,7 @@ class TleOrbit:
             raise EmulatorError(f"orbit: TLE: {_sgp4_error(self._satellite.error)}; give a current TLE")
 
     def state(self, unix_s: float) -> OrbitState:
-        """Return position and velocity at a Unix time.
-
-        Raises
-        ------
-        EmulatorError
-            SGP4 fails, for example because the satellite has decayed.
-        """
+        """Return position and velocity at a Unix time."""
         import erfa
 
         days, seconds = divmod(unix_s, DAY_S)

@@ -75,13 +75,7 @@ class TruthState:
     unix_s: float | None = None
 
     def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
-        """Return the state with the date and orbit of the run if the source has none.
-
-        Raises
-        ------
-        EmulatorError
-            The orbit cannot be propagated to this date.
-        """
+        """Return the state with the date and orbit of the run if the source has none."""
         date = unix_s if self.unix_s is None else self.unix_s
         place = self.orbit
         if place is None and orbit is not None:
@@ -153,10 +147,6 @@ class SlewSegment:
 
     Attributes
     ----------
-    to
-        Final attitude.
-    rate_rad_s
-        Largest rate, rad/s.
     shape
         `smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant
         braking).
@@ -229,10 +219,6 @@ class SlewTruth:
 
     Parameters
     ----------
-    attitude
-        Initial attitude.
-    segments
-        Segments in order.
     start_s
         Simulation time at which the first segment begins; at rest before this.
     repeat

@@ -12,9 +12,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     WATCHED_NODE,
     Abort,
     CanopenProbe,
-    multiplexer,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
+from starhil.hil_tests.judge.canopen import multiplexer
 
 EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusive=True)
 

@@ -7,8 +7,9 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, is_integer, multiplexer, size_of
+from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, is_integer, size_of
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
+from starhil.hil_tests.judge.canopen import multiplexer
 
 OD: Final = CaseArea[CanopenProbe]("canopen.od", "CiA 301 7.2.4.3.17", intrusive=True)
 NOT_NOW = {Abort.NO_DATA, Abort.GENERAL, Abort.DEVICE_STATE, Abort.NOT_STORED}

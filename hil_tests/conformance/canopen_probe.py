@@ -10,6 +10,16 @@ from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
 from starhil.hil_tests.conformance.ports import CanFrame, Port
+from starhil.hil_tests.judge.canopen import (
+    ABORT,
+    abort_code,
+    expedited_data,
+    expedited_download,
+    multiplexer,
+    segment_data,
+    segment_request,
+    upload_request,
+)
 
 NMT: Final = 0x000
 SYNC: Final = 0x080
@@ -116,7 +126,7 @@ class CanopenProbe:
             self.command(RESET_COMMUNICATION)
         mine = {base + self.node for base in (0x080, 0x580, 0x700)}
         for _ in range(3):
-            self.send_request(bytes([0x40]) + multiplexer(0x1000, 0))
+            self.send_request(upload_request(0x1000, 0))
             if self.wait_for(mine, max(ANSWER_S, BOOT_S / 3) if booting else ANSWER_S) is not None:
                 return None
         return "nothing"
@@ -276,7 +286,7 @@ class CanopenProbe:
         expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
         if seen is None:
             raise CaseFailed(expected, "nothing")
-        if len(seen) != 8 or seen[0] != 0x80 or int.from_bytes(seen[4:], "little") not in codes:
+        if len(seen) != 8 or seen[0] != ABORT or abort_code(seen) not in codes:
             raise CaseFailed(expected, seen.hex(" "))
         if multiplexer and seen[1:4].hex() != multiplexer:
             raise CaseFailed(f"{expected} for object {multiplexer}", seen.hex(" "))
@@ -290,20 +300,21 @@ class CanopenProbe:
 
     def try_read(self, index: int, subindex: int = 0) -> bytes | int:
         """Read an object; return its value, or the abort code as a number."""
-        answer = self.ask(bytes([0x40]) + multiplexer(index, subindex))
+        answer = self.ask(upload_request(index, subindex))
         if answer is None or len(answer) != 8:
             raise CaseFailed(f"an answer to reading {index:04X}h:{subindex:02X}h", _seen(answer))
-        if answer[0] == 0x80:
-            return int.from_bytes(answer[4:], "little")
-        if answer[0] & 0x02:
-            return answer[4 : 8 - (answer[0] >> 2 & 3)]
+        if answer[0] == ABORT:
+            return abort_code(answer)
+        if (found := expedited_data(answer)) is not None:
+            return found
         data, toggle = b"", 0
         while True:
-            part = self.ask(bytes([0x60 | toggle]))
+            part = self.ask(segment_request(toggle))
             if part is None or len(part) != 8 or part[0] & 0xF0 != toggle:
                 raise CaseFailed(f"a segment of {index:04X}h:{subindex:02X}h", _seen(part))
-            data += part[1 : 8 - (part[0] >> 1 & 7)]
-            if part[0] & 1:
+            chunk, last = segment_data(part)
+            data += chunk
+            if last:
                 return data
             toggle ^= 0x10
 
@@ -314,13 +325,12 @@ class CanopenProbe:
     def write(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> int:
         """Write up to 4 bytes; return 0 or the abort code."""
         data = value if isinstance(value, bytes) else value.to_bytes(size, "little")
-        command = bytes([0x23 | (4 - len(data)) << 2])
-        answer = self.ask(command + multiplexer(index, subindex) + data)
-        if answer is None or len(answer) != 8 or answer[0] not in {0x60, 0x80}:
+        answer = self.ask(expedited_download(index, subindex, data))
+        if answer is None or len(answer) != 8 or answer[0] not in {0x60, ABORT}:
             raise CaseFailed(f"an answer to writing {index:04X}h:{subindex:02X}h", _seen(answer))
         if answer[1:4] != multiplexer(index, subindex):
             raise CaseFailed(f"an answer for {index:04X}h:{subindex:02X}h", answer.hex(" "))
-        return 0 if answer[0] == 0x60 else int.from_bytes(answer[4:], "little")
+        return 0 if answer[0] == 0x60 else abort_code(answer)
 
     def set(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> None:
         """Write; fail if it is refused."""
@@ -410,11 +420,6 @@ class CanopenProbe:
     def pdo_indices(self, first: int) -> list[int]:
         """Return the indices of communication records from 1400h or 1800h on."""
         return [index for index in sorted(self.od.indices) if first <= index < first + 0x200]
-
-
-def multiplexer(index: int, subindex: int) -> bytes:
-    """Return index and sub-index as encoded in an SDO."""
-    return index.to_bytes(2, "little") + bytes([subindex])
 
 
 def size_of(item: ODVariable) -> int | None:

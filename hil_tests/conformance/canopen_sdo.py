@@ -11,10 +11,10 @@ from starhil.hil_tests.conformance.canopen_probe import (
     Abort,
     CanopenProbe,
     is_integer,
-    multiplexer,
     size_of,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check_equal
+from starhil.hil_tests.judge.canopen import multiplexer
 
 SDO: Final = CaseArea[CanopenProbe]("canopen.sdo", "CiA 301 7.2.4.3.17")
 LONGEST_TIMEOUT_S: Final = 12.0

@@ -7,7 +7,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, multiplexer
+from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe
 from starhil.hil_tests.conformance.canopen_sdo import (
     LONGEST_TIMEOUT_S,
     expect_no_transfer,
@@ -17,6 +17,7 @@ from starhil.hil_tests.conformance.canopen_sdo import (
     writable_number,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
+from starhil.hil_tests.judge.canopen import multiplexer
 
 SDO_BLOCK: Final = CaseArea[CanopenProbe]("canopen.sdo-block", "CiA 301 7.2.4.3.17")
 SEGMENT: Final = 7

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any, Final
 
 from starhil.hil_tests.conformance.canopen_pdo import SYNCHRONOUS, send_sync
@@ -27,16 +26,21 @@ from starhil.hil_tests.conformance.row_cases import (
     clause_of,
     is_valid,
 )
+from starhil.hil_tests.judge.canopen import (
+    EXPEDITED,
+    Entry,
+    entries,
+    is_text,
+    pdo_can_id,
+    with_byte_order,
+    written,
+)
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
 
-PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
-"""CAN IDs of the first four RPDOs and TPDOs, to which the node ID is added (CiA 301 7.3.5)."""
 BOOT_S: Final = 15.0
 """Maximum time from a reset to the end of booting."""
-EXPEDITED: Final = 4
-"""Maximum number of bytes in an expedited SDO."""
 CHANGING: Final = ("attitude.", "rate.", "frame.", "stars.", "stars[")
 """Prefixes of the names of quantities that change with each exposure."""
 UNUSED_ID: Final = 0x3E0
@@ -44,92 +48,6 @@ UNUSED_ID: Final = 0x3E0
 CLAUSE: Final = "[canopen]"
 
 Run = Callable[[CanopenProbe], None]
-
-
-@dataclass(frozen=True)
-class Entry:
-    """An entry of the object dictionary, as defined in `[canopen]`.
-
-    Attributes
-    ----------
-    name
-        Name used by PDOs: `INDEX.NAME`, or `INDEX`.
-    size
-        Size in bytes; 0 if it varies, as for a text.
-    row, slot
-        Telemetry row, and the slot that the entry reads.
-    command, part
-        Telecommand that a write executes, and the part of its data that is written; None: all of it.
-    """
-
-    index: int
-    subindex: int
-    name: str
-    size: int
-    row: Row | None = None
-    slot: Field | None = None
-    command: Row | None = None
-    part: Field | None = None
-
-    @property
-    def mapping(self) -> int:
-        """Mapping entry of a PDO."""
-        return self.index << 16 | self.subindex << 8 | 8 * self.size
-
-
-def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
-    """Yield the entries of the application."""
-    for placed in layout.object:
-        index, at = placed.index, f"{placed.index:04x}"
-        if placed.telemetry is not None:
-            row = unit.telemetry[placed.telemetry]
-            command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
-            for number, slot in enumerate(places(row), 1):
-                part = None if command is None else slot
-                yield Entry(index, number, f"{at}.{slot.name}", slot.size, row, slot, command, part)
-        elif placed.members:
-            subindex = 0
-            for member in placed.members:
-                subindex = member.subindex or subindex + 1
-                yield _entry(unit, member, index, subindex, f"{at}.{member.name.lower()}")
-        elif placed.value is not None or placed.telecommand is not None:
-            yield _entry(unit, placed, index, 0, at)
-        elif placed.parameters:
-            for parameter in unit.parameters.values():
-                yield Entry(index, parameter.id, f"{at}.{parameter.name}", _bytes_of(parameter.type))
-        for number, packed in enumerate(placed.packed, 1):
-            name = packed.name or packed.source.partition(".")[2]
-            yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type))
-
-
-def _entry(unit: Unit, placed: Any, index: int, subindex: int, name: str) -> Entry:
-    row, slot, size = None, None, 0
-    if placed.value is not None:
-        row_name, _, field = placed.value.partition(".")
-        row = unit.telemetry[row_name]
-        slot = row.named[field]
-        size = 0 if slot.kind == "text" else slot.size
-    command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
-    if command is not None and not _is_text(command):
-        size = size or command.size
-    if getattr(placed, "parameter", None) is not None:
-        size = _bytes_of(unit.parameters[placed.parameter].type)
-    return Entry(index, subindex, name, size, row, slot, command)
-
-
-def places(row: Row) -> list[Field]:
-    """Return the first named field at each place of a row; fields of bits share one."""
-    return list({item.offset: item for item in reversed(list(row.named.values()))}.values())[::-1]
-
-
-def _is_text(command: Row) -> bool:
-    """Return whether a telecommand has a text, which is written without padding."""
-    return [field.kind for field in command.fields] == ["text"]
-
-
-def _bytes_of(type_: str) -> int:
-    """Return the bytes of a type; names end in the number of bits, but for `bool`."""
-    return int("".join(filter(str.isdigit, type_)) or 8) // 8
 
 
 def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
@@ -149,18 +67,13 @@ def _case(
 # --- reading and writing ---
 
 
-def _with_byte_order(slot: Field | None, data: bytes) -> bytes:
-    """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
-    return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
-
-
 def _read(probe: CanopenProbe, entry: Entry) -> bytes:
     """Read an entry and check its size; return it in the byte order of its row."""
     data = probe.read(entry.index, entry.subindex)
     if entry.slot is not None and not entry.size:
         return data.ljust(entry.slot.size, b"\0")
     check_equal(len(data), entry.size, f"bytes of {entry.name}h")
-    return _with_byte_order(entry.slot, data)
+    return with_byte_order(entry.slot, data)
 
 
 def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
@@ -179,17 +92,7 @@ def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
 
 def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Value]) -> None:
     """Write an entry that executes a telecommand, which must be accepted."""
-    probe.set(entry.index, entry.subindex, _written(entry, command, command.encode(values)))
-
-
-def _written(entry: Entry, command: Row, data: bytes) -> bytes:
-    """Return the bytes to be written to an entry to execute a telecommand with this data."""
-    part = places(command)[0] if entry.part is None and len(places(command)) == 1 else entry.part
-    if not data:
-        return b"\x01"
-    if _is_text(command):
-        return data.rstrip(b"\0") or b"\0"
-    return data if part is None else _with_byte_order(part, data[part.offset : part.offset + part.size])
+    probe.set(entry.index, entry.subindex, written(entry, command, command.encode(values)))
 
 
 @contextmanager
@@ -319,7 +222,7 @@ def _reported(entry: Entry, command: Row) -> Run:
     """Write all values of an enumeration, or else both limits; restore the previous value."""
     (name, field), *_ = command.named.items()
     values: list[Value]
-    if _is_text(command):
+    if is_text(command):
         values = ["s", "star"]
     else:
         values = list(field.limits) if field.enum is None else list(field.enum)
@@ -327,7 +230,7 @@ def _reported(entry: Entry, command: Row) -> Run:
     def run(probe: CanopenProbe) -> None:
         before = probe.read(entry.index, entry.subindex)
         for value in values:
-            data = _written(entry, command, command.encode({name: value}))
+            data = written(entry, command, command.encode({name: value}))
             probe.set(entry.index, entry.subindex, data)
             check_equal(
                 probe.read(entry.index, entry.subindex), data, f"{entry.name}h after writing {value!s}:"
@@ -368,7 +271,7 @@ def _limit(command: Row, entry: Entry, end: int) -> bytes:
     for name, field in command.named.items():
         if field.kind in ("integer", "float", "bits") and entry.part is not None:
             values[name] = field.limits[end]
-    return _written(entry, command, command.encode(values))
+    return written(entry, command, command.encode(values))
 
 
 def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
@@ -381,7 +284,7 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 continue
             for why, data in command.bad_values(field):
                 title = f"{entry.name}h with {name} {why} is refused"
-                run = _refused(entry, _written(entry, command, data))
+                run = _refused(entry, written(entry, command, data))
                 yield _case("limits", f"{command.name}.{name}.{why}", title, run, clause_of(command))
 
 
@@ -424,20 +327,12 @@ def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 yield from _clock(index, model, mapped, found)
 
 
-def _can_id(probe: CanopenProbe, index: int, model: Any) -> int:
-    predefined = PREDEFINED[index & ~0x1FF]
-    number = index & 0x1FF
-    if model.can_id is None:
-        return predefined[number] + probe.node if number < len(predefined) else 0
-    return int(model.can_id) + (probe.node if model.relative else 0)
-
-
 def _default(index: int, model: Any, mapped: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         at = f"{index:04X}h"
         flags = 0 if model.enabled else PDO_OFF
         cob_id = probe.number(index, 1) & ~NO_RTR
-        check_equal(f"{cob_id:08X}", f"{flags | _can_id(probe, index, model):08X}", f"{at}:01h")
+        check_equal(f"{cob_id:08X}", f"{flags | pdo_can_id(probe.node, index, model):08X}", f"{at}:01h")
         check_equal(probe.number(index, 2), model.transmission_type, f"{at}:02h, transmission type")
         if index >= 0x1800:
             check_equal(probe.number(index, 3), round(model.inhibit_ms * 10), f"{at}:03h, inhibit time")
@@ -476,7 +371,7 @@ def _sent_with_frames(index: int, model: Any, found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
         with _identifying_stars(probe, found):
             probe.command(START)
-            can_id = _can_id(probe, index, model)
+            can_id = pdo_can_id(probe.node, index, model)
             times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
         probe.command(PRE_OPERATIONAL)
         check_equal(len(times), 3, "TPDOs")
@@ -504,7 +399,9 @@ def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> I
             return probe.number(reading.index, reading.subindex)
 
         def send(value: int) -> None:
-            probe.send(_can_id(probe, index, model), command.encode({**command.example(), name: value}))
+            probe.send(
+                pdo_can_id(probe.node, index, model), command.encode({**command.example(), name: value})
+            )
 
         before, began = read(), probe.port.now()
         probe.command(START)

@@ -17,11 +17,16 @@ from starhil.hil_tests.conformance.link_probe import (
 )
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Value
-from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.rows import Field, Row
 
 FLOOD: Final = 200
 SUBSCRIBED_S: Final = 3.0
 ATTITUDE_S: Final = 20.0
+SETTLING_S: Final = 1.0
+"""Time after which a unit that identifies stars has an attitude."""
+RESTING: Final = 5
+"""Number of attempts to read two rows between two measurements."""
+F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
 QUATERNION: Final = ("attitude.x", "attitude.y", "attitude.z", "attitude.w")
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
@@ -56,6 +61,7 @@ def row_cases(
                 title = f"{row.name} with {name} {why} is refused, and the refused field named"
                 run = _refused(row, data, INVALID_PARAMETER, index)
                 yield _case("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
+    yield from _agreement(unit)
     yield from _settings(unit, marks)
     yield from _subscriptions(unit)
     yield _case(
@@ -203,6 +209,66 @@ def identifying_stars(probe: LinkProbe, unit: Unit) -> Iterator[None]:
         yield
     finally:
         probe.command(command.name, **{field_name: "lost_in_space" if before == "tracking" else before})
+
+
+# --- quantities in several rows ---
+
+
+def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    """Yield the case for numbers that several fields report: the layouts differ, the values must not."""
+    places: dict[tuple[str, str], list[tuple[Row, str]]] = {}
+    for row in unit.telemetry.values():
+        for name, item in row.named.items():
+            if item.value is not None and item.kind in ("integer", "float", "bits") and item.enum is None:
+                places.setdefault((item.value, item.unit), []).append((row, name))
+    shared = {
+        quantity: found for quantity, found in places.items() if len({_layout(*place) for place in found}) > 1
+    }
+    if not shared:
+        return
+
+    def run(probe: LinkProbe) -> None:
+        with identifying_stars(probe, unit):
+            probe.sleep(SETTLING_S)
+            for (quantity, _unit), (first, *others) in shared.items():
+                for other in others:
+                    _compare(probe, quantity, first, other)
+
+    title = "numbers that several fields report agree within the resolution of the fields"
+    yield _case(
+        "agreement", "rows", title, run, "[[telemetry]]: fields with the same `value`", intrusive=True
+    )
+
+
+def _layout(row: Row, name: str) -> tuple[object, ...]:
+    item = row.named[name]
+    return item.type, item.order, item.scale, item.bias, item.width
+
+
+def _compare(probe: LinkProbe, quantity: str, one: tuple[Row, str], other: tuple[Row, str]) -> None:
+    """Compare two fields between two readings of the first that agree; skip a quantity that never rests."""
+    for _ in range(RESTING):
+        before, seen, after = (probe.values(row)[name] for row, name in (one, other, one))
+        if before == after:
+            break
+    else:
+        return
+    first, second = (row.named[name] for row, name in (one, other))
+    whole = "float" not in (first.kind, second.kind)
+    alike = whole and (first.scale, first.bias) == (second.scale, second.bias)
+    numbers = (first, float(after)), (second, float(seen))
+    margin = 0.0 if alike else sum(_resolution(item, number) for item, number in numbers)
+    what = f"{quantity} in {other[0].name}.{other[1]} and {one[0].name}.{one[1]} alike, to {margin:.2g}"
+    # a number beyond the limits of one field is sent as the nearest limit, and known only from the other
+    for (item, number), (against, found) in (numbers, numbers[::-1]):
+        low, high = item.limits
+        if low < number < high:
+            nearest = min(max(number, against.limits[0]), against.limits[1])
+            check(abs(found - nearest) <= margin, what, f"{float(seen):.9g} and {float(after):.9g}")
+
+
+def _resolution(item: Field, number: float) -> float:
+    return F32_ROUNDING * abs(number) if item.kind == "float" else 0.51 * abs(item.scale)
 
 
 # --- telecommands ---

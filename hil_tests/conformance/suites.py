@@ -1,8 +1,9 @@
 """All cases of a link: those that the definition of a unit yields, and the unit's own.
 
 A unit's own cases are Python files `*_cases.py` beside its definition. Each defines areas (`CaseArea`), whose cases
-get the probe of the link; `settings`, if a file defines it, makes the object that records and restores the settings
-of the unit around a run. A case whose ID the definition yields too replaces that case.
+get the probe of the link, or a function `generated`, which yields cases for the definition that it gets; `settings`,
+if a file defines it, makes the object that records and restores the settings of the unit around a run. A case whose
+ID the definition yields too replaces that case.
 """
 
 from __future__ import annotations
@@ -61,9 +62,10 @@ def _suite(unit: Unit, link: str, derived: Iterable[Case[Any]]) -> tuple[Case[An
     """Return derived and own cases, with IDs and areas that begin with the link."""
     found = {item.id: item for item in derived}
     for contents in _own_files(unit.folder):
-        for area in contents.values():
-            if isinstance(area, CaseArea) and link in area.links:
-                found |= {item.id: item for item in area.cases}
+        areas = [area for area in contents.values() if isinstance(area, CaseArea) and link in area.links]
+        own = [item for area in areas for item in area.cases]
+        own += contents["generated"](unit) if "generated" in contents else []
+        found |= {item.id: item for item in own}
     return tuple(
         replace(item, id=f"{link}.{item.id}", area=f"{link}.{item.id.split('.', 1)[0]}")
         for item in found.values()

@@ -11,9 +11,12 @@ from starhil.hil_tests.endurance.truth import (
     Error,
     Motion,
     Quaternion,
+    Vector,
     conjugate,
+    cross,
     frame_turned,
     of_matrix,
+    of_pairs,
     product,
 )
 from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
@@ -30,6 +33,8 @@ STALE_PERIODS: Final = 3
 STALE_S: Final = 2.0
 """An attitude is not reported longer than `STALE_PERIODS` update periods and `STALE_S` after its exposure."""
 KEPT_PERIODS: Final = 20
+SMALLEST_SCALAR: Final = 0.1
+"""Smallest scalar that is computed from the other three numbers of a quaternion."""
 ARCSEC: Final = math.radians(1.0 / 3600.0)
 
 Readings = Mapping[str, tuple[Field, Value]]
@@ -91,12 +96,16 @@ class AttitudeJudge:
         imaging
             Whether the unit may be in a mode with frames.
         """
-        four = [read.get(f"attitude.{letter}") for letter in "xyzw"]
-        valid = flag(read["attitude.valid"][1])
-        numbers = [0.0 if item is None else float(item[1]) for item in four if not isinstance(item, str)]
-        if not valid:
-            if any(item is not None and abs(float(item[1])) > resolution(item[0]) for item in four):
+        reported = [read[name] for name in (f"attitude.{letter}" for letter in "xyzw") if name in read]
+        numbers = [float(value) for _, value in reported if not isinstance(value, (str, bytes))]
+        stars = _stars(read)
+        if not flag(read["attitude.valid"][1]):
+            if any(
+                abs(number) > resolution(field) for number, (field, _) in zip(numbers, reported, strict=True)
+            ):
                 raise Violation(f"{row}: quaternion {numbers} though the attitude is invalid")
+            if stars:
+                raise Violation(f"{row}: {len(stars)} identified stars though the attitude is invalid")
             return
         if not imaging:
             raise Violation(f"{row}: a valid attitude in a mode without images")
@@ -104,19 +113,68 @@ class AttitudeJudge:
         dark_s = math.inf if self.dark_since_s is None else self.dark_since_s
         if now_s > dark_s + window_s - STALE_S:
             raise Violation(f"{row}: a valid attitude {now_s - dark_s:.3f} s after the lens was covered")
-        if any(item is None for item in four):
+        if not math.isfinite(window_s):
             return
-        finest = max(resolution(item[0]) for item in four if item is not None) + 1e-7
+        if len(numbers) >= 3:
+            finest = max(resolution(field) for field, _ in reported) + 1e-7
+            self._judge_quaternion(row, numbers, 4.0 * finest, read, (now_s, window_s), values)
+        if len(stars) >= 2:
+            self._judge_stars(row, stars, (now_s, window_s), values)
+
+    def _judge_quaternion(
+        self,
+        row: str,
+        numbers: list[float],
+        tolerance: float,
+        read: Readings,
+        window: tuple[float, float],
+        values: Mapping[str, Known | None],
+    ) -> None:
+        """Judge a quaternion, whose scalar may be left out if its sign is fixed."""
+        if len(numbers) == 3:
+            scalar = math.sqrt(max(0.0, 1.0 - sum(number * number for number in numbers)))
+            if self._conventions.scalar_sign != "positive" or scalar < SMALLEST_SCALAR:
+                return
+            tolerance /= scalar
+            numbers = [*numbers, scalar]
         length = math.sqrt(sum(number * number for number in numbers))
-        if abs(length - 1.0) > 4.0 * finest:
+        if abs(length - 1.0) > tolerance:
             raise Violation(f"{row}: the quaternion has length {length!r}")
         x, y, z, w = (number / length for number in numbers)
-        measured = self._to_sensor((x, y, z, w), values)
-        if measured is not None and math.isfinite(window_s):
+        q = (x, y, z, w)
+        measured = self._to_sensor(conjugate(q) if self._conventions.quaternion == "attitude" else q, values)
+        if measured is not None:
             self.count += 1
-            self._check_error(row, self._errors(measured, now_s, window_s), read, 4.0 * finest)
+            self._check_error(row, self._errors(measured, *window), read, tolerance)
+
+    def _judge_stars(
+        self,
+        row: str,
+        stars: list[tuple[Vector, Vector, float]],
+        window: tuple[float, float],
+        values: Mapping[str, Known | None],
+    ) -> None:
+        """Judge measured directions of stars by the attitude in which they have their catalogue directions."""
+        (one, one_icrs, step), (other, other_icrs, _) = stars[:2]
+        apart = math.hypot(*cross(one, other))
+        error = math.hypot(*(a - b for a, b in zip(one, other, strict=True)))
+        error -= math.hypot(*(a - b for a, b in zip(one_icrs, other_icrs, strict=True)))
+        star_rad = SIGMAS * self._sigma_arcsec[0] * ARCSEC + 2.0 * step
+        if abs(error) > 2.0 * star_rad:
+            raise Violation(
+                f"{row}: two stars are {abs(error) / ARCSEC:.1f} arcsec too near or too far apart"
+            )
+        if apart < 10.0 * star_rad:
+            return
+        measured = self._to_sensor(of_pairs((one, other), (one_icrs, other_icrs)), values)
+        if measured is None:
+            return
+        self.count += 1
+        tolerance = star_rad * (1.0 + 1.0 / apart)
+        self._check_error(row, self._errors(measured, *window), {}, tolerance)
 
     def _check_error(self, row: str, errors: list[Error], read: Readings, tolerance_rad: float) -> None:
+        """Check the errors to the truth against what is stated, or else the largest that may be left unstated."""
         stated = [read.get("attitude.sigma_cross"), read.get("attitude.sigma_roll")]
         cross, roll = (
             (largest if item is None else float(item[1]) * (factor(item[0].unit, "arcsec") or 1.0))
@@ -152,10 +210,7 @@ class AttitudeJudge:
         return errors
 
     def _to_sensor(self, reported: Quaternion, values: Mapping[str, Known | None]) -> Quaternion | None:
-        """Return a reported attitude in the sensor frame; None if the mounting is not known."""
-        conventions = self._conventions
-        if conventions.quaternion == "attitude":
-            reported = conjugate(reported)
+        """Return an attitude of the reported frame in the sensor frame; None if the mounting is not known."""
         angles = [values[f"mounting_{name}"] for name in ("alpha", "beta", "gamma")]
         if any(angle is None for angle in angles):
             return None
@@ -165,17 +220,37 @@ class AttitudeJudge:
             for axis, angle in enumerate(numbers):
                 unit = [float(index == axis) for index in range(3)]
                 turn = product(frame_turned(unit, math.radians(angle)), turn)
-            self._turn_cache = (numbers, product(of_matrix(conventions.rows), turn))
+            self._turn_cache = (numbers, product(of_matrix(self._conventions.rows), turn))
         return product(conjugate(self._turn_cache[1]), reported)
+
+    def check_period(
+        self, where: str, field: Field, value: Value, now_s: float, values: Mapping[str, Known | None]
+    ) -> None:
+        """Check the time between exposures, which changes with the next image after a telecommand."""
+        low, high = field.physical_limits
+        scale = factor("s", field.unit) or 1.0
+        possible = [min(max(period * scale, low), high) for period in self._recent_periods(now_s, values)]
+        if isinstance(value, (str, bytes)) or not all(map(math.isfinite, possible)):
+            return
+        if all(abs(value - period) > resolution(field) + 1e-6 * period for period in possible):
+            raise Violation(f"{where}: {value!r}, not {possible[0]!r}")
+
+    def _recent_periods(self, now_s: float, values: Mapping[str, Known | None]) -> list[float]:
+        """Return the periods in use when the last image may have been taken; infinite if not known."""
+        recent = [period_s(values)]
+        for number, (_, period) in enumerate(self._periods):
+            until_s = self._periods[number + 1][0] if number + 1 < len(self._periods) else now_s
+            if now_s - until_s <= _window_of(period):
+                recent.append(period)
+        return recent
 
     def _window_s(self, now_s: float, values: Mapping[str, Known | None]) -> float:
         """Return the largest age that a valid attitude may have now; infinite if it is not known."""
-        longest = period_s(values)
-        for number, (_, period) in enumerate(self._periods):
-            until_s = self._periods[number + 1][0] if number + 1 < len(self._periods) else now_s
-            if now_s - until_s <= (STALE_PERIODS + 1) * period + STALE_S + PROCESSING_S:
-                longest = max(longest, period)
-        return (STALE_PERIODS + 1) * longest + STALE_S + PROCESSING_S
+        return _window_of(max(self._recent_periods(now_s, values)))
+
+
+def _window_of(period: float) -> float:
+    return (STALE_PERIODS + 1) * period + STALE_S + PROCESSING_S
 
 
 def period_s(values: Mapping[str, Known | None]) -> float:
@@ -184,3 +259,21 @@ def period_s(values: Mapping[str, Known | None]) -> float:
     if rate is None or exposure is None or delay is None:
         return math.inf
     return max(1.0 / float(rate[0]), (float(exposure[0]) + float(delay[0])) / 1000.0)
+
+
+def _stars(read: Readings) -> list[tuple[Vector, Vector, float]]:
+    """Return the stars of a row: measured direction, catalogue direction, and the resolution of both."""
+    found: list[tuple[Vector, Vector, float]] = []
+    while True:
+        names = [f"stars[{len(found) + 1}].{kind}_{axis}" for kind in ("vector", "icrs") for axis in "xyz"]
+        items = [read[name] for name in names if name in read]
+        numbers = [float(value) for _, value in items if not isinstance(value, (str, bytes))]
+        if len(numbers) < 6 or not any(numbers):
+            return found
+        found.append(
+            (
+                (numbers[0], numbers[1], numbers[2]),
+                (numbers[3], numbers[4], numbers[5]),
+                resolution(items[0][0]),
+            )
+        )

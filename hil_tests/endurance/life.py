@@ -5,9 +5,12 @@ A step is a JSON object with `do`:
 =================  ==================================================================================================
 `do`               effect
 =================  ==================================================================================================
-``wait``           `s`: let simulation time pass
+``wait``           `s`: let simulation time pass, or less after `most` events in the unit
 ``request``        `link`, `row` ("class id"), `data`: send a request and judge the answers
 ``burst``          `link`, `rows`: send telemetry requests without waiting; the answers come in order
+``flood``          `link`, `row`, `data`, `count`: send the same request many times, so that counters of 16 bits wrap
+``cut``            `link`, `row`, `share`: send the first part of a request, as a client that goes away; another comes
+``nmt``            `link`, `command`: an NMT command, by which a CANopen node begins or ends to send PDOs
 ``junk``           `link`, `data` or `frames`: send input that is not a request for this unit; nothing may answer
 ``truth``          `truth`: a table as `[truth]` in a profile
 ``fault``          `fault`: a request of faults as on the control channel; ``clear`` ends all faults
@@ -17,6 +20,9 @@ A step is a JSON object with `do`:
 ``peer``           `link`, `reads`: whether the peer of a link reads
 ``recover``        end all faults, restore the unit, and wait: its attitude must be valid
 =================  ==================================================================================================
+
+Two kinds of lives: in most, everything happens and power is switched often. In a long one, the unit is left alone for
+days, without resets and with the lowest update rates, so that its counters and clocks pass their wraps while observed.
 """
 
 from __future__ import annotations
@@ -38,8 +44,19 @@ LONGEST_S: Final = 40_000.0
 """Waits are log-uniform between these limits."""
 MOST_EVENTS: Final = 400
 """Waits end early after about this many events in the unit: exposures, messages, heartbeats."""
+LONG_WAIT_S: Final = (20_000.0, 300_000.0)
+"""Limits of the waits of a long life."""
+MOST_EVENTS_LONG: Final = {False: 40_000, True: 4000}
+"""Waits of a long life end early after about this many events, by whether the unit sends heartbeats every second."""
+LONG_UPDATE_RATE_HZ: Final = (0.01, 0.02)
+FLOOD: Final = (20_000, 40_000)
+"""Limits of the number of requests in a flood."""
 USUAL_SHARE: Final = 0.75
 """Share of values that are set to their default, so that the unit mostly works."""
+COUNTING: Final = ("counters.", "uptime", "clock.", "boot.count")
+"""Beginnings of the quantities that count."""
+NMT_COMMANDS: Final = (0x01, 0x80)
+"""Start the node, and enter pre-operational; in both states SDO works."""
 EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
 """Clock settings next to the wraps of 2038 and 2106."""
 
@@ -69,12 +86,23 @@ class Life:
     steps: tuple[Step, ...]
 
 
-def make_life(icd: InterfaceDefinition, unit: str, links: tuple[str, ...], seed: int, count: int) -> Life:
+def make_life(
+    icd: InterfaceDefinition,
+    unit: str,
+    links: tuple[str, ...],
+    seed: int,
+    count: int,
+    *,
+    is_long: bool = False,
+) -> Life:
     """Generate a life of `count` steps."""
     random_of_life = random.Random(f"{unit} {seed}")  # noqa: S311 (reproducible, not secret)
     commanded = any(row.action == "set_mode" for row in icd.telecommands.values())
     start_mode = random_of_life.choice(["standby", "lost_in_space"]) if commanded else "lost_in_space"
     update_rate = round(10.0 ** random_of_life.uniform(-2.0, 1.0), 3)
+    if is_long:
+        update_rate = round(random_of_life.uniform(*LONG_UPDATE_RATE_HZ), 4)
+        links = tuple(link for link in links if link != "canopen") or links  # a heartbeat every second
     profile: dict[str, Any] = {"parameters": {"start_mode": start_mode, "update_rate": update_rate}}
     if update_rate > 2.0:
         profile["parameters"]["exposure"] = 50
@@ -82,7 +110,7 @@ def make_life(icd: InterfaceDefinition, unit: str, links: tuple[str, ...], seed:
         "start_unix_s": float(random_of_life.choice([1_767_225_600, 2**31 - 3600, 4_102_444_800]))
     }
     used = tuple(link for link in links if random_of_life.random() < 0.6) or (random_of_life.choice(links),)
-    generator = LifeGenerator(icd, used, random_of_life)
+    generator = LifeGenerator(icd, used, random_of_life, is_long=is_long)
     return Life(unit, seed, used, profile, tuple(generator.steps(count)))
 
 
@@ -97,22 +125,37 @@ class LifeGenerator:
         Its links: `serial`, `can`, `canopen`.
     random_of_life
         Source of chance.
+    is_long
+        Whether the unit is left alone for days.
     """
 
     def __init__(
-        self, icd: InterfaceDefinition, links: tuple[str, ...], random_of_life: random.Random
+        self,
+        icd: InterfaceDefinition,
+        links: tuple[str, ...],
+        random_of_life: random.Random,
+        *,
+        is_long: bool = False,
     ) -> None:
         self._icd = icd
         self._links = links
         self._random = random_of_life
         self._telemetry = list(icd.telemetry.values())
+        self._telecommands = list(icd.telecommands.values())
         self._attitude_rows = [
             row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)
         ]
-        self._telecommands = list(icd.telecommands.values())
+        self._count_rows = [
+            row
+            for row in self._telemetry
+            if any((field.value or "").startswith(COUNTING) for field in row.fields)
+        ]
+        self._stream_rows = [
+            row for row in self._telecommands if row.action in ("select_unsolicited", "subscribe")
+        ]
+        self._clock_rows = [row for row in self._telecommands if row.action == "set_clock"]
         self._mode_rows = [row for row in self._telecommands if row.action == "set_mode"]
-        self._period_s = 1.0
-        weighted: list[tuple[float, Callable[[], Step]]] = [
+        everything: list[tuple[float, Callable[[], Step]]] = [
             (30, self._wait),
             (16, self._read_any),
             (16, self._read_attitude),
@@ -121,6 +164,9 @@ class LifeGenerator:
             (8, self._mode),
             (2, self._burst),
             (2, self._junk),
+            (1, self._cut),
+            (2, self._stream),
+            (1, self._nmt),
             (5, self._truth),
             (4, self._fault),
             (4, lambda: {"do": "clear"}),
@@ -130,6 +176,17 @@ class LifeGenerator:
             (0.5, self._peer),
             (2, lambda: {"do": "recover"}),
         ]
+        left_alone: list[tuple[float, Callable[[], Step]]] = [
+            (22, self._long_wait),
+            (10, self._read_any),
+            (20, self._read_attitude),
+            (20, self._read_count),
+            (12, self._mode),
+            (3, self._flood),
+            (5, self._truth),
+            (6, self._clock),
+        ]
+        weighted = left_alone if is_long else everything
         self._makers = [maker for _, maker in weighted]
         self._weights = [weight for weight, _ in weighted]
 
@@ -144,6 +201,10 @@ class LifeGenerator:
     def _wait(self) -> Step:
         exponent = self._random.uniform(math.log(SHORTEST_S), math.log(LONGEST_S))
         return {"do": "wait", "s": round(math.exp(exponent), 6)}
+
+    def _long_wait(self) -> Step:
+        most = MOST_EVENTS_LONG["canopen" in self._links]
+        return {"do": "wait", "s": round(self._random.uniform(*LONG_WAIT_S), 3), "most": most}
 
     def _request(self, row: Row, data: bytes = b"") -> Step:
         return self._raw_request(row.klass, row.id, row.kind, data)
@@ -177,6 +238,53 @@ class LifeGenerator:
                 if wanted:
                     values[field.name] = self._random.choice([wanted[0], *wanted])
         return self._request(row, row.encode(values, check=False))
+
+    def _read_count(self) -> Step:
+        return self._request(self._random.choice(self._count_rows or self._telemetry))
+
+    def _clock(self) -> Step:
+        if not self._clock_rows:
+            return self._read_count()
+        row = self._random.choice(self._clock_rows)
+        return self._request(row, row.encode(self._values(row), check=False))
+
+    def _stream(self) -> Step:
+        """Let the unit send telemetry without requests."""
+        if not self._stream_rows:
+            return self._read_any()
+        row = self._random.choice(self._stream_rows)
+        values: dict[str, Value] = {}
+        for name, field in row.named_fields.items():
+            if field.argument == "rate":
+                values[name] = self._random.choice([0.0, 10.0 ** self._random.uniform(-2.0, 0.7)])
+            elif (field.argument or "").startswith("telemetry"):
+                number = self._random.choice(self._attitude_rows + self._telemetry).id
+                values[name] = number if self._random.random() < 0.5 or row.size < 8 else 0
+        return self._request(row, row.encode(values, check=False))
+
+    def _flood(self) -> Step:
+        """Repeat the shortest request of its kind, often enough in a life if the unit has counters of 16 bits."""
+        link = self._random.choice([link for link in self._links if link != "canopen"] or self._links[:1])
+        harmless = [row for row in self._telecommands if row.action == "nothing"]
+        rows = [min(kind, key=lambda row: row.size) for kind in (self._telemetry, harmless) if kind]
+        row = self._random.choice(rows)
+        narrow = any(
+            (field.value or "").startswith("counters.") and field.raw_limits[1] <= 0xFFFF
+            for other in self._count_rows
+            for field in other.fields
+        )
+        count = self._random.randint(*FLOOD) if narrow else FLOOD[0] // 20
+        data = bytes(row.size) if row.kind == "telecommand" else b""
+        return {**self._request(row, data), "do": "flood", "link": link, "count": count}
+
+    def _cut(self) -> Step:
+        row = self._random.choice([*self._telecommands, *self._telemetry])
+        return {**self._request(row), "do": "cut", "share": round(self._random.uniform(0.1, 0.9), 2)}
+
+    def _nmt(self) -> Step:
+        if "canopen" not in self._links:
+            return self._read_any()
+        return {"do": "nmt", "link": "canopen", "command": self._random.choice(NMT_COMMANDS)}
 
     def _burst(self) -> Step:
         rows = [self._random.choice(self._telemetry) for _ in range(self._random.randint(2, 6))]

@@ -90,19 +90,24 @@ class Oracle:
             "set_clock": self._clock_changed,
             "set_mode": self._mode_commanded,
             "start_burst": self._burst_started,
+            "subscribe": self._subscribed_rows,
         }
         self._checks: dict[str, Callable[[str, Field, Value], None]] = {
             "mode": self._check_mode,
             "counters.telecommands": partial(self._check_count, "telecommands"),
             "counters.telemetry": partial(self._check_count, "telemetry"),
             "counters.requests": self._check_requests,
-            "clock.unix": partial(self._check_clock, 1.0, 2**64),
-            "clock.seconds": partial(self._check_clock, 1.0, 2**32),
-            "clock.milliseconds": partial(self._check_clock, 1e3, 1),
+            "clock.unix": partial(self._check_clock, 2**64),
+            "clock.seconds": partial(self._check_clock, 2**32),
+            "clock.milliseconds": partial(self._check_fraction, self._clock_s, 1e3),
+            "clock.microseconds": partial(self._check_fraction, self._clock_s, 1e6),
+            "clock.nanoseconds": partial(self._check_fraction, self._clock_s, 1e9),
             "uptime": self._check_uptime,
             "uptime.seconds": self._check_uptime,
+            "uptime.milliseconds": partial(self._check_fraction, self._uptime_s, 1e3),
             "boot.count": self._check_boot_count,
             "frame.counter": self._check_frames,
+            "frame.period": self._check_period,
             "selected.id": self._check_selected,
             "request.last": self._check_last,
         }
@@ -121,9 +126,9 @@ class Oracle:
         self.attitudes.motions = [motion]
         self._start(0.0)
 
-    def restarted(self) -> None:
-        """The unit has restarted by itself, now."""
-        self._start(self.now_s)
+    def restarted(self, at_s: float) -> None:
+        """The unit has restarted by itself at a time."""
+        self._start(at_s)
 
     def _start(self, at_s: float) -> None:
         self._started_s: float | None = at_s
@@ -139,7 +144,7 @@ class Oracle:
         self._frames = None
         self._selected = next(iter(self._icd.parameters_by_id), None)
         self._last = None
-        self.bursts = False
+        self.bursts = self._subscribed = False
         self.attitudes.started(at_s, self.values)
 
     def time_passed(self, now_s: float) -> None:
@@ -177,7 +182,7 @@ class Oracle:
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
         self.modes = {"boot", "standby", "error", *IMAGING}
-        self.bursts = True
+        self.bursts = self._subscribed = True
         self.attitudes.retimed(self.now_s, self.values)
 
     # --- requests ---
@@ -208,9 +213,9 @@ class Oracle:
                 return ErrorCode.INTERNAL if self.disk_full else ErrorCode.OK
             case "set_parameters" if any(field.parameter in _BOUND for field in row.fields):
                 return None
-            case "nothing" | None | "reset" | "set_clock" | "clear_counters" | "restore_parameters":
+            case None | "nothing" | "reset" | "set_clock" | "clear_counters":
                 return ErrorCode.OK
-            case "default_parameters" | "set_parameters":
+            case "restore_parameters" | "default_parameters" | "set_parameters":
                 return ErrorCode.OK
             case _:
                 return None
@@ -234,8 +239,9 @@ class Oracle:
 
     def counted(self, kind: str) -> None:
         """A request was received."""
-        count = self.counts[f"{_COUNTER[kind]}"]
-        self.counts[_COUNTER[kind]] = None if count is None else (count + 1) & 0xFFFF
+        name = "telecommands" if kind == "telecommand" else "telemetry"
+        count = self.counts[name]
+        self.counts[name] = None if count is None else (count + 1) & 0xFFFF
 
     def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode) -> None:
         """A telecommand was answered with a code."""
@@ -251,7 +257,7 @@ class Oracle:
 
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
-        if changes.keys() & _BOUND:
+        if changes.keys() & _TIMING:
             self.attitudes.retimed(self.now_s, self.values)
 
     def _parameters_set(self, row: Row, arguments: Mapping[str, Any]) -> None:
@@ -301,16 +307,21 @@ class Oracle:
         self.modes = set(IMAGING) if wanted in IMAGING else {wanted}
         self._has_imaged = self._has_imaged or wanted in IMAGING
 
+    def _subscribed_rows(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
+        self._subscribed = True
+
+    @property
+    def streams(self) -> bool:
+        """Whether telemetry may come without a request."""
+        rate = self.values.get("unsolicited_rate")
+        return self._subscribed or rate is None or float(rate[0]) > 0.0
+
     def _burst_started(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
         self.bursts = True
 
     def forget_last(self) -> None:
         """The code with which the last telecommand was refused is not known."""
         self._last = None
-
-    def started_at(self, at_s: float) -> None:
-        """The last start was at this time."""
-        self._started_s = at_s
 
     # --- readings ---
 
@@ -327,15 +338,23 @@ class Oracle:
                 raise Violation(f"{row.name}.{name}: {value}")
             if quantity is not None:
                 by_quantity[quantity] = (field, value)
-        for quantity, (field, value) in by_quantity.items():
-            where = f"{row.name}.{field.name}"
+        self.judge(row.name, by_quantity)
+        self.judge_attitude(row.name, by_quantity)
+
+    def judge(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+        """Judge the quantities of a row or PDO, received now, apart from its attitude."""
+        for quantity, (field, value) in read.items():
+            where = f"{name}.{field.name}"
             if quantity.startswith(PARAMETER):
                 self._check_parameter(where, field, value, quantity.removeprefix(PARAMETER))
             elif quantity in self._checks:
                 self._checks[quantity](where, field, value)
-        if "attitude.valid" in by_quantity:
+
+    def judge_attitude(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+        """Judge the attitude in a row, or in the PDOs of an instant."""
+        if "attitude.valid" in read:
             imaging = bool(self.modes & IMAGING)
-            self.attitudes.judge(row.name, by_quantity, self.now_s, self.values, imaging=imaging)
+            self.attitudes.judge(name, read, self.now_s, self.values, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
         known = self.values[name]
@@ -394,18 +413,35 @@ class Oracle:
         if telecommands is not None and telemetry is not None:
             self._expect(where, field, value, telecommands + telemetry)
 
-    def _check_clock(self, scale: float, modulo_s: int, where: str, field: Field, value: Value) -> None:
+    def _clock_s(self) -> float | None:
         if self._clock is None:
-            return
+            return None
         since_s, unix_ns = self._clock
-        now_ns = self._icd.conventions.reported_ns(unix_ns + round((self.now_s - since_s) * SECOND_NS))
-        expected = now_ns % (modulo_s * SECOND_NS) / SECOND_NS * scale
-        self._expect(where, field, value, expected, 1.0 if field.kind != "float" else 1e-6 * scale)
+        elapsed_ns = round((self.now_s - since_s) * SECOND_NS)
+        return self._icd.conventions.reported_ns(unix_ns + elapsed_ns) / SECOND_NS
+
+    def _uptime_s(self) -> float | None:
+        return None if self._started_s is None else self.now_s - self._started_s
+
+    def _check_clock(self, modulo_s: int, where: str, field: Field, value: Value) -> None:
+        clock_s = self._clock_s()
+        if clock_s is not None:
+            self._expect(where, field, value, clock_s % modulo_s, 1.0 if field.kind != "float" else 1e-6)
 
     def _check_uptime(self, where: str, field: Field, value: Value) -> None:
-        if self._started_s is not None:
-            uptime_s = self.now_s - self._started_s
+        uptime_s = self._uptime_s()
+        if uptime_s is not None:
             self._expect(where, field, value, uptime_s * (factor("s", field.unit) or 1.0), 1.01)
+
+    def _check_fraction(
+        self, seconds: Callable[[], float | None], scale: float, where: str, _field: Field, value: Value
+    ) -> None:
+        """Check the part of a second, in units of 1 / scale."""
+        expected_s = seconds()
+        if expected_s is None or isinstance(value, (str, bytes)):
+            return
+        if abs((value / scale - expected_s + 0.5) % 1.0 - 0.5) > 1.01 / scale + 1e-6:
+            raise Violation(f"{where}: {value!r}, not {expected_s % 1.0 * scale!r}")
 
     def _check_boot_count(self, where: str, field: Field, value: Value) -> None:
         if self._boot_count is not None:
@@ -418,6 +454,9 @@ class Oracle:
             if self._frames is not None and value < self._frames and self._frames - value < 128:
                 raise Violation(f"{where}: {value} after {self._frames}")
             self._frames = value
+
+    def _check_period(self, where: str, field: Field, value: Value) -> None:
+        self.attitudes.check_period(where, field, value, self.now_s, self.values)
 
     def _check_selected(self, where: str, field: Field, value: Value) -> None:
         if self._selected is not None:
@@ -442,20 +481,14 @@ def _by_argument(row: Row, values: Mapping[str, Value]) -> dict[str, Any]:
 _RUNNING: Final = frozenset({"standby", *IMAGING})
 _COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; `_RUNNING` from all others."""
-_BOUND: Final = frozenset({"update_rate", "exposure", "delay_time"})
-"""Parameters that bound each other."""
-_COUNTER: Final = {"telecommand": "telecommands", "telemetry": "telemetry"}
+_TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
+_PAIRS: Final = frozenset(
+    {"min_star_pixels", "max_star_pixels", "orbit_semi_major_axis", "orbit_eccentricity"}
+)
+_BOUND: Final = _TIMING | _PAIRS
+"""Parameters that bound each other, so that a value within its limits may be refused."""
 _WITHOUT_EFFECT: Final = frozenset(
-    [
-        "nothing",
-        "reset",
-        "subscribe",
-        "save_image",
-        "open_image",
-        "load_image_chunk",
-        "load_file_block",
-        "set_hole_map",
-    ]
+    ["nothing", "reset", "save_image", "open_image", "load_image_chunk", "load_file_block", "set_hole_map"]
 )
 """Actions that leave what the oracle knows as it is."""
 _TIME_UNITS: Final = {

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
@@ -50,6 +51,34 @@ def of_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
     length = math.sqrt(sum(value * value for value in four))
     x, y, z, w = (value / length for value in four)
     return (x, y, z, w)
+
+
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the vector product a × b."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def of_pairs(seen: tuple[Vector, Vector], known: tuple[Vector, Vector]) -> Quaternion:
+    """Return the attitude from two directions in the sensor and in ICRS (TRIAD, Black 1964)."""
+
+    def triad(first: Vector, second: Vector) -> list[Vector]:
+        axes = [first, cross(first, second), cross(first, cross(first, second))]
+        x, y, z = (
+            (axis[0] / length, axis[1] / length, axis[2] / length)
+            for axis in axes
+            if (length := math.hypot(*axis))
+        )
+        return [x, y, z]
+
+    in_sensor, in_icrs = triad(*seen), triad(*known)
+    rows = [
+        [
+            sum(sensor[row] * icrs[column] for sensor, icrs in zip(in_sensor, in_icrs, strict=True))
+            for column in range(3)
+        ]
+        for row in range(3)
+    ]
+    return of_matrix(rows)
 
 
 def of_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:

@@ -16,7 +16,6 @@ from typing import Any, Literal
 from starhil.hil_tests.judge.framings import Framing, Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import SIZES, Field, Row
-from starhil.protocol.canopen.layout import read_layout
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import InterfaceDefinition, load_unit
 from starhil.protocol.unit_folders import find_unit
@@ -134,7 +133,7 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         first_telemetry_id=icd.first_telemetry_id,
         telecommand_crc=icd.conventions.telecommand_crc,
         plugin=icd.plugin,
-        canopen=read_layout(icd) if icd.canopen is not None else None,
+        canopen=icd.canopen,
     )
 
 
@@ -164,7 +163,7 @@ def _fields(row: Any) -> Iterator[Field]:
             yield Field(
                 item.name, item.kind, slot.type, slot.order, offset, size, shift, item.width, item.scale, item.bias,
                 item.minimum, item.maximum, None if item.enum is None else item.enum.values, default, item.const,
-                item.value, item.argument, item.telecommand,
+                item.value, item.argument, item.telecommand, item.unit,
             )  # fmt: skip
             shift += item.width
         offset += size
@@ -188,6 +187,7 @@ class _PluginFraming:
     def __init__(self, unit: Unit) -> None:
         link = unit.serial
         self._framing = unit.plugin.framings[link.framing.name]()
+        self.start, self.end = self._framing.start, self._framing.end
         self._sizes = link.max_size or 1 << 16, link.timeout
 
     def encode(self, body: bytes) -> bytes:

@@ -68,6 +68,7 @@ class Field:
     value: str | None = None
     argument: str | None = None
     telecommand: str | None = None
+    unit: str = ""
 
     @property
     def type_limits(self) -> tuple[int, int]:

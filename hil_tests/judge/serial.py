@@ -84,7 +84,7 @@ class SerialLine:
             self.envelope = Dialect(unit, self.dialect)
         else:
             self.framing = _framing(unit)
-            self.envelope = Headed(unit)
+            self.envelope = Headed(unit, self.framing)
         self.clear()
 
     def clear(self) -> None:
@@ -170,20 +170,14 @@ class Headed:
 
     has_unsolicited = True
 
-    def __init__(self, unit: Unit) -> None:
+    def __init__(self, unit: Unit, framing: Framing) -> None:
         link = unit.serial
         self._unit = unit
-        self._start = bytes(
-            getattr(link.framing, "start", [])
-            if link.framing.kind != "escaped"
-            else (link.framing.escape, link.framing.start)
-        )
-        end = getattr(link.framing, "end", [])
-        ending = {"escaped": 2, "slip": 1}.get(link.framing.kind) or len(end)
+        self._start = framing.start
         self._compute = check_function(link.check, unit.byte_order, partial(plugin_check, unit))
-        self._covers = getattr(link.check, "covers", [])
+        self.covers = getattr(link.check, "covers", [])
         self.check_size = len(self._compute(b""))
-        sizes = {"start": len(self._start), "check": self.check_size, "end": ending}
+        sizes = {"start": len(self._start), "check": self.check_size, "end": len(framing.end)}
         coded = [item for item in unit.classes if item.code is not None]
         requests = [(item.name, item.code) for item in coded]
         replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]
@@ -205,7 +199,7 @@ class Headed:
 
     def _covered(self, header: bytes, data: bytes) -> bytes:
         parts = {"start": self._start, "header": header, "data": data}
-        return b"".join(parts[name] for name in ("start", "header", "data") if name in self._covers)
+        return b"".join(parts[name] for name in ("start", "header", "data") if name in self.covers)
 
     def size(self, begun: bytes, asked: Request | None) -> int | None:
         """Return the size of header, data and check."""

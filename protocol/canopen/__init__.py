@@ -13,7 +13,7 @@ from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, NmtState, 
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.eds import build_eds
-from starhil.protocol.canopen.emergency import ErrorCode, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 
@@ -24,7 +24,7 @@ __all__ = [
     "CanopenSlave",
     "Deferred",
     "DeviceDictionary",
-    "ErrorCode",
+    "EmergencyCode",
     "ErrorRegister",
     "EventKind",
     "FileStorage",

@@ -8,8 +8,8 @@ from typing import Final
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.cob import BIT_30, EMERGENCY, INVALID, SDO_RECEIVE, SDO_TRANSMIT, SYNC, TIME
-from starhil.protocol.canopen.layout import CanopenModel, PdoModel
 from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING
+from starhil.protocol.canopen_schema import CanopenModel, PdoModel
 
 U8: Final = datatypes.UNSIGNED8
 U16: Final = datatypes.UNSIGNED16

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, NoReturn
 
@@ -18,13 +19,12 @@ from starhil.protocol.canopen.communication import (
     variable,
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from starhil.protocol.canopen.layout import (
+from starhil.protocol.canopen_schema import (
     CanopenModel,
     PackedField,
     PdoModel,
     PlacedMember,
     PlacedObject,
-    read_layout,
 )
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
@@ -53,6 +53,18 @@ DATA_TYPES: Final[dict[str, int]] = {
 Key = tuple[int, int]
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What an entry reads: a slot of a telemetry row, or all of it, as it is or as a narrower integer."""
+
+    row: Row
+    slot: Slot | None = None
+    """None for the whole row."""
+    fields: Sequence[Field] = ()
+    """Fields of the slot."""
+    packed: PackedField | None = None
+
+
 class DeviceDictionary(Dictionary):
     """Object dictionary of a device, built from its interface definition.
 
@@ -62,19 +74,26 @@ class DeviceDictionary(Dictionary):
         The interface definition.
     layout
         Indices of its rows, fields and parameters.
+    application
+        Device behind the dictionary; by default it is a stand-in.
 
     Attributes
     ----------
+    readings
+        Key of an entry → the part of a telemetry row that it reads.
     sources
         Telemetry row → keys of the entries that contain it.
     parameters
         Parameter → key of its entry.
     """
 
-    def __init__(self, icd: InterfaceDefinition, layout: CanopenModel) -> None:
+    def __init__(
+        self, icd: InterfaceDefinition, layout: CanopenModel, application: Application | None = None
+    ) -> None:
         self.icd = icd
         self.layout = layout
-        self.application: Application = StandInApplication(icd)
+        self.application: Application = application or StandInApplication(icd)
+        self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
         self.parameters: dict[str, Key] = {}
         self._readers: dict[Key, Callable[[], bytes]] = {}
@@ -160,7 +179,7 @@ class DeviceDictionary(Dictionary):
             key = (placed.index, row.id)
             if row.kind == "telemetry":
                 member = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
-                self._bind_reader(key, row, row.name, partial(self.row_bytes, row))
+                self._bind_reader(key, Reading(row), row.name, partial(self.row_bytes, row))
                 self._placed[row.kind, row.name, None] = key
             else:
                 member = self._telecommand_variable(row.name, key, row)
@@ -176,7 +195,9 @@ class DeviceDictionary(Dictionary):
             member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
             _describe(member, fields)
             for field in fields:
-                self._bind_reader(key, row, field.name, partial(self._read_slot, row, slot))
+                self._bind_reader(
+                    key, Reading(row, slot, fields), field.name, partial(self._read_slot, row, slot)
+                )
             self._placed[row.kind, row.name, slot.index] = key
             if placed.telecommand is not None:
                 member.access_type = "rw"
@@ -219,7 +240,9 @@ class DeviceDictionary(Dictionary):
                 member.access_type = "rw"
             read = partial(self._read_slot, row, slot)
             text = fields[0].kind == "text"
-            self._bind_reader(key, row, name, (lambda: read().rstrip(b"\0")) if text else read)
+            self._bind_reader(
+                key, Reading(row, slot, fields), name, (lambda: read().rstrip(b"\0")) if text else read
+            )
             self._placed[row.kind, row.name, slot.index] = key
         return member
 
@@ -308,7 +331,8 @@ class DeviceDictionary(Dictionary):
             _describe(member, fields)
             member.min = member.max = None
             member.factor = model.scale
-            self._bind_reader(key, row, name, _Packer(self, row, slot, fields, model))
+            packer = _Packer(self, row, slot, fields, model)
+            self._bind_reader(key, Reading(row, slot, fields, model), name, packer)
             members.append(member)
         add_record(objects, placed.name, members)
 
@@ -359,9 +383,10 @@ class DeviceDictionary(Dictionary):
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
         return in_order(slot, self.row_bytes(row)[span_of(slot)])
 
-    def _bind_reader(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
+    def _bind_reader(self, key: Key, reading: Reading, name: str, reader: Callable[[], bytes]) -> None:
+        self.readings[key] = reading
         self._readers[key] = reader
-        self.sources.setdefault(row.name, set()).add(key)
+        self.sources.setdefault(reading.row.name, set()).add(key)
         self._names[f"{key[0]:04x}.{name}"] = key
 
     def _slot_of(self, reference: str) -> tuple[Row, Slot, list[Field]]:
@@ -420,9 +445,14 @@ class _Packer:
         return enum.values[value]
 
 
-def build_dictionary(icd: InterfaceDefinition) -> DeviceDictionary:
-    """Build the object dictionary of the device that serves a definition, with the definition's layout."""
-    return DeviceDictionary(icd, read_layout(icd))
+def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:
+    """Build the object dictionary of the device that serves a definition, with the definition's layout.
+
+    Raises IcdError for a definition without `[canopen]`, and for a layout that does not fit its rows.
+    """
+    if icd.canopen is None:
+        raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
+    return DeviceDictionary(icd, icd.canopen, application)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

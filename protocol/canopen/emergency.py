@@ -30,7 +30,7 @@ MESSAGE: Final = construct.Struct(
 """The 8 bytes of an EMCY message: error code, error register, manufacturer-specific bytes."""
 
 
-class ErrorCode(IntEnum):
+class EmergencyCode(IntEnum):
     """EMCY error codes of the communication profile."""
 
     RESET = 0x0000
@@ -127,7 +127,7 @@ class EmergencyProducer:
         if self._active.pop((code, key), None) is None:
             return False
         self._context.report(EventKind.EMERGENCY, 0, f"error 0x{code:04X} gone")
-        self._enqueue(ErrorCode.RESET, code.to_bytes(2, "little"))
+        self._enqueue(EmergencyCode.RESET, code.to_bytes(2, "little"))
         return True
 
     @property

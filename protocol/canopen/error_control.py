@@ -10,7 +10,7 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.cob import ERROR_CONTROL
 from starhil.protocol.canopen.context import Context, EventKind, NmtState
 from starhil.protocol.canopen.dictionary import Entry
-from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer, ErrorRegister
 
 GUARD_TIME: Final = (0x100C, 0)
 LIFE_FACTOR: Final = (0x100D, 0)
@@ -93,7 +93,7 @@ class ErrorControl:
         if monitor.lost:
             monitor.lost = False
             self._context.report(EventKind.NODE_FOUND, node_id)
-            self._emergency.clear_error(ErrorCode.HEARTBEAT, key=bytes([node_id]))
+            self._emergency.clear_error(EmergencyCode.HEARTBEAT, key=bytes([node_id]))
 
     def receive_guarding(self) -> None:
         """Answer the guarding request of the master, unless the heartbeat is in use."""
@@ -106,7 +106,7 @@ class ErrorControl:
         if self._guarding_lost:
             self._guarding_lost = False
             self._context.report(EventKind.GUARDING_FOUND)
-            self._emergency.clear_error(ErrorCode.HEARTBEAT, key=GUARDING_KEY)
+            self._emergency.clear_error(EmergencyCode.HEARTBEAT, key=GUARDING_KEY)
 
     def tick(self) -> None:
         """Send the heartbeat if it is due, and check which nodes have fallen silent."""
@@ -127,7 +127,7 @@ class ErrorControl:
             self._failed(GUARDING_KEY, b"")
 
     def _failed(self, key: bytes, data: bytes) -> None:
-        self._emergency.raise_error(ErrorCode.HEARTBEAT, ErrorRegister.COMMUNICATION, data, key=key)
+        self._emergency.raise_error(EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, data, key=key)
         self._on_failure()
 
     def _schedule(self, period_ms: int) -> None:
@@ -147,7 +147,7 @@ class ErrorControl:
     def _unwatch(self, value: int) -> None:
         node_id, period_ms = value >> 16 & 0xFF, value & 0xFFFF
         if period_ms and self._monitors.pop(node_id, None) is not None:
-            self._emergency.clear_error(ErrorCode.HEARTBEAT, key=bytes([node_id]))
+            self._emergency.clear_error(EmergencyCode.HEARTBEAT, key=bytes([node_id]))
 
     def _checker(self, entry: Entry) -> Callable[[bytes], None]:
         def changed(data: bytes) -> None:

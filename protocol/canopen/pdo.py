@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.context import Context, EventKind, NmtState
 from starhil.protocol.canopen.dictionary import check_value
-from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer, ErrorRegister
 from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedObject, PdoRecords
 
 
@@ -41,20 +41,20 @@ class ReceivePdo:
         """Process a message; report a wrong length and drop a message that is too short."""
         if len(data) < self._size:
             detail = bytes([*self._key, len(data)])
-            self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
+            self._emergency.clear_error(EmergencyCode.PDO_LENGTH_HIGH, key=self._key)
             self._emergency.raise_error(
-                ErrorCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key
+                EmergencyCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key
             )
             return
-        self._emergency.clear_error(ErrorCode.PDO_LENGTH_LOW, key=self._key)
-        self._emergency.clear_error(ErrorCode.RPDO_TIMEOUT, key=self._key)
+        self._emergency.clear_error(EmergencyCode.PDO_LENGTH_LOW, key=self._key)
+        self._emergency.clear_error(EmergencyCode.RPDO_TIMEOUT, key=self._key)
         if len(data) > self._size:
             detail = bytes([*self._key, len(data)])
             self._emergency.raise_error(
-                ErrorCode.PDO_LENGTH_HIGH, ErrorRegister.COMMUNICATION, detail, key=self._key
+                EmergencyCode.PDO_LENGTH_HIGH, ErrorRegister.COMMUNICATION, detail, key=self._key
             )
         else:
-            self._emergency.clear_error(ErrorCode.PDO_LENGTH_HIGH, key=self._key)
+            self._emergency.clear_error(EmergencyCode.PDO_LENGTH_HIGH, key=self._key)
         self.next_deadline = self._context.now + self.records.event_s if self.records.event_s else None
         if self.records.transmission_type <= LAST_CYCLIC:
             self._pending = data
@@ -72,7 +72,7 @@ class ReceivePdo:
         if self.next_deadline is not None and self._context.now >= self.next_deadline:
             self.next_deadline = None
             self._emergency.raise_error(
-                ErrorCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, self._key, key=self._key
+                EmergencyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, self._key, key=self._key
             )
 
     def _apply(self, data: bytes) -> None:
@@ -94,13 +94,13 @@ class ReceivePdo:
         except SdoAbortError as refusal:
             self._context.report(EventKind.REFUSED, self.records.number + 1, f"RPDO: {refusal}")
             self._emergency.raise_error(
-                ErrorCode.PROTOCOL,
+                EmergencyCode.PROTOCOL,
                 ErrorRegister.COMMUNICATION,
                 self._key + refusal.code.to_bytes(4, "little"),
                 key=self._key,
             )
             return
-        self._emergency.clear_error(ErrorCode.PROTOCOL, key=self._key)
+        self._emergency.clear_error(EmergencyCode.PROTOCOL, key=self._key)
 
 
 class TransmitPdo:

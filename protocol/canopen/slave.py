@@ -21,7 +21,7 @@ from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
 from starhil.protocol.canopen.pdo import PdoService
 from starhil.protocol.canopen.sdo import SdoServer
 from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, MemoryStorage, ParameterStorage
-from starhil.protocol.canopen.store import ParameterStore
+from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
 from starhil.protocol.canopen.sync import SyncService
 from starhil.protocol.canopen.timestamp import TimeConsumer
 from starhil.protocol.errors import ProtocolError
@@ -55,6 +55,11 @@ class CanopenSlave:
         Silence of an SDO client after which its transfer is aborted.
     bit_rates
         Bit rates that LSS may set, bit/s.
+    on_save, on_restore
+        As in `ParameterStore`.
+    on_reset
+        Called to reset the application when NMT resets the node; a returned node ID applies unless LSS has
+        stored one.
 
     Raises
     ------
@@ -71,12 +76,17 @@ class CanopenSlave:
         storage: ParameterStorage | None = None,
         sdo_timeout_s: float = 1.0,
         bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
+        on_save: ApplicationStore | None = None,
+        on_restore: ApplicationStore | None = None,
+        on_reset: Callable[[], int | None] | None = None,
     ) -> None:
         if not 1 <= node_id <= 127 and node_id != UNCONFIGURED:
             raise ProtocolError(f"CANopen node ID {node_id}: must be 1 to 127, or 255 to wait for LSS")
         self.dictionary = dictionary
         self._context = context = Context(dictionary, node_id)
-        self.store = ParameterStore(context, MemoryStorage() if storage is None else storage)
+        self.store = ParameterStore(
+            context, MemoryStorage() if storage is None else storage, on_save, on_restore
+        )
         stored = self.store.load_lss()
         if stored is not None:
             context.node_id, bit_rate = stored
@@ -88,9 +98,7 @@ class CanopenSlave:
         self.time = TimeConsumer(context)
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
         self.pdos = PdoService(context, self.emergency)
-        self.on_reset: Callable[[], int | None] | None = None
-        """Called to reset the application when NMT resets the node; a returned node ID applies unless LSS has
-        stored one."""
+        self._on_reset = on_reset
         self._clock_offset_us = 0
         self._silence: tuple[float, float] | None = None
         self._pending_bit_rate = bit_rate
@@ -351,8 +359,8 @@ class CanopenSlave:
     def _reset(self, *, application: bool) -> None:
         kind = EventKind.RESET_NODE if application else EventKind.RESET_COMMUNICATION
         self._context.report(kind)
-        if application and self.on_reset is not None:
-            self._prepare_node_id(self.on_reset())
+        if application and self._on_reset is not None:
+            self._prepare_node_id(self._on_reset())
         self._initialise(application=application)
 
     def _prepare_node_id(self, node_id: int | None) -> None:

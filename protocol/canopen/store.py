@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Final, TypeAlias
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.context import Context, EventKind
@@ -22,6 +22,10 @@ ON_COMMAND: Final = b"\x01\0\0\0"
 """Value read from 1010h and 1011h: the node stores on command, not autonomously."""
 
 
+ApplicationStore: TypeAlias = Callable[[], Deferred | None]
+"""Stores the parameters of the application; a `Deferred` is answered when this is done."""
+
+
 class ParameterStore:
     """Saves parameters across a restart, and restores the defaults.
 
@@ -31,15 +35,23 @@ class ParameterStore:
         Shared by the node.
     storage
         Storage of the values.
+    on_save
+        Saves the parameters of the application; raises `SdoAbortError` on failure.
+    on_restore
+        Resets the parameters of the application to their defaults at its next restart.
     """
 
-    def __init__(self, context: Context, storage: ParameterStorage) -> None:
+    def __init__(
+        self,
+        context: Context,
+        storage: ParameterStorage,
+        on_save: ApplicationStore | None = None,
+        on_restore: ApplicationStore | None = None,
+    ) -> None:
         self._context = context
         self._storage = storage
-        self.on_save: Callable[[], Deferred | None] | None = None
-        """Saves the parameters of the application; raises `SdoAbortError` on failure."""
-        self.on_restore: Callable[[], Deferred | None] | None = None
-        """Resets the parameters of the application to their defaults at its next restart."""
+        self._on_save = on_save
+        self._on_restore = on_restore
         for index, action in ((STORE, self._store), (RESTORE, self._restore)):
             for subindex in (ALL, *GROUPS):
                 entry = context.dictionary.find(index, subindex)
@@ -99,8 +111,8 @@ class ParameterStore:
         for number, group in GROUPS.items():
             if subindex in {ALL, number}:
                 self._save(group)
-                if group == APPLICATION and self.on_save is not None:
-                    deferred = self.on_save()
+                if group == APPLICATION and self._on_save is not None:
+                    deferred = self._on_save()
         self._context.report(EventKind.STORED, subindex)
         return deferred
 
@@ -127,8 +139,8 @@ class ParameterStore:
                     self._storage.clear(group)
                 except StorageError as error:
                     self._abort_on_storage_error(error)
-                if group == APPLICATION and self.on_restore is not None:
-                    deferred = self.on_restore()
+                if group == APPLICATION and self._on_restore is not None:
+                    deferred = self._on_restore()
         self._context.report(EventKind.RESTORED, subindex)
         return deferred
 

@@ -7,7 +7,7 @@ from typing import Final
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_can_id, check_replacement
 from starhil.protocol.canopen.context import Context
-from starhil.protocol.canopen.emergency import EmergencyProducer, ErrorCode, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer, ErrorRegister
 
 COB_ID: Final = (0x1005, 0)
 PERIOD: Final = (0x1006, 0)
@@ -50,9 +50,9 @@ class SyncService:
             return None
         if len(data) != (1 if self._overflow.number() else 0):
             detail = bytes([len(data)])
-            self._emergency.raise_error(ErrorCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, detail)
+            self._emergency.raise_error(EmergencyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, detail)
             return None
-        self._emergency.clear_error(ErrorCode.SYNC_LENGTH)
+        self._emergency.clear_error(EmergencyCode.SYNC_LENGTH)
         return data[0] if data else 0
 
     def tick(self) -> int | None:

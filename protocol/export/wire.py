@@ -8,12 +8,13 @@ from typing import Final
 from pydantic import BaseModel
 
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
-from starhil.protocol.canopen.layout import CanopenModel, PdoModel, PlacedObject, read_layout
+from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
+from starhil.protocol.cubespace_serial import encode_reply, encode_request
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import serial_answers
 from starhil.protocol.values import Section
 
@@ -60,8 +61,7 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
-        layout = read_layout(icd)
-        found += [_objects(layout), _pdos(layout)]
+        found += [_objects(icd.canopen), _pdos(icd.canopen)]
     return tuple(found)
 
 

@@ -13,7 +13,7 @@ from functools import partial
 from itertools import takewhile
 from typing import Final
 
-from starhil.protocol.serial_framing import PacingSchedule
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import Statistics, Transport
 
 BACKLOG_LIMIT: Final = 64 * 1024
@@ -24,6 +24,30 @@ GRAIN_S: Final = 1e-6
 
 RETRY_S: Final = 0.005
 """Time until the next attempt if the port is full."""
+
+
+class PacingSchedule:
+    """Schedule of bytes on a serial line at its bit rate."""
+
+    def __init__(self, baud: int, bits_per_byte: int = 10) -> None:
+        if baud <= 0 or bits_per_byte <= 0:
+            raise ProtocolError(f"baud rate {baud} and {bits_per_byte} bits per byte must be positive")
+        self.seconds_per_byte: Final = bits_per_byte / baud
+        """Time that one byte takes on the line."""
+        self._free_at = float("-inf")
+
+    def reserve(self, now: float, size: int) -> tuple[float, float]:
+        """Reserve the line for `size` bytes.
+
+        Returns the times at which the first byte begins and the last one ends.
+        """
+        begin = max(now, self._free_at)
+        self._free_at = begin + size * self.seconds_per_byte
+        return begin, self._free_at
+
+    def release(self) -> None:
+        """Free the line: the reserved bytes are not sent."""
+        self._free_at = float("-inf")
 
 
 class PacedWriter:

@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.flow import TURN
-from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import TransportError
-from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
+from starhil.protocol.transports.paced import PacedTransport, PacingSchedule, termios_as_os_error, write_fd
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _IN_CLOSE: Final = 0x08 | 0x10

@@ -16,9 +16,14 @@ import serial
 
 from starhil.protocol.errors import reason
 from starhil.protocol.flow import TURN, TurnProtocol, detect_lost_peer
-from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
-from starhil.protocol.transports.paced import PacedTransport, SerialTransport, termios_as_os_error, write_fd
+from starhil.protocol.transports.paced import (
+    PacedTransport,
+    PacingSchedule,
+    SerialTransport,
+    termios_as_os_error,
+    write_fd,
+)
 from starhil.protocol.transports.pty import PtyTransport
 
 STREAM_LIMIT: Final = 65536

@@ -1,9 +1,9 @@
 """The thesis's filter and camera motion as its MATLAB program ran them, inferred from tables A.1–A.18.
 
-The main cluster of algorithm 2 gives a list of objects for each frame. The i-th object of one list is taken
-for the i-th of the other, and MATLAB's `estimateGeometricTransform(…, 'affine')` fits the motion: MSAC, with
-its defaults. Only the inliers of the fit are true stars. If the lists differ in length, or fewer than three
-objects are left, the frame is lost: none of its objects is a true star.
+The main cluster of algorithm 2 gives objects of each frame, and pairs of them that vote for each other. MATLAB's
+`estimateGeometricTransform(…, 'affine')` fits the motion to the pairs: MSAC, with its defaults. Only the
+inliers of the fit are true stars. If the cluster has more objects of one frame than of the other, the frame
+is lost: none of its objects is a true star, as if the function had been given lists of different length.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 
@@ -107,22 +107,25 @@ class MatlabFilter:
     ----------
     pixel_deg
         Width of a pixel, degrees: the limit for inliers is in pixels.
-    pairing
-        "listed": the i-th object in the cluster with the i-th, as the program did. "mutual": objects that
-        vote for each other most; no frame is lost for lists of different length.
+    loses_unequal
+        A frame is lost if the cluster has different numbers of objects of the two frames.
     """
 
     pixel_deg: float
-    pairing: Literal["listed", "mutual"] = "listed"
+    loses_unequal: bool = True
 
     def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
         """Compare two frames; raises `FilterError` as `ClusterFilter`."""
+        return self.inliers(before, now, self.pairs(before, now))
+
+    def pairs(self, before: ObservedFrame, now: ObservedFrame) -> Indices:
+        """Pairs of objects (earlier, later) in the main cluster, (m, 2); none if the frame is lost."""
         found = ClusterFilter()(before, now)
-        pairs = found.matches
-        if self.pairing == "listed":
-            lists = np.flatnonzero(found.true_before), np.flatnonzero(found.true_now)
-            same_length = lists[0].size == lists[1].size
-            pairs = np.column_stack(lists) if same_length else np.empty((0, 2), dtype=np.int64)
+        unequal = np.count_nonzero(found.true_before) != np.count_nonzero(found.true_now)
+        return found.matches[:0] if self.loses_unequal and unequal else found.matches
+
+    def inliers(self, before: ObservedFrame, now: ObservedFrame, pairs: Indices) -> FilterResult:
+        """Keep the pairs that an affine motion explains."""
         inliers = np.zeros(len(pairs), dtype=np.bool_)
         first, second = before.positions[pairs[:, 0]], now.positions[pairs[:, 1]]
         # the samples differ from frame to frame, and are the same whenever a frame is filtered again

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+from starhil.protocol.cubespace_serial import DeviceReceiver
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect
+from starhil.protocol.serial_interface import Dialect
 from tests.conformance.mutant_seams import (
     enter,
     events,

@@ -29,9 +29,8 @@ from starhil.hil_tests.conformance.suites import settings_of
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.canopen import build_dictionary, build_eds
 from starhil.protocol.icd import load_unit
-from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports.base import Transport
-from starhil.protocol.transports.paced import PacedWriter
+from starhil.protocol.transports.paced import PacedWriter, PacingSchedule
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
@@ -170,7 +169,7 @@ class SimulatedUnit:
         link: str,
         damage: Callable[[SimulatedUnit], None] | None = None,
         dialect: str = "b",
-        unit: str = DEFAULT_UNIT,
+        unit: str | Path = DEFAULT_UNIT,
         served: Path | None = None,
     ) -> None:
         self.loop = SimulatedLoop()

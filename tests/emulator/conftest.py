@@ -15,8 +15,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.state_store import MemoryStore, StateStore
-from starhil.emulator.emulation import Emulation
-from starhil.emulator.launch import Run, RunOptions
+from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.pipeline import worker_process
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
 from starhil.emulator.pipeline.messages import (
@@ -35,7 +34,7 @@ from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
-from tests.emulator.runs import DirectImager, FakeImager
+from tests.emulator.runs import DirectImager, FakeImager, FirstHead
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 
@@ -200,23 +199,25 @@ def make_bench() -> Callable[..., Bench]:
 def run(monkeypatch, make_bench):
     """Run a scenario with an emulation that is started and ready."""
     pipeline = make_bench().pipeline
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: FakeImager(pipeline.handle))
+    monkeypatch.setattr("starhil.emulator.run.make_imager", lambda *_, **__: FakeImager(pipeline.handle))
 
     def run(scenario, *, clock="stepped", options=None, others=(), ready_within_s=60.0, **overrides):
         def profile(keys):
             links = {"serial": {"port": "auto"}, "can": {"channel": "off"}}
             return Profile.model_validate({"run": {"clock": clock}, "links": links, **keys})
 
+        def first_head():
+            return FirstHead(run.launched.run, run.launched.ready_fields)
+
+        run.first_head = first_head
+
         async def whole():
-            run.launched = Run(
-                profile(overrides),
-                options or RunOptions(control="auto"),
-                others=[profile(keys) for keys in others],
-            )
+            profiles = [profile(keys) for keys in (overrides, *others)]
+            run.launched = Emulator(profiles, options or RunOptions(control="auto"))
             try:
                 await run.launched.start()
                 line = await asyncio.wait_for(run.launched.ready(), ready_within_s)
-                return await scenario(run.launched.emulation, line)
+                return await scenario(first_head(), line)
             finally:
                 await run.launched.close()
 

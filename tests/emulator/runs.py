@@ -8,6 +8,7 @@ from dataclasses import replace
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady
+from starhil.emulator.signals import Signal
 from starhil.protocol.messages import ErrorCode, Request
 
 CAMERA = {"focal_px": [1220.0, 1220.0], "centre_px": [468.0, 468.0], "distortion": [0.0] * 5}
@@ -32,11 +33,10 @@ class DirectImager:
 class FakeImager(DirectImager):
     """A pipeline that is ready at once, and makes previews while somebody looks."""
 
-    on_failure = None
-
     def __init__(self, handle: Callable[[PipelineRequest], PipelineReply]) -> None:
         super().__init__(handle)
         self.watchers: set[object] = set()
+        self.ended = Signal[str]("end of the pipeline")
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         if self.watchers and isinstance(request, FrameRequest):
@@ -48,6 +48,24 @@ class FakeImager(DirectImager):
 
     async def close(self) -> None:
         return
+
+
+class FirstHead:
+    """The first head of a run, and the run with its truth, its clock and all fields of its ready line."""
+
+    def __init__(self, run, fields=()) -> None:
+        self.run = run
+        self._fields = fields
+
+    def __getattr__(self, name):
+        run = self.run
+        return next(getattr(part, name) for part in (run.heads[0], run, run.truth) if hasattr(part, name))
+
+    @property
+    def ready_fields(self):
+        run = self.run
+        truth = {"truth": run.truth.address} if run.truth.address else {}
+        return {**truth, **run.heads[0].ready_fields, **dict(self._fields)}
 
 
 def command(emulation, name, **values) -> ErrorCode | None:

@@ -9,17 +9,17 @@ import pytest
 from starhil.emulator.clock import SteppedClock
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile, RunConfig, configs_folder
+from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
-from tests.emulator.runs import CAMERA, Control, FakeImager, command, read
+from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 
 def test_a_scenario_reads_its_truth_files_when_the_run_starts(run, tmp_path):
@@ -148,9 +148,12 @@ def test_scenario_events_happen_at_their_simulation_times(run, tmp_path):
         await emulation.stepper.step(1.99)
         assert not emulation.device.unresponsive
         await emulation.stepper.step(0.02)
-        assert run.launched.faults.describe() == {"optical": {"false_stars": 3}, "device": {"stuck": True}}
+        assert run.first_head().faults.describe() == {
+            "optical": {"false_stars": 3},
+            "device": {"stuck": True},
+        }
         await emulation.stepper.step(1.0)
-        assert run.launched.faults.describe() == {}
+        assert run.first_head().faults.describe() == {}
         assert emulation.device.surroundings.truth.state(9.0).attitude.ra_deg == pytest.approx(10.0)
 
     run(scenario, options=RunOptions(scenario=str(path)))
@@ -318,7 +321,7 @@ def test_a_symlink_in_use_is_rejected_and_stays(run, tmp_path):
 
     async def scenario(_emulation, _line):
         first = link.readlink()
-        second = Emulation(Profile.model_validate({"run": {"clock": "stepped"}, "links": links}))
+        second = Run([Profile.model_validate({"run": {"clock": "stepped"}, "links": links})])
         with pytest.raises(EmulatorError, match="in use by another emulator"):
             await second.open()
         await second.close()
@@ -344,13 +347,14 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
     assert profile.run == RunConfig(clock="stepped")
 
     async def scenario():
-        emulation = Emulation(profile)
-        assert isinstance(emulation.imager, ProcessImager)
-        assert isinstance(emulation.clock, SteppedClock)
+        run = Run([profile])
+        assert isinstance(run.clock, SteppedClock)
         try:
-            await emulation.open()
-            emulation.begin()
-            await emulation.ready()
+            await run.open()
+            run.begin()
+            await run.ready()
+            emulation = FirstHead(run)
+            assert isinstance(emulation.imager, ProcessImager)
             await emulation.stepper.step(1.0)
             command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)
@@ -367,7 +371,7 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
             await emulation.stepper.step(2.0)
             assert emulation.device.latest.valid
         finally:
-            await emulation.close()
+            await run.close()
 
     asyncio.run(scenario())
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from starhil.emulator.control.scenario import Scenario
-from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig

@@ -7,9 +7,9 @@ from starhil.emulator.benchmarks.ecss_campaign import REST, Condition, EcssDevic
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.emulation import camera_constants, pipeline_setup
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady, SolverSettings
 from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
 from starhil.emulator.profile import CALIBRATION, load_profile
 from starhil.protocol.icd import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude

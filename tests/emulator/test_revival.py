@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.profile import Profile
-from tests.emulator.runs import CAMERA, command, read
+from starhil.emulator.run import Run
+from tests.emulator.runs import CAMERA, FirstHead, command, read
 from tests.emulator.workers import ANSWERING, WORKER
 
 WITHIN_S = 20.0
@@ -37,14 +37,14 @@ def run(worker):
 
         async def whole():
             process = worker(*programs)
-            emulation = Emulation(profile, worker=process)
+            run = Run([profile], worker=process)
             try:
-                await emulation.open()
-                emulation.begin()
-                await asyncio.wait_for(emulation.ready(), WITHIN_S)
-                await asyncio.wait_for(scenario(emulation, process.started), WITHIN_S)
+                await run.open()
+                run.begin()
+                await asyncio.wait_for(run.ready(), WITHIN_S)
+                await asyncio.wait_for(scenario(FirstHead(run), process.started), WITHIN_S)
             finally:
-                await emulation.close()
+                await run.close()
 
         asyncio.run(whole())
 

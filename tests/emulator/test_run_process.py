@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starhil.protocol.cubespace_serial import HostReceiver, encode_request
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
-from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.serial_interface import Dialect
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
 

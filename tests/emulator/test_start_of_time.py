@@ -64,7 +64,7 @@ def test_truth_and_boot_wait_for_a_slow_start(run, slow_start, clock):
     before = []
 
     async def during():
-        emulation = run.launched.emulation
+        emulation = run.first_head()
         before.append((emulation.clock.now_ns(), emulation.device.modes.mode.value))
 
     slow_start.during = during
@@ -124,14 +124,14 @@ def test_a_step_requested_before_the_pipeline_is_ready_waits_for_it(run, slow_st
     requests = []
 
     async def ask():
-        async with Control(run.launched.emulation) as control:
+        async with Control(run.first_head()) as control:
             return await control.do("step", seconds=1.0)
 
     async def during():
         requests.append(asyncio.create_task(ask()))
         await asyncio.sleep(0.1)
         assert not requests[0].done()
-        assert run.launched.emulation.clock.now_ns() == 0
+        assert run.first_head().clock.now_ns() == 0
 
     slow_start.during = during
 
@@ -145,7 +145,7 @@ def test_a_step_requested_before_the_pipeline_is_ready_waits_for_it(run, slow_st
 @pytest.mark.parametrize("timed", [True, False])
 def test_a_live_feed_that_runs_during_a_slow_start_is_anchored_at_its_end(run, slow_start, timed):
     async def during():
-        feed = run.launched.emulation.feed
+        feed = run.first_head().feed
         for second in range(100):
             quaternion = Attitude.from_radec_roll(second, 0.0, 0.0).quaternion_xyzw.tolist()
             at = {"t": second} if timed else {}

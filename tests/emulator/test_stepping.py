@@ -7,8 +7,8 @@ import time
 
 import pytest
 
+from starhil.protocol.cubespace_serial import encode_request
 from starhil.protocol.messages import Request
-from starhil.protocol.serial_framing import encode_request
 
 STEP_S = 30.0
 PEER_BYTES_S = 300_000.0

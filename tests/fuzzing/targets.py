@@ -6,6 +6,7 @@ by coverage; `test_corpus.py` repeats the inputs that were worth keeping.
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import json
 import logging
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -27,14 +29,13 @@ from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.server import ConsoleServer
 from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.viewer import Viewer
-from starhil.emulator.control.channel import ControlServer, ControlTarget
-from starhil.emulator.control.faults import Faults
+from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.state_store import FileStore
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.replay import EVENTS_FILE, RUN_FILE, read_events, read_run
+from starhil.emulator.run import Run as EmulatorRun
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.file import read_truth_file
@@ -75,6 +76,7 @@ from tests.fuzzing.edits import edited, toml
 from tests.protocol.canopen.conftest import Bench as CanopenBench
 
 CONFIGS = Path(__file__).parents[2] / "configs"
+CORPUS = Path(__file__).parent / "corpus"
 UNITS = tuple(bundled_units())
 DOCUMENTED = (EmulatorError, ProtocolError, BenchError, StaridError)
 """The errors that a caller of the readers expects."""
@@ -120,6 +122,12 @@ def target(
         return make
 
     return enter
+
+
+def read_corpus(name: str) -> list[bytes]:
+    """Return the inputs of a target that were kept: one a line, as Python writes bytes."""
+    path = CORPUS / f"{name}.txt"
+    return [ast.literal_eval(line) for line in path.read_text("ascii").splitlines()] if path.exists() else []
 
 
 def chunks(data: bytes) -> Iterator[bytes]:
@@ -649,20 +657,15 @@ class _Loop:
         self.loop = asyncio.new_event_loop()
         pipeline = FakePipeline()
         keys = {"run": {"clock": "stepped"}, "links": {"serial": {"port": "off"}, "can": {"channel": "off"}}}
-        real = Emulation._make_imager
-        Emulation._make_imager = lambda *_: FakeImager(pipeline.handle)  # type: ignore[method-assign]
-        try:
-            self.emulation = Emulation(Profile.model_validate(keys))
-        finally:
-            Emulation._make_imager = real  # type: ignore[method-assign]
+        with patch("starhil.emulator.run.make_imager", lambda *_, **__: FakeImager(pipeline.handle)):
+            self.run = EmulatorRun([Profile.model_validate(keys)])
         self.call(self._start())
-        faults = Faults(self.emulation.device, self.emulation.links)
-        self.control = ControlServer([ControlTarget(self.emulation, faults)], lambda: None)
+        self.control = ControlServer(self.run, lambda: None)
 
     async def _start(self) -> None:
-        await self.emulation.open()
-        self.emulation.begin()
-        await self.emulation.ready()
+        await self.run.open()
+        self.run.begin()
+        await self.run.ready()
 
     def call(self, awaitable: Any) -> Any:
         """Wait for a coroutine."""
@@ -756,7 +759,7 @@ ASKED = [
 
 def console_of(run_: _Loop) -> Console:
     """Return the console of a run."""
-    return Console(run_.emulation, 1, _Obc(), StepRunner(run_.control.execute), Runs())
+    return Console(run_.run, run_.run.heads[0], _Obc(), StepRunner(run_.control.execute), Runs())
 
 
 @target("console", lambda: request_edits(len(ASKED)))

@@ -14,7 +14,7 @@ from starhil.protocol.export import export_folder
 from starhil.protocol.export.packets import key_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import serial_answers
 from tests.protocol.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
 from tests.protocol.test_export_c import KINDS

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from starhil.protocol.export import export
 from starhil.protocol.icd import IcdError, load_unit
+from starhil.protocol.unit_examples import check_unit
 from starhil.protocol.values import Section
 from starid.attitude import Attitude
 
@@ -122,6 +123,16 @@ def test_human_readable_exports_contain_the_convention(name):
             assert cell in said
 
 
+def test_an_unknown_key_hides_what_it_may_cause(tmp_path):
+    (tmp_path / "a.toml").write_text(
+        'unit = { name = "x", version = "1", doc = "x" }\n'
+        '[[section]]\nheading = "Frames"\ncolums = 1\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
+    )
+    assert check_unit(tmp_path) == [
+        f"{tmp_path}/a.toml: section.Frames.colums: unknown key; did you mean columns?"
+    ]
+
+
 def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
     (tmp_path / "a.toml").write_text(
         'unit = { name = "x", version = "1", doc = "x" }\n'
@@ -129,3 +140,14 @@ def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
     )
     with pytest.raises(IcdError, match=r"section\.Frames: row 2 has 1 cells, must have 2"):
         load_unit(tmp_path)
+
+
+def test_errors_speak_of_lists_as_toml_does(tmp_path):
+    (tmp_path / "a.toml").write_text(
+        'unit = { name = "x", version = "1", doc = "x" }\n'
+        'conventions = { axes = ["+x", "+y"] }\n'
+        '[[section]]\nheading = "Frames"\ncolumns = "a"\nrows = []\n'
+    )
+    axes, columns = check_unit(tmp_path)
+    assert axes.endswith("conventions.axes: List should have at least 3 items after validation, not 2")
+    assert columns.endswith("section.Frames.columns: Input should be a valid list")

@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
+from starhil.protocol.cubespace_serial import DeviceReceiver, encode_reply
 from starhil.protocol.export.cosmos_plugin import answer_id
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import DeviceReceiver, Dialect, encode_reply
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import serial_answers
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import packets

@@ -21,17 +21,12 @@ from starhil.protocol.can_framing import (
     encode_request_frames,
 )
 from starhil.protocol.candump import format_candump, parse_candump
+from starhil.protocol.cubespace_serial import DeviceReceiver, HostReceiver, encode_reply, encode_request
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import (
-    DeviceReceiver,
-    Dialect,
-    HostReceiver,
-    encode_reply,
-    encode_request,
-)
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "100000"))

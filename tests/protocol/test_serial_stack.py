@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.link_schema import SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import Dialect
-from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import CubeSpaceStack, build_stack
+from starhil.protocol.serial_interface import Dialect, SerialStack
+from starhil.protocol.serial_stack import build_stack
 
 
 def test_cubespace_keeps_its_codec_and_dialects() -> None:

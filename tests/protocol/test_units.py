@@ -147,6 +147,8 @@ INVALID = [
     ("echo on a line that has none", '[link.serial]\nframing = { kind = "cubespace" }\n' + telecommand("", more='answer = ["echo", "reply"]'), "telecommand command: answer 'echo': link.serial with framing cubespace has no echoes"),
     ("echo on CAN", '[link.can]\nkind = "cubespace"\n' + telemetry("", more='answer = ["echo", "reply"]'), "telemetry row: answer 'echo': link.can has no echoes"),
     ("unknown key", telemetry('{ name = "a", type = "u8", scal = 2 }'), r"row\.fields\.a\.scal: unknown key; did you mean scale"),
+    ("unknown key of a check", '[link.serial]\nframing = { kind = "slip" }\ncheck = { kind = "sum", colour = 1 }\n' + telemetry(""), r"link\.serial\.check\.colour: unknown key"),
+    ("unknown key of a framing", '[link.serial]\nframing = { kind = "fixed", colour = 1 }\n' + telemetry(""), r"link\.serial\.framing\.colour: unknown key"),
     ("unknown key of a convention", '[conventions]\nquaternions = "attitude"\n', r"conventions\.quaternions: unknown key; did you mean quaternion"),
     ("left-handed axes", '[conventions]\naxes = ["+x", "-y", "+z"]\n', "is not a right-handed frame"),
     ("unknown epoch", '[conventions]\nepoch = "y2k"\n', "'y2k' is not one of unix, gps, j2000, midnight"),

@@ -28,7 +28,7 @@ from starhil.hil_tests.conformance.link_probe import (
 from starhil.hil_tests.conformance.ports import CanFrame
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.judge.can import TELECOMMAND_SEGMENT, can_id_of, segments
-from starhil.hil_tests.judge.definition import Parameter, read_unit
+from starhil.hil_tests.judge.definition import Parameter, Unit
 from starhil.hil_tests.judge.messages import Answer, Value
 
 HOST_TIMEOUT_S: Final = 0.3
@@ -61,7 +61,6 @@ CAN_UNSOLICITED: Final = CaseArea[CanProbe](
     intrusive=True,
     links=("can",),
 )
-PARAMETERS: Final = CaseArea[LinkProbe]("parameters", rule(19), intrusive=True)
 
 READ: Final = "1F 7F 80 1F FF"
 """Request for identification."""
@@ -290,6 +289,13 @@ def no_can_flag(probe: CanProbe) -> None:
 
 # --- parameters ---
 
+
+def generated(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    """Yield the cases for each parameter of the unit."""
+    for item in unit.parameters.values():
+        yield from _parameter_cases(item)
+
+
 PARTNERS: Final = {
     "max_star_pixels": ("min_star_pixels", 1.0),
     "min_star_pixels": ("max_star_pixels", 255.0),
@@ -375,7 +381,3 @@ def _inside(parameter: Parameter, present: float) -> list[float]:
         return [float(number) for number in parameter.enum.values()]
     greatest = [] if parameter.name in UNSET else [parameter.maximum]
     return [parameter.minimum, *greatest, parameter.default]
-
-
-for _parameter in read_unit("cubestar").parameters.values():
-    PARAMETERS.cases.extend(_parameter_cases(_parameter))

@@ -1,11 +1,22 @@
-"""Checks against published numbers: agreement within a stated tolerance, or improvement on the number."""
+"""Checks against published numbers: agreement within a stated tolerance, or improvement on the number.
+
+An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
+and marks the checks that it meets as weak. (Constants fitted to published numbers: see `choices`.)
+
+`published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
+tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
+``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``the same``, or a number and its origin.
+"""
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import TypedDict
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypedDict
 
 from starid.lab.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
 
@@ -43,6 +54,12 @@ def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
     return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
 
 
+def sampled_deviation(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+    """Tolerance for two standard deviations over equally many trials, as a multiple of the standard error."""
+    error = sigma / math.sqrt(trials - 1)
+    return sigmas * error, f"{sigmas:g} standard errors of two deviations of {trials}, {sigmas * error:.2g}"
+
+
 def shown(
     quantity: str,
     *,
@@ -69,6 +86,27 @@ def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -
     """Turn a row into a check that passes if all its published numbers match."""
     met, of = sum(map(bool, matches)), len(matches)
     return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
+
+
+def best_constant(intervals: Iterable[Sequence[float]]) -> float:
+    """Value in most of the intervals: the best answer that ignores all that varies within a table."""
+    known = list(intervals)
+    lows = [low for low, _ in known]
+    return max(lows, key=lambda value: sum(low <= value <= high for low, high in known))
+
+
+def null_model(rows: Sequence[Row]) -> list[Row]:
+    """Mark as weak the checks in one column of a table that its best constant answer meets as well."""
+    intervals = [row.interval for row in rows if row.interval]
+    if not intervals:
+        return list(rows)
+    constant = best_constant(intervals)
+    return [
+        replace(row, weak=row.of, weak_met=row.met)
+        if row.interval and row.interval[0] <= constant <= row.interval[1]
+        else row
+        for row in rows
+    ]
 
 
 def agreement(
@@ -100,7 +138,8 @@ def agreement(
     largest, origin = tolerance
     readings = {"published": published, "author": author, "printed": printed, "ours": ours}
     informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
-    return _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
+    made = _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
+    return replace(made, interval=(published - largest, published + largest))
 
 
 def same(
@@ -113,12 +152,18 @@ def same(
     matches: Sequence[bool],
     target: str,
     remark: str = "",
+    null: Sequence[bool] = (),
 ) -> Row:
-    """Make one row for several published numbers; `target` names the rule by which each agrees or not."""
+    """Make one row for several published numbers; `target` names the rule by which each agrees or not.
+
+    `null` says which of the numbers the null model meets.
+    """
     met, of = sum(map(bool, matches)), len(matches)
     remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
     informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
-    return _checked(informing, "agrees", target, matches)
+    made = _checked(informing, "agrees", target, matches)
+    weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
+    return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
 
 
 def improvement(
@@ -140,3 +185,81 @@ def improvement(
     remark = f"Better {better}. {remark}".strip() if passed else remark
     informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
     return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])
+
+
+@lru_cache(maxsize=1)
+def _published() -> dict[tuple[str, str], dict[str, str]]:
+    with Path(__file__).with_name("published.csv").open(encoding="utf-8", newline="") as stream:
+        return {(line["experiment"], line["quantity"]): line for line in csv.DictReader(stream)}
+
+
+def published(experiment: str, quantity: str) -> list[float]:
+    """Return the published numbers of a quantity; none if the thesis has none."""
+    line = _published().get((experiment, quantity))
+    return [] if line is None else [float(word) for word in line["published"].split()]
+
+
+def compared(
+    experiment: str,
+    quantity: str,
+    *,
+    author: Any = None,
+    printed: Any = None,
+    ours: Any = None,
+    remark: str = "",
+) -> Row:
+    """Check a quantity of `published.csv`; several numbers must agree one by one.
+
+    Parameters
+    ----------
+    experiment, quantity
+        Key in `published.csv`.
+    author, printed, ours
+        The number, or as many as are published; the first that is given is checked.
+    remark
+        By default that of the table.
+    """
+    line, numbers = _published()[experiment, quantity], published(experiment, quantity)
+    unit, digits, rule, remark = (
+        line["unit"],
+        int(line["digits"]),
+        line["tolerance"],
+        remark or line["remark"],
+    )
+    if len(numbers) == 1 and rule != "the same":
+        word, _, rest = rule.partition(" ")
+        if word in ("digit", "rounding"):
+            tolerance = rounding(digits if word == "digit" else int(rest), unit)
+        else:
+            tolerance = float(word), rest
+        readings = {
+            name: None if value is None else float(value)
+            for name, value in (("author", author), ("printed", printed), ("ours", ours))
+        }
+        return agreement(
+            quantity,
+            published=numbers[0],
+            tolerance=tolerance,
+            **readings,
+            unit=unit,
+            digits=digits,
+            remark=remark,
+        )
+
+    def text(values: Any) -> str | None:
+        return None if values is None else ", ".join(f"{value:.{digits}f}" for value in values) + unit
+
+    checked = next(values for values in (author, printed, ours) if values is not None)
+    largest = 0.0 if rule == "the same" else 0.51 * 10.0**-digits
+    return same(
+        quantity,
+        published=text(numbers) or "",
+        author=text(author),
+        printed=text(printed),
+        ours=text(ours),
+        matches=[bool(abs(a - b) <= largest) for a, b in zip(checked, numbers, strict=True)],
+        target=rule
+        if rule == "the same"
+        else f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
+        remark=remark,
+    )

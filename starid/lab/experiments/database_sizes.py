@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.lab.experiments.comparison import agreement, rounding
+from starid.lab.experiments.comparison import compared, published
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -17,37 +17,12 @@ from starid.lab.experiments.experiment import (
     Parameters,
     Part,
     Results,
-    Row,
     parts_of,
     row,
     star_catalog,
     write_lines,
 )
 
-_SIZES_KB: Final = {
-    96.0: 99,
-    97.0: 176,
-    98.0: 392,
-    99.0: 1575,
-    99.1: 1945,
-    99.2: 2464,
-    99.3: 3290,
-    99.4: 4380,
-    99.5: 6300,
-    99.75: 25225,
-}
-_NOMINAL: Final = {
-    96.0: 22959,
-    97.0: 40816,
-    98.0: 91836,
-    99.0: 367346,
-    99.1: 453514,
-    99.2: 573979,
-    99.3: 749687,
-    99.4: 1020408,
-    99.5: 1469388,
-    99.6: 2295918,
-}
 _BYTES: Final = 5
 _INCLUSIVE: Final = (99.75,)
 """Overlaps of the databases that include both ends of their ranges."""
@@ -94,49 +69,31 @@ def _inclusive_cells(percent: float) -> float:
     return float((round(360.0 / step) + 1) * (round(140.0 / step) + 1))
 
 
-def _size_row(percent: float, kilobytes: float) -> Row:
-    remark = {
-        98.0: "392 kB are 448 · 175 frames; 360° at a step of 0.8° take 450 columns.",
-        99.3: "The step of 0.28° does not divide 360°.",
-        99.75: "3 601 · 1 401 frames: both ends of the two ranges are counted, which no other size has.",
-    }.get(percent, "")
-    author = _BYTES * _inclusive_cells(percent) / 1000.0 if percent in _INCLUSIVE else kilobytes
-    return agreement(
-        f"table 6.1: database size, p = {percent:g} %",
-        published=float(_SIZES_KB[percent]),
-        tolerance=rounding(0, "kB"),
-        author=author,
-        printed=kilobytes,
-        unit="kB",
-        digits=1,
-        remark=remark,
-    )
-
-
 def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     from starid.thesis.frame_grid import minimum_overlap, nominal_cells
 
-    least = minimum_overlap()
-    rows = [agreement("p_min, eq. 2.27", published=0.2929, tolerance=rounding(4), printed=least, digits=4)]
+    rows = [compared("database-sizes", "p_min, eq. 2.27", printed=minimum_overlap())]
     lines = []
     for percent in context.parameters["percent"]:
         result = results[f"p{percent:g}"]
         cells, nominal = int(result["cells"]), nominal_cells(42.0, percent / 100.0)
-        if percent in _NOMINAL:
-            rows.append(
-                agreement(
-                    f"nominal N, eq. 2.23, φ = 42°, p = {percent:g} %",
-                    published=float(_NOMINAL[percent]),
-                    tolerance=rounding(0),
-                    author=math.floor(nominal),
-                    printed=nominal,
-                    digits=0,
-                )
-            )
-        if percent in _SIZES_KB:
-            rows.append(_size_row(percent, _BYTES * cells / 1000.0))
-        line = {"percent": percent, "nominal_N_42_deg": nominal, "published_N": _NOMINAL.get(percent, "")}
-        line |= {"cells": cells, "bytes_features": _BYTES * cells, "published_kB": _SIZES_KB.get(percent, "")}
+        counted = _inclusive_cells(percent) if percent in _INCLUSIVE else cells
+        quantities = {
+            f"nominal N, eq. 2.23, φ = 42°, p = {percent:g} %": (math.floor(nominal), nominal),
+            f"table 6.1: database size, p = {percent:g} %": (
+                _BYTES * counted / 1000.0,
+                _BYTES * cells / 1000.0,
+            ),
+        }
+        numbers = [published("database-sizes", quantity) for quantity in quantities]
+        rows += [
+            compared("database-sizes", quantity, author=author, printed=printed)
+            for (quantity, (author, printed)), known in zip(quantities.items(), numbers, strict=True)
+            if known
+        ]
+        names = ["".join(f"{number:.0f}" for number in known) for known in numbers]
+        line = {"percent": percent, "nominal_N_42_deg": nominal, "published_N": names[0]}
+        line |= {"cells": cells, "bytes_features": _BYTES * cells, "published_kB": names[1]}
         line |= {"build_s": float(result["seconds"]), "build_processor_s": float(result["processor_s"])}
         lines.append(line | {"bytes_file": int(result["bytes_file"])})
     last = results[f"p{context.parameters['percent'][-1]:g}"]

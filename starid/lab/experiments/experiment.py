@@ -32,8 +32,9 @@ Parameters = Mapping[str, Any]
 EPOCH: Final = 1991.25
 """Epoch of the catalogue: the published numbers are without proper motion."""
 
-Kind = Literal["", "agrees", "better", "ours"]
-"""Class of a check: agreement with a published number, improvement on it, our own bound, or none ("")."""
+Kind = Literal["", "agrees", "fitted", "better", "ours"]
+"""Class of a check: agreement with a published number, the same after a constant was fitted to that number (only in
+the report, see `choices`), improvement on it, our own bound, or none ("")."""
 
 
 class ReproduceError(StaridError):
@@ -84,6 +85,11 @@ class Row:
         Class of the check.
     met, of
         How many of the published numbers in the row agree, and how many there are.
+    interval
+        Lowest and highest value that agrees, for one published number.
+    weak, weak_met
+        How many of the published numbers the best constant answer of the null model meets as well, and how
+        many of these agree.
     """
 
     quantity: str
@@ -97,6 +103,9 @@ class Row:
     kind: Kind = ""
     met: int = 0
     of: int = 0
+    interval: Sequence[float] = ()
+    weak: int = 0
+    weak_met: int = 0
 
 
 @dataclass(frozen=True, slots=True)

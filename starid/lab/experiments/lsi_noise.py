@@ -9,6 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.comparison import Readings, agreement, same, sampling, shown
 from starid.lab.experiments.experiment import (
     Context,
@@ -33,8 +34,6 @@ IDENTIFIED_DEG: Final = 0.283
 _OVERLAP: Final = 0.995
 _KINDS: Final = ("position", "brightness", "both")
 _LEVELS: Final = (1.0, 2.0, 3.0)
-_ROOT: Final = 0.25
-"""Factor on the noise in the author's version: "σ" means 0.25·√σ pixels or units."""
 _UNIT_RANGE: Final = (11.5, 12.5)
 """Interpretation (i): the 255 steps of intensity span one magnitude."""
 _KIND_LABELS: Final = {
@@ -74,9 +73,8 @@ neighbouring cell. (i) *Six features*: with the polar angle as a sixth feature o
 example of section 5.1, and a brightness unit of 1/255 mag, the nearest cell alone has about the published
 shares within 0.3° at the printed noise, but not those within 0.1° and 0.013°; and a search with the polar
 angle is not invariant to roll, as figure 6.3 is. (ii) *As the author ran it*: with MATLAB's `lasso` and a
-noise of 0.25·√σ, as if a fraction of σ had been passed as a variance, all twelve published shares for both
-noises are reproduced to within about two percentage points. Nothing in the text supports the 0.25, but the
-published μ_d (figure 6.18) requires a similar reduction. The percentages 99.99 and 97.99 of section 6.1.2.3
+noise of 0.27·√σ, as if a fraction of σ had been passed as a variance, most of the twelve published shares for
+both noises are reproduced; the 0.27 was fitted to them, and the same law explains tables A.1–A.18 and H.1. The percentages 99.99 and 97.99 of section 6.1.2.3
 cannot be shares of 1 701 frames."""
 
 _TEXT_NOTE: Final = """The thesis's sentence on 0.2°, 0.1° and 0.013° with noise is taken to mean, for each
@@ -116,12 +114,13 @@ def _compute(context: Context, part: Part) -> Results:
                 missing_stars=int(level) if kind == "missing" else 0,
             )
         mean = float(rng.normal()) if values["spread"] else 0.0
-        sigma = _ROOT * math.sqrt(level) if values.get("root") else level
+        if values.get("root"):
+            return identification_noise(level, str(kind))
         moved, dimmed = float(kind in ("position", "both")), float(kind in ("brightness", "both"))
         return NoiseModel(
-            position_sigma_px=sigma * moved,
+            position_sigma_px=level * moved,
             position_mean_px=mean * moved,
-            brightness_sigma=sigma * dimmed,
+            brightness_sigma=level * dimmed,
             brightness_mean=mean * dimmed,
             magnitude_range=_UNIT_RANGE if values.get("six") else NoiseModel().magnitude_range,
         )
@@ -375,6 +374,6 @@ EXPERIMENTS: Final = (
             "cases": ["none", "root-both-1", "root-both-3", "both-3", "false-1", "missing-1"],
             "every": 8,
         },
-        revision=2,
+        revision=3,
     ),
 )

@@ -21,7 +21,6 @@ MODULES: Final[tuple[str, ...]] = (
     "memory",
     "filter_example",
     "fsf",
-    "fsf_limits",
     "fsf_studies",
     "rsi",
     "rsi_printed",

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from starid.files import write_atomically
-from starid.lab.experiments.experiment import Kind, Row
+from starid.lab.experiments.choices import class_of, numbers_by_choice
+from starid.lab.experiments.experiment import Row
 from starid.lab.experiments.known_misses import known_miss
 from starid.lab.experiments.runner import FinishedExperiment
 
@@ -26,11 +27,15 @@ row fills those that apply:
 * **as printed**: the equations and parameters of the thesis's text, solved exactly.
 * **ours**: this project's own solution of the task.
 
-A check belongs to one of three classes, which are counted separately:
+A check belongs to one of these classes, which are counted separately:
 
 * **agrees**: the value as the author ran it (or else as printed, or else ours) is within a tolerance on
   *both* sides of the published number. The tolerance comes from the printed digits or from the sampling
   error; the row says which.
+* **agrees, weak**: the same, but one constant answer for the whole column of the table agrees as well (the
+  best such constant is the null model): these checks can hardly fail.
+* **fitted**: as *agrees*, but a constant was chosen so that this very number comes out. This is no agreement, and it
+  is counted apart.
 * **better**: ours is better than the published number; the row says by how much.
 * **ours**: nothing was published; the bound is a requirement of this project.
 
@@ -45,8 +50,10 @@ How to read the accuracy figures of the LSI algorithm:
   sensor sees. Every accuracy figure is given for both.
 """
 
-CLASSES: Final[dict[Kind, str]] = {
+CLASSES: Final = {
     "agrees": "published numbers agree",
+    "weak": "published numbers agree, and a constant answer does too",
+    "fitted": "published numbers are explained by a constant fitted to them",
     "better": "published numbers are bettered",
     "ours": "bounds of this project hold",
 }
@@ -56,9 +63,12 @@ CLASSES: Final[dict[Kind, str]] = {
 def _mark(experiment: str, row: Row) -> str:
     if row.passed is None:
         return ""
+    kind: str = class_of(experiment, row)
+    if kind == "agrees" and row.weak == row.of:
+        kind = "agrees, weak"
     if row.passed:
-        return row.kind
-    return f"**missed** ({row.kind})" if known_miss(experiment, row) else f"**regression** ({row.kind})"
+        return kind
+    return f"**missed** ({kind})" if known_miss(experiment, row) else f"**regression** ({kind})"
 
 
 def _cell(text: str) -> str:
@@ -92,23 +102,44 @@ def _table(rows: Iterable[tuple[str, Row]]) -> list[str]:
 
 def counts(results: Sequence[FinishedExperiment]) -> dict[str, dict[str, int]]:
     """For each class, how many numbers agree and how many there are."""
-    rows = [row for result in results for row in result.outcome.rows]
-    return {
-        kind: {
-            "met": sum(row.met for row in rows if row.kind == kind),
-            "of": sum(row.of for row in rows if row.kind == kind),
-        }
-        for kind in CLASSES
-    }
+    found = {kind: {"met": 0, "of": 0} for kind in CLASSES}
+    for kind, row in ((class_of(name, row), row) for name, row in _named_rows(results) if row.kind):
+        weak, weak_met = (row.weak, row.weak_met) if kind == "agrees" else (0, 0)
+        for each, met, of in ((kind, row.met - weak_met, row.of - weak), ("weak", weak_met, weak)):
+            found[each]["met"] += met
+            found[each]["of"] += of
+    return found
+
+
+def _named_rows(results: Iterable[FinishedExperiment]) -> list[tuple[str, Row]]:
+    """All rows with the names of their experiments."""
+    return [(result.experiment.name, row) for result in results for row in result.outcome.rows]
+
+
+def _choices(results: Iterable[FinishedExperiment]) -> list[str]:
+    found = numbers_by_choice(_named_rows(results))
+    return [
+        "## Free choices",
+        "",
+        f"The column *as the author ran it* rests on {len(found)} choices that the text of the thesis does not make. A number",
+        "may depend on several.",
+        "",
+        "| choice | numbers that depend on it | of these agree | it was fitted to |",
+        "|---|---:|---:|---:|",
+        *(
+            f"| {name} | {each['numbers']} | {each['agree']} | {each['fitted']} |"
+            for name, each in found.items()
+        ),
+        "",
+    ]
 
 
 def regressions(results: Sequence[FinishedExperiment]) -> list[tuple[str, Row]]:
     """Failed checks that are not known misses, with the names of their experiments."""
     return [
-        (result.experiment.name, row)
-        for result in results
-        for row in result.outcome.failed
-        if known_miss(result.experiment.name, row) is None
+        (name, row)
+        for name, row in _named_rows(results)
+        if row.passed is False and known_miss(name, row) is None
     ]
 
 
@@ -131,7 +162,7 @@ def _section(finished: FinishedExperiment) -> list[str]:
 
 def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int) -> str:
     """Format the report in Markdown."""
-    missed = [(result.experiment.name, row) for result in results for row in result.outcome.failed]
+    missed = [(name, row) for name, row in _named_rows(results) if row.passed is False]
     lost = regressions(results)
     lines = [_HEAD]
     if quick:
@@ -150,6 +181,7 @@ def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int
     found = counts(results)
     lines += [f"| {words} | {found[kind]['met']} | {found[kind]['of']} |" for kind, words in CLASSES.items()]
     lines.append("")
+    lines += _choices(results)
     if lost:
         lines += ["## Regressions", "", *_table(lost), ""]
     known = [entry for entry in missed if entry not in lost]
@@ -173,7 +205,7 @@ def write_report(results: Sequence[FinishedExperiment], folder: Path, *, quick: 
 
 def summary(results: Sequence[FinishedExperiment]) -> dict[str, Any]:
     """Counts and rows as plain values, for `--json`."""
-    rows = [(result, row) for result in results for row in result.outcome.rows]
+    rows = _named_rows(results)
     return {
         "experiments": {
             result.experiment.name: {
@@ -184,23 +216,22 @@ def summary(results: Sequence[FinishedExperiment]) -> dict[str, Any]:
             for result in results
         },
         "classes": counts(results),
+        "choices": numbers_by_choice(rows),
         "missed": sum(row.passed is False for _, row in rows),
         "regressions": [f"{name}: {row.quantity}" for name, row in regressions(results)],
         "rows": [
             {
-                "experiment": result.experiment.name,
+                "experiment": name,
                 "quantity": row.quantity,
                 "published": row.published,
                 "as_the_author_ran_it": row.author,
                 "as_printed": row.printed,
                 "ours": row.ours,
-                "class": row.kind,
+                "class": class_of(name, row),
                 "target": row.target,
                 "passed": row.passed,
-                "known_miss": known.reason
-                if (known := known_miss(result.experiment.name, row)) is not None
-                else None,
+                "known_miss": known.reason if (known := known_miss(name, row)) is not None else None,
             }
-            for result, row in rows
+            for name, row in rows
         ],
     }

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from starid.lab.experiments.author_noise import IDENTIFICATION_ROOT, identification_noise
 from starid.lab.experiments.experiment import Context, Experiment, Outcome, Part, Results
-from starid.lab.experiments.fsf import EQUIVALENT
 from starid.lab.experiments.published import printed_of
 from starid.lab.experiments.rsi_figures import rsi_figures
-from starid.lab.experiments.rsi_parts import BY_EQUATION, BY_TABLE, FIELDS, LSI_ONLY, rsi_parts
+from starid.lab.experiments.rsi_parts import BY_EQUATION, BY_TABLE, FIELDS, LSI_ONLY, PRINTED, rsi_parts
 from starid.lab.experiments.rsi_tables import rsi_notes, rsi_rows, rsi_tables
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, sky_sequence
 from starid.thesis.metrics import boresight_error, rotation_error
@@ -36,7 +36,9 @@ def _settings(values: Mapping[str, Any]) -> RsiSettings:
 def _compute(context: Context, part: Part) -> Results:
     v = part.values
     lsi = context.lost_in_space(v["overlap"])
-    noise = NoiseModel.factor(v["factor"] * v["scale"], v["false_stars"])
+    noise = identification_noise(v["factor"], false_stars=v["false_stars"])
+    if v["scale"] == PRINTED:
+        noise = NoiseModel.factor(v["factor"], v["false_stars"])
     track = TrackFilter(
         TrackFilterSettings(
             position_sigma_deg=max(noise.position_sigma_px * PIXEL_DEG, 0.002),
@@ -110,16 +112,16 @@ EXPERIMENTS: Final = (
                 [0.5, 0, BY_TABLE],
                 [0.5, _MEMORY, BY_EQUATION],
             ],
-            "scales": [EQUIVALENT, 1.0],
+            "scales": [IDENTIFICATION_ROOT, PRINTED],
             "frames": 1001,
         },
         quick={
             "overlaps": [0.995],
             "sets": [[0, 0], [1, 1]],
             "methods": [[1.0, 0, BY_EQUATION], [0.5, _MEMORY, BY_EQUATION]],
-            "scales": [EQUIVALENT],
+            "scales": [IDENTIFICATION_ROOT],
             "frames": 400,
         },
-        revision=3,
+        revision=4,
     ),
 )

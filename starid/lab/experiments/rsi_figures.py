@@ -8,7 +8,15 @@ from typing import Any, Final
 import numpy as np
 
 from starid.lab.experiments.experiment import Context, Part, Results
-from starid.lab.experiments.rsi_parts import BY_TABLE, FIELDS, LSI_ONLY, SETTLING, method_of, rsi_parts
+from starid.lab.experiments.rsi_parts import (
+    BY_TABLE,
+    FIELDS,
+    LSI_ONLY,
+    SETTLING,
+    method_of,
+    noise_label,
+    rsi_parts,
+)
 from starid.plots import colours, figure, precision_curve, save
 
 _SHOWN: Final = 40
@@ -64,7 +72,7 @@ def _by_noise(context: Context, results: Mapping[str, Results], scale: float) ->
             )
         axis.set(title=f"μ = f = {factor}", xlabel="threshold of ε_f / °")
     axes[0, 0].legend(loc="lower right")
-    fig.suptitle(f"Figures 6.37, 6.38, F.1, F.2; noise × {scale:g}")
+    fig.suptitle(f"Figures 6.37, 6.38, F.1, F.2; {noise_label(scale)}")
     return save(fig, context.folder / f"figures_6_37_6_38_f_1_f_2_x{scale:g}.png")
 
 
@@ -87,7 +95,7 @@ def _by_method(context: Context, results: Mapping[str, Results], overlap: float,
         axis.legend(loc="lower right")
     last = overlap == context.parameters["overlaps"][-1]
     number, words = ("6_39_to_6_41", "6.39 to 6.41") if last else ("f_3_to_f_5", "F.3 to F.5")
-    fig.suptitle(f"Figures {words}: p = {100 * overlap:g} %, noise × {scale:g}")
+    fig.suptitle(f"Figures {words}: p = {100 * overlap:g} %, {noise_label(scale)}")
     return save(fig, context.folder / f"figures_{number}_x{scale:g}.png")
 
 

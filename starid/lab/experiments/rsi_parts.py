@@ -32,6 +32,9 @@ SETTLING: Final = 5
 LSI_ONLY: Final = 0.0
 """Threshold τ for which every frame searches the whole database."""
 
+PRINTED: Final = 1.0
+"""Scale of the noise as printed; another scale stands for scale·√μ (`author_noise`)."""
+
 BY_EQUATION, BY_TABLE = "equation", "table"
 """Side of the search region, by eq. 6.5 as interpreted here, or from table 6.8."""
 
@@ -82,10 +85,15 @@ def method_of(values: Mapping[str, Any]) -> str:
     return name if values["side"] == BY_EQUATION else f"{name}, Γ of table 6.8"
 
 
+def noise_label(scale: float) -> str:
+    """Name of the noise of a scale."""
+    return "noise as printed" if scale == PRINTED else f"noise {scale:g}·√μ"
+
+
 def set_label(values: Mapping[str, Any]) -> str:
     """Describe the overlap, noise and false stars of a part."""
     words = f"p = {100 * values['overlap']:g} %, μ = {values['factor']}, f = {values['false_stars']}"
-    return words + (f", noise × {values['scale']:g}" if values["factor"] else "")
+    return words + (f", {noise_label(values['scale'])}" if values["factor"] else "")
 
 
 def statistics(result: Results) -> dict[str, float]:

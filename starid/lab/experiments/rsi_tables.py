@@ -6,15 +6,17 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
+from starid.lab.experiments.author_noise import IDENTIFICATION_ROOT
 from starid.lab.experiments.comparison import improvement, shown
 from starid.lab.experiments.experiment import Context, Part, Results, Row, write_lines
-from starid.lab.experiments.fsf import EQUIVALENT
 from starid.lab.experiments.published import printed_of
 from starid.lab.experiments.rsi_parts import (
     BY_TABLE,
     LSI_ONLY,
+    PRINTED,
     SETTLING,
     method_of,
+    noise_label,
     rsi_parts,
     set_label,
     statistics,
@@ -171,7 +173,7 @@ def rsi_rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
         chosen = [
             p
             for p in parts
-            if p.values["overlap"] == overlap and p.values["memory"] and p.values["scale"] != 1.0
+            if p.values["overlap"] == overlap and p.values["memory"] and p.values["scale"] != PRINTED
         ]
         means = {set_label(p.values): statistics(results[p.key])["error_mean"] for p in chosen}
         worst = max(means, key=lambda words: means[words])
@@ -194,8 +196,8 @@ frame to the next the boresight moves by U(−25, 25) px per axis and the frame 
 enter and leave. The filter is the scalable one; the thesis's own filter is used in the experiment
 `rsi-as-printed`. Objects are visible two degrees beyond the field of the features, so that a star is known
 before it enters. The first {SETTLING} frames, in which false stars cannot be recognised yet, are left out of
-the statistics. "Noise × {EQUIVALENT:g}" is the noise to which the published μ_d corresponds. All methods
-process the same frames."""
+the statistics. "Noise {IDENTIFICATION_ROOT:g}·√μ" is the noise to which the published accuracy corresponds. All
+methods process the same frames."""
 
 _MEMORY_NOTE: Final = """**Why the mean is large, and what helps.** Half of the answers as printed are within
 a few hundredths of a degree; the mean is dominated by rare gross errors. In frames with few stars a
@@ -234,7 +236,9 @@ def rsi_notes(context: Context, results: Mapping[str, Results]) -> list[str]:
         lines = []
         for m, scale, mean, sigma, *sides in (line.values() for line in readings):
             cells = [f"{mean:.2g}", f"{sigma:.2g}", *(f"{side:.2f}" for side in sides)]
-            lines.append((f"μ = f = {m:g}, × {scale:g}", *cells, f"{sides[-1] - _GAMMA_MIN_DEG:.2f}°"))
+            lines.append(
+                (f"μ = f = {m:g}, {noise_label(scale)}", *cells, f"{sides[-1] - _GAMMA_MIN_DEG:.2f}°")
+            )
         notes += [_REGION_NOTE, _wide(head, lines)]
     return notes
 

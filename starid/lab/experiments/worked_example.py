@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array
-from starid.lab.experiments.comparison import agreement, improvement, rounding, same
+from starid.lab.experiments.comparison import compared, improvement, published
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -27,39 +26,12 @@ from starid.thesis.metrics import boresight_error
 
 _CORNER: Final = (95.0, -85.0)
 _NAMES: Final = ("n", "A", "r", "σ_A", "σ_r")
-_FEATURES: Final = (26.0, 11.96, 2.95, 0.37, 5.35)
-_NORMALISED: Final = (26.60, 43.59, 20.03, 47.75, 64.41)
-_THETA: Final = 40.72
 _NEAREST: Final = 735
 _CELLS: Final = (509, 510, 511, 734, 735, 736, 959, 960, 961)
-_DICTIONARY: Final = (
-    (24, 11.99, 5.07, 0.38, 4.80),
-    (24, 11.99, 3.75, 0.38, 4.71),
-    (24, 11.99, 2.75, 0.38, 4.76),
-    (26, 11.98, 4.18, 0.37, 5.52),
-    (26, 11.96, 3.54, 0.37, 5.39),
-    (26, 11.96, 2.46, 0.37, 5.38),
-    (27, 11.97, 3.42, 0.36, 5.60),
-    (27, 11.96, 2.53, 0.37, 5.49),
-    (26, 11.96, 1.34, 0.37, 5.23),
-)
-_THETAS: Final = (29.10, 41.07, 63.52, 30.68, 36.84, 59.80, 34.76, 24.99, 23.00)
-_OMEGA: Final = {
-    "mse": (0, 0, 0.04, 0, 0.45, 0.26, 0, 0.26, 0),
-    "one_se": (0, 0, 0.03, 0, 0.44, 0.26, 0, 0.27, 0),
-}
-_BORESIGHT: Final = {"mse": (94.88, -84.85), "one_se": (94.86, -84.81)}
-_ERROR: Final = {"mse": 0.1983, "one_se": 0.2347}
+_THETAS: Final = "polar angles θ of the dictionary"
 _LABELS: Final = {"mse": "MSE", "one_se": "1SE"}
-_HALF_DIGIT: Final = 0.0051
 _PERCENT, _WIDER_PERCENT = 96.0, 98.0
 
-_PSI: Final = {
-    "mse": (24.71, 11.94, 2.80, 0.35, 5.08, 38.37),
-    "one_se": (24.14, 11.94, 2.72, 0.34, 4.95, 37.06),
-}
-"""Reconstructed features n, A, r, σ_A, σ_r and θ."""
-_EPSILON: Final = {"mse": 2.69, "one_se": 4.13}
 _LAMBDA: Final = {"mse": 1.00, "one_se": 1.40}
 """The λ of eq. 2.34 whose weights are nearest to the printed ones."""
 _TURN: Final = 3.6
@@ -156,85 +128,49 @@ def _compute(context: Context, part: Part) -> Results:
     return {**results, **_author(context)}
 
 
-def _within(ours: Array, published: Sequence[float], tolerance: float = _HALF_DIGIT) -> list[bool]:
-    return [bool(close) for close in np.abs(ours - np.asarray(published, dtype=float)) <= tolerance]
-
-
-def _list(values: Any, digits: int = 2) -> str:
-    return ", ".join(f"{value:.{digits}f}" for value in values)
-
-
-def _numbers(
-    quantity: str,
-    published: Sequence[float],
-    author: Array,
-    printed: Array | None = None,
-    *,
-    digits: int = 2,
-    unit: str = "",
-    remark: str = "",
-) -> Row:
-    """Make a row for a list of published numbers, each of which must agree to its last digit."""
-    tolerance = 0.51 * 10.0**-digits
-    return same(
-        quantity,
-        published=_list(published, digits) + unit,
-        author=_list(author, digits) + unit,
-        printed=None if printed is None else _list(printed, digits) + unit,
-        matches=_within(author, published, tolerance),
-        target=f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
-        remark=remark,
-    )
+def _compared(quantity: str, **readings: Any) -> Row:
+    return compared("worked-example", quantity, **readings)
 
 
 def _estimate_rows(result: Results, kind: str) -> list[Row]:
     word = _LABELS[kind]
-    printed = result[f"boresight_{kind}"] - HALF_FRAME_DEG
-    author = result[f"author_boresight_{kind}"] - HALF_FRAME_DEG
-    fine = result["fine"] - HALF_FRAME_DEG
-    errors = {
-        name: float(boresight_error(corner[0], corner[1], *_CORNER))
-        for name, corner in (("author", author), ("printed", printed), ("ours", fine))
+    corners = {
+        name: values - HALF_FRAME_DEG
+        for name, values in (
+            ("author", result[f"author_boresight_{kind}"]),
+            ("printed", result[f"boresight_{kind}"]),
+            ("ours", result["fine"]),
+        )
     }
+    errors = {
+        name: float(boresight_error(corner[0], corner[1], *_CORNER)) for name, corner in corners.items()
+    }
+    error = f"error of the estimate ε_f ({word})"
     return [
-        _numbers(
+        _compared(
             f"ω ({word}) of the nine cells",
-            _OMEGA[kind],
-            result[f"author_omega_{kind}"],
-            result[f"omega_{kind}"],
+            author=result[f"author_omega_{kind}"],
+            printed=result[f"omega_{kind}"],
             remark=f"λ = {_LAMBDA[kind]:.2f} as the author ran it; as printed {float(result[f'lambda_{kind}']):.2f}.",
         ),
-        _numbers(
+        _compared(
             f"reconstructed features ψ̃ ({word}): n, A, r, σ_A, σ_r, θ",
-            _PSI[kind],
-            result[f"author_rebuilt_{kind}"],
+            author=result[f"author_rebuilt_{kind}"],
         ),
-        agreement(
+        _compared(
             f"error of the reconstruction ε_ψ ({word}), in the features' own units",
-            published=_EPSILON[kind],
-            tolerance=rounding(2),
-            author=float(result[f"author_epsilon_{kind}"]),
+            author=result[f"author_epsilon_{kind}"],
             remark=f"On the normalised scale, as printed, {float(result[f'psi_{kind}']):.3f}.",
         ),
-        _numbers(
+        _compared(
             f"corner of the estimated frame ({word}), α, δ",
-            _BORESIGHT[kind],
-            author,
-            printed,
-            unit="°",
+            author=corners["author"],
+            printed=corners["printed"],
         ),
-        agreement(
-            f"error of the estimate ε_f ({word})",
-            published=_ERROR[kind],
-            tolerance=rounding(2, "°"),
-            **errors,
-            unit="°",
-            digits=4,
-            remark="To two digits; the printed four digits would require three digits of λ.",
-        ),
+        _compared(error, **errors),
         improvement(
-            f"error of the estimate ε_f ({word}), sub-cell search of the whole database",
-            published=_ERROR[kind],
+            f"{error}, sub-cell search of the whole database",
+            published=published("worked-example", error)[0],
             ours=errors["ours"],
             larger=False,
             unit="°",
@@ -247,64 +183,46 @@ def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
     result = results["example"]
     vectors = result["dictionary"]
     author = result["author_dictionary"]
+    pairs = {
+        quantity: (result[f"author_{name}"], result[name])
+        for quantity, name in (
+            ("feature vector (n, A, r, σ_A, σ_r)", "features"),
+            ("polar angle θ", "theta"),
+            ("normalised feature vector, eq. 5.1", "normalised"),
+        )
+    }
+    dictionary = {
+        f"dictionary vector {cell}": pair
+        for cell, pair in zip(_CELLS, zip(author, vectors, strict=True), strict=True)
+    }
+    dictionary[_THETAS] = (result["author_thetas"], result["thetas"])
     rows = [
-        _numbers(
-            "feature vector (n, A, r, σ_A, σ_r)",
-            _FEATURES,
-            result["author_features"],
-            result["features"],
-        ),
-        agreement(
-            "polar angle θ",
-            published=_THETA,
-            tolerance=rounding(2, "°"),
-            author=float(result["author_theta"]),
-            printed=float(result["theta"]),
-            unit="°",
-        ),
-        _numbers(
-            "normalised feature vector, eq. 5.1",
-            _NORMALISED,
-            result["author_normalised"],
-            result["normalised"],
-            remark=f"As the author ran it with the extremes of the database of {_WIDER_PERCENT:g} %.",
-        ),
-        same(
+        *(_compared(quantity, author=one, printed=other) for quantity, (one, other) in pairs.items()),
+        _compared(
             "nearest database vector (counted from 1)",
-            published=str(_NEAREST),
-            author=str(int(result["author_nearest"]) + 1),
-            printed=str(int(result["nearest"]) + 1),
-            matches=[int(result["author_nearest"]) + 1 == _NEAREST],
-            target="the same",
+            author=[int(result["author_nearest"]) + 1],
+            printed=[int(result["nearest"]) + 1],
             remark=f"As the author ran it with the polar angle as a sixth feature. In five features ours is at distance "
             f"{float(result['distance']):.2f}, {_NEAREST} at {result['distances'][4]:.2f}; by the printed vectors others are nearer too. "
             "The rows below continue from 735, as the thesis does.",
         ),
-        same(
-            "cells of the dictionary",
-            published=", ".join(map(str, _CELLS)),
-            printed=", ".join(str(cell + 1) for cell in result["cells"]),
-            matches=[int(cell) + 1 == wanted for cell, wanted in zip(result["cells"], _CELLS, strict=True)],
-            target="the same",
-        ),
-        *(
-            _numbers(f"dictionary vector {cell}", _DICTIONARY[i], author[i], vectors[i])
-            for i, cell in enumerate(_CELLS)
-        ),
-        _numbers(
-            "polar angles θ of the dictionary", _THETAS, result["author_thetas"], result["thetas"], unit="°"
-        ),
+        _compared("cells of the dictionary", printed=result["cells"] + 1),
+        *(_compared(quantity, author=one, printed=other) for quantity, (one, other) in dictionary.items()),
         *_estimate_rows(result, "mse"),
         *_estimate_rows(result, "one_se"),
     ]
+    printed = [published("worked-example", f"dictionary vector {cell}") for cell in _CELLS]
     table: dict[str, Any] = {"cell": result["cells"] + 1}
-    for head, features, thetas in (("", vectors, result["thetas"]), ("published_", _DICTIONARY, _THETAS)):
+    for head, features, thetas in (
+        ("", vectors, result["thetas"]),
+        ("published_", printed, published("worked-example", _THETAS)),
+    ):
         names = (f"{head}{name}" for name in ("n", "A", "r", "sigma_A", "sigma_r"))
         table |= dict(zip(names, zip(*features, strict=True), strict=True))
         table[f"{head}theta_deg"] = thetas
-    for kind, published in _OMEGA.items():
+    for kind, word in _LABELS.items():
         table |= {name: result[name] for name in (f"author_omega_{kind}", f"omega_{kind}")}
-        table[f"published_omega_{kind}"] = published
+        table[f"published_omega_{kind}"] = published("worked-example", f"ω ({word}) of the nine cells")
     files = (write_csv(context.folder / "dictionary.csv", table), _draw(context, result))
     return Outcome(tuple(rows), files, (_NOTE,))
 

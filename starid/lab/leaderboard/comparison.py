@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime as dt
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -203,7 +204,7 @@ def run(
     -------
     dict
         `rows` (list of `Tally.report`), `solvers` (what each takes for each field: database, time to build or
-        load it, growth of resident memory), `skipped`, `versions`, `seed`.
+        load it, growth of resident memory), `skipped`, `versions`, `seed`, `frames` and `date`.
     """
     if frames < 1:
         raise StaridError(f"--frames {frames}: must be at least 1")
@@ -225,6 +226,8 @@ def run(
             tallies += _run_row(row, frames, seed, field_of, budget_s)
     tallies.sort(key=lambda tally: list(rows).index(tally.row))
     return {
+        "date": dt.datetime.now(dt.UTC).date().isoformat(),
+        "frames": frames,
         "seed": seed,
         "rows": [tally.report() for tally in tallies],
         "solvers": made,

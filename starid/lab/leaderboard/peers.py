@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+import math
 import resource
 import struct
 import tempfile
@@ -41,14 +42,16 @@ EVEN: Final = "-even"
 PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve", "solve-field")
 ALL: Final = (*OWN, *CLASSICS, *PEERS)
 PATTERN_MAX_ERROR: Final = 0.005
-RUST_TOLERANCE_RAD: Final = 0.0015
-RUST_LOOKUP_MAGNITUDE: Final = 4.0
+RUST_TOLERANCE_PX: Final = 3.0
+"""Tolerance of ruststartracker for an angle between two stars, pixels at the centre of the field."""
+RUST_PER_FIELD: Final = 20.0
+"""Mean number of stars in a field that ruststartracker looks up; its own example has about as many."""
 RUST_MATCHES: Final = 8
 CEDAR_TIMEOUT_MS: Final = 5000.0
 EVEN_PER_FIELD: Final = 12
 """Maximum number of evenly spread guide stars in the solid angle of a field around any of them."""
 MIN_SIGMA_PX: Final = 0.1
-"""Lowest centroid noise passed to a raw published algorithm."""
+"""Lowest centroid noise passed to a published algorithm, raw or verified."""
 MIN_FEATURE_FIELD_DEG: Final = 30.0
 """Narrowest field for which a feature database (lsi, rsi) is built: its size grows with the inverse square of
 the field."""
@@ -237,7 +240,7 @@ def _own(name: str, camera: Camera) -> Solver:
 
 
 def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> Solver:
-    """Make a published algorithm, with the sensor's limit, the magnitude of one unit of flux and, raw, the centroid noise."""
+    """Make a published algorithm, with the sensor's limit, the magnitude of one unit of flux and the centroid noise."""
     guide = None
     if name.endswith(EVEN):
         if verify:
@@ -254,7 +257,7 @@ def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> 
     )
 
     def solve(scene: Scene) -> Reply:
-        errors = None if verify else np.full(len(scene.flux), max(scene.sigma_px, MIN_SIGMA_PX))
+        errors = np.full(len(scene.flux), max(scene.sigma_px, MIN_SIGMA_PX))
         watch = Stopwatch()
         return _reply(watch, identifier.identify(scene.xy_px, scene.flux, errors))
 
@@ -309,13 +312,14 @@ def _ruststartracker(camera: Camera, stars: StarCatalog) -> Solver:
     from scipy.spatial.transform import Rotation
 
     (fx, fy), (cx, cy) = camera.focal_px, camera.centre_px
+    wanted = round(RUST_PER_FIELD * 4.0 * math.pi / field_solid_angle(camera))
     matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=np.float32)
     tracker: Any = ruststartracker.StarTracker(
         stars.vectors.astype(np.float32),
         stars.v.astype(np.float32),
         ruststartracker.CameraParameters(matrix, (camera.width, camera.height), None),
-        max_lookup_magnitude=RUST_LOOKUP_MAGNITUDE,
-        inter_star_angle_tolerance=RUST_TOLERANCE_RAD,
+        max_lookup_magnitude=float(stars.v[min(wanted, len(stars)) - 1]),
+        inter_star_angle_tolerance=RUST_TOLERANCE_PX * camera.pixel_scale_rad,
         n_minimum_matches=RUST_MATCHES,
     )
 

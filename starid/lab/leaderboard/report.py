@@ -18,7 +18,7 @@ _HEAD: Final = """# Leaderboard of star identification
 unless it says otherwise, the field is 42° wide and shows stars to V 5.5. *Right* answers are within 0.1° of the true boresight and 1° of the
 true roll; in scenes without a sky, it is right not to answer. All other answers are *wrong*. *Ill-conditioned* answers are wrong answers
 within the same limits of the least-squares attitude of the true matches: no solver could do better with these stars.
-A solver that used up its time budget was given fewer scenes.
+A solver that used up its time budget was given fewer scenes: compare no percentages before the number of scenes.
 """
 
 
@@ -32,7 +32,7 @@ def markdown(answer: Answer, command: str) -> str:
             "| solver | scenes | right % | wrong (ill-conditioned) | boresight ″ | over the floor | median ms | 99 % ms | CPU ms |",
             "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
         ]
-        lines += [_line(entry) for entry in ranked(answer, row)]
+        lines += [_line(entry, answer["frames"]) for entry in ranked(answer, row)]
         lines.append("")
     lines += [
         "## Database, build time and memory",
@@ -50,7 +50,7 @@ def markdown(answer: Answer, command: str) -> str:
     ]
     lines += ["", *(f"- {name}: skipped, {why}" for name, why in answer["skipped"].items())]
     versions = ", ".join(f"{name} {version}" for name, version in answer["versions"].items())
-    lines += ["", f"Seed {answer['seed']}. Versions: {versions}.", ""]
+    lines += ["", f"{answer['date']}, seed {answer['seed']}. Versions: {versions}.", ""]
     return "\n".join(lines)
 
 
@@ -70,7 +70,7 @@ def _wrong(entry: Mapping[str, Any]) -> float:
     return 100.0 * float(entry["wrong"]) / max(int(entry["frames"]), 1)
 
 
-def _line(entry: Mapping[str, Any]) -> str:
+def _line(entry: Mapping[str, Any], asked: int) -> str:
     figures = (
         _text(entry["boresight_median_arcsec"], 1),
         _text(entry["floor_ratio"], 2),
@@ -78,7 +78,8 @@ def _line(entry: Mapping[str, Any]) -> str:
         _text(entry["p99_ms"], 1),
         _text(entry["cpu_median_ms"], 2),
     )
-    return f"| {entry['solver']} | {entry['frames']} | {right(entry):.1f} | {entry['wrong']} ({entry['ill_conditioned']}) | {' | '.join(figures)} |"
+    scenes = f"{entry['frames']}" if entry["frames"] == asked else f"**{entry['frames']}** of {asked}"
+    return f"| {entry['solver']} | {scenes} | {right(entry):.1f} | {entry['wrong']} ({entry['ill_conditioned']}) | {' | '.join(figures)} |"
 
 
 def _text(value: float | None, digits: int) -> str:
@@ -117,16 +118,17 @@ def _table(answer: Answer, value: str) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 
 def _plot_rates(answer: Answer, path: Path) -> None:
-    """Draw the share of right answers as colour, and the number of wrong ones in the cells."""
+    """Draw the share of right answers as colour; in the cells, also the wrong ones, and the scenes if not all."""
     from starid.plots import figure, save
 
     solvers, rows = _names(answer, "solver"), _names(answer, "row")
     fig, axis = figure(width=2.5 + 0.62 * len(rows), height=1.8 + 0.3 * len(solvers))
-    shares, wrong = _table(answer, "right"), _table(answer, "wrong")
+    shares, wrong, scenes = (_table(answer, name) for name in ("right", "wrong", "frames"))
     image = axis.imshow(shares, cmap="RdYlGn", vmin=0.0, vmax=100.0, aspect="auto")
     for (i, j), share in np.ndenumerate(shares):
         if np.isfinite(share):
             mark = f"\n{wrong[i, j]:.0f} wrong" if wrong[i, j] > 0 else ""
+            mark += f"\nof {scenes[i, j]:.0f}" if scenes[i, j] < answer["frames"] else ""
             axis.text(j, i, f"{share:.0f}{mark}", ha="center", va="center", fontsize=6)
     axis.set_xticks(range(len(rows)), rows, rotation=60, ha="right", fontsize=7)
     axis.set_yticks(range(len(solvers)), solvers, fontsize=7)

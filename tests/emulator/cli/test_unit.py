@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from starhil.emulator.cli.bench import group as bench
 from starhil.emulator.cli.conformance import links_of
 from starhil.emulator.cli.unit import group
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
+from starhil.emulator.run import Run
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
@@ -64,17 +64,19 @@ def test_all_errors_are_printed_and_the_status_is_1(tmp_path):
 
 
 def test_a_profile_with_a_wrong_unit_starts_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: pytest.fail("the pipeline was started"))
+    monkeypatch.setattr(
+        "starhil.emulator.run.make_imager", lambda *_, **__: pytest.fail("the pipeline was started")
+    )
     unit("new", str(tmp_path / "mine"))
     profile = tmp_path / "profile.toml"
     profile.write_text('extends = "cubestar"\nunit = "mine"\n', encoding="utf-8")
     file = tmp_path / "mine" / "unit.toml"
     file.write_text(file.read_text(encoding="utf-8").replace("attitude.w", "w"), encoding="utf-8")
     with pytest.raises(ProtocolError, match="no quantity named 'w'"):
-        Emulation(load_profile(str(profile)))
+        Run([load_profile(str(profile))])
     file.write_text(file.read_text(encoding="utf-8").replace(', value = "w"', ""), encoding="utf-8")
     with pytest.raises(EmulatorError, match="field q_w: no `value`"):
-        Emulation(load_profile(str(profile)))
+        Run([load_profile(str(profile))])
 
 
 def test_bundled_units_are_listed_and_described():
@@ -131,9 +133,11 @@ def test_a_bench_of_another_unit_than_the_profile_is_rejected():
     ],
 )
 def test_a_unit_without_the_links_that_are_asked_for_starts_nothing(monkeypatch, unit_, links, message):
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: pytest.fail("the pipeline was started"))
+    monkeypatch.setattr(
+        "starhil.emulator.run.make_imager", lambda *_, **__: pytest.fail("the pipeline was started")
+    )
     with pytest.raises(EmulatorError, match=message):
-        Emulation(Profile.model_validate({"unit": unit_, "links": links}))
+        Run([Profile.model_validate({"unit": unit_, "links": links})])
 
 
 @pytest.mark.parametrize(
@@ -159,6 +163,6 @@ def test_the_load_of_the_links_is_refused_for_a_unit_without_its_rows():
 
 
 def test_a_link_that_the_unit_lacks_is_left_out_with_a_warning(monkeypatch, caplog):
-    monkeypatch.setattr(Emulation, "_make_imager", lambda *_: None)
-    Emulation(Profile.model_validate({"unit": "sagitta", "links": {"can": {"channel": "vcan0"}}}))
+    monkeypatch.setattr("starhil.emulator.run.make_imager", lambda *_, **__: None)
+    Run([Profile.model_validate({"unit": "sagitta", "links": {"can": {"channel": "vcan0"}}})])
     assert "links.can.channel: unit sagitta has no such link" in caplog.text

@@ -59,9 +59,9 @@ def test_a_scenario_from_the_page_starts_now(run, tmp_path):
                 "events"
             ] == 1
             await emulation.stepper.step(1.9)
-            assert run.launched.faults.describe() == {}
+            assert run.first_head().faults.describe() == {}
             await emulation.stepper.step(0.2)
-            assert run.launched.faults.describe() == {"optical": {"blank": True}}
+            assert run.first_head().faults.describe() == {"optical": {"blank": True}}
             missing = await page.ask(do="control", request={"do": "scenario", "name": "no_such"})
             assert "no such file" in missing["error"]
 

@@ -4,9 +4,10 @@ import pytest
 
 from starhil.emulator.console.trace import Decoder, WireItem, canopen_text
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
+from starhil.protocol.cubespace_serial import encode_reply, encode_request
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import Dialect, encode_reply, encode_request
+from starhil.protocol.serial_interface import Dialect
 
 ICD = load_unit()
 MODE = ICD.telecommands["set_mode"]

@@ -179,7 +179,7 @@ def test_an_internal_error_is_answered_and_logged_and_the_connection_kept(run, m
     async def scenario(emulation, _line):
         async with Control(emulation) as control:
             with monkeypatch.context() as patch:
-                patch.setattr(run.launched.faults, "describe", lambda: {}[0])
+                patch.setattr(run.first_head().faults, "describe", lambda: {}[0])
                 answer = await control.do("clear_faults", id=4)
             assert answer["id"] == 4
             assert not answer["ok"]

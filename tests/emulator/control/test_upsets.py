@@ -2,8 +2,8 @@
 
 import pytest
 
-from starhil.emulator.control.faults import FaultRequest, Faults
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.faults import FaultRequest, Faults
 from starhil.emulator.profile import Profile
 
 THRESHOLD_BIT = 22

@@ -9,10 +9,10 @@ import struct
 import numpy as np
 import pytest
 
-from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import Failure, FrameRequest, SolverSettings
 from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import LINK_PARAMETERS, Profile, load_profile
 from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_folders import bundled_units

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starhil.emulator.emulation import Emulation
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile
+from starhil.emulator.run import Run
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode, ReplyKind
 from starid.attitude import Attitude
@@ -255,4 +255,4 @@ def test_a_unit_whose_rows_are_bound_to_nothing_does_not_start(tmp_path):
     text = HEAD + row("telemetry", 1, "bare", '{ name = "a", type = "u8" }') + START
     (tmp_path / "unit.toml").write_text(text, encoding="utf-8")
     with pytest.raises(EmulatorError, match="telemetry bare: field a: no `value`"):
-        Emulation(Profile(name="x", unit=str(tmp_path)))
+        Run([Profile(name="x", unit=str(tmp_path))])

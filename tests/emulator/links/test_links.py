@@ -18,8 +18,9 @@ from starhil.protocol.can_framing import (
     MessageType,
     encode_request_frames,
 )
+from starhil.protocol.cubespace_serial import HostReceiver, encode_request
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_framing import Dialect, HostReceiver, encode_request
+from starhil.protocol.serial_interface import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 

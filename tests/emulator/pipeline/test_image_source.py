@@ -10,7 +10,6 @@ import pytest
 
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.emulation import camera_constants, pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.image_source import CapturedImages, FolderImages, open_images, used_bits
 from starhil.emulator.pipeline.messages import (
@@ -21,6 +20,7 @@ from starhil.emulator.pipeline.messages import (
     SolverSettings,
 )
 from starhil.emulator.pipeline.pipeline import Pipeline, make_pipeline
+from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.protocol.icd import load_unit

@@ -5,10 +5,10 @@ import pickle
 
 import pytest
 
-from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
 from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageRequest, PipelineReady
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
 from tests.emulator.workers import ANSWERING, WORKER
 
@@ -84,7 +84,7 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_i
     answers, losses = [], []
 
     async def scenario(imager):
-        imager.on_failure = losses.append
+        imager.ended.connect(losses.append)
         imager.kill()
         imager.submit(REQUEST, answers.append)
         await imager.settle()
@@ -104,7 +104,7 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_i
 
 def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, caplog):
     async def scenario(imager):
-        imager.on_failure = lambda _text: 1 / 0
+        imager.ended.connect(lambda _text: 1 / 0)
         imager.kill()
         imager.submit(REQUEST, lambda _answer: None)
         await imager.settle()
@@ -124,7 +124,7 @@ def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, ca
     answers, losses = [], []
 
     async def scenario(imager):
-        imager.on_failure = losses.append
+        imager.ended.connect(losses.append)
         imager.submit(REQUEST, answers.append)
         while not losses:
             await asyncio.sleep(0.01)
@@ -150,7 +150,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
 
     async def scenario():
         imager = ProcessImager(SETUP, worker(program))
-        imager.on_failure = losses.append
+        imager.ended.connect(losses.append)
         try:
             with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
                 await asyncio.wait_for(imager.start(), WITHIN_S)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from starhil.emulator.device.measurement import as_quaternion
-from starhil.emulator.emulation import pipeline_setup
 from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
 from starhil.emulator.pipeline.messages import CatalogUpset, FrameRequest, FrameResult
 from starhil.emulator.pipeline.pipeline import Pipeline
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starid.attitude import Attitude

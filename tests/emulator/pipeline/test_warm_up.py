@@ -10,7 +10,7 @@ import pytest
 SCRIPT = """
 import sys
 from dataclasses import replace
-from starhil.emulator.emulation import pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import load_profile
 from starid.jit import KernelFunction

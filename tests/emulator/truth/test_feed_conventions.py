@@ -16,8 +16,8 @@ from starhil.emulator.truth.config import MountConfig, TruthConfig
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth.mount import mounted
 from starhil.emulator.truth.source import FixedTruth, RateTruth
+from starhil.emulator.truth.truth import seen_from
 from starid.attitude import Attitude, propagate
 from tests.emulator.runs import Control
 from tests.emulator.truth.simulators import ORION
@@ -102,17 +102,17 @@ def test_the_three_forms_of_a_mount_are_the_same_rotation():
 def test_a_mounted_sensor_sees_along_its_axes_in_the_body_and_turns_with_the_body():
     mount = mount_of(matrix=[[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # boresight along the x axis of the body
     body = RateTruth(ORION, np.radians([0.0, 0.0, 0.5]))
-    sensor = mounted(body, mount)
+    sensor, last = (seen_from(mount, body.state(t)) for t in (7.0, 10.0))
     x_axis = body.state(7.0).attitude.matrix[0]
-    assert sensor.state(7.0).attitude.boresight == pytest.approx(x_axis, abs=1e-12)
-    assert np.degrees(sensor.state(7.0).rate_rad_s) == pytest.approx([-0.5, 0.0, 0.0])
-    later = propagate(sensor.state(7.0).attitude, sensor.state(7.0).rate_rad_s, 3.0)
-    assert apart_arcsec(sensor.state(10.0).attitude, later) < MILLIARCSECOND
+    assert sensor.attitude.boresight == pytest.approx(x_axis, abs=1e-12)
+    assert np.degrees(sensor.rate_rad_s) == pytest.approx([-0.5, 0.0, 0.0])
+    later = propagate(sensor.attitude, sensor.rate_rad_s, 3.0)
+    assert apart_arcsec(last.attitude, later) < MILLIARCSECOND
 
 
 def test_without_a_mount_the_truth_is_the_sensor_s():
-    truth = FixedTruth(ORION)
-    assert mounted(truth, None) is truth
+    state = FixedTruth(ORION).state(0.0)
+    assert seen_from(None, state) is state
 
 
 @pytest.mark.parametrize(

@@ -135,13 +135,13 @@ def lockstep(run, tmp_path, name, blocks, role="client"):
         stub = Stub42(blocks)
         if role == "client":
             port = await stub.listen()
-            await emulation.change_truth(type(emulation.profile).model_validate(truth_of(port)).truth)
+            await emulation.truth.set(type(emulation.profile).model_validate(truth_of(port)).truth)
         else:
             await stub.connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
         async with asyncio.timeout(WITHIN_S):
             await stub.done.wait()
         assert stub.acknowledged == len(blocks)
-        feed = emulation.body_truth
+        feed = emulation.truth.source
         assert (feed.accepted, feed.refused) == (len(blocks), 0), feed.last_fault
         return emulation.clock.now_ns()
 
@@ -204,7 +204,7 @@ def test_a_restarted_42_continues_at_the_clock(run):
         port = int(emulation.ready_fields["truth"].rpartition(":")[2])
         for _ in range(2):
             await Stub42(blocks_of_42(31)).connect(port)
-        return emulation.clock.now_ns(), emulation.body_truth.refused
+        return emulation.clock.now_ns(), emulation.truth.source.refused
 
     assert run(scenario, **truth_of(0, role="server")) == (6_000_000_000, 0)
 
@@ -213,8 +213,8 @@ def test_on_the_real_clock_42_is_acknowledged_and_followed(run):
     async def scenario(emulation, _line):
         stub = Stub42([blocks_of_42(1)[0], *blocks_of_42(30)])
         await stub.connect(int(emulation.ready_fields["truth"].rpartition(":")[2]))
-        assert (emulation.body_truth.accepted, emulation.body_truth.refused) == (31, 0)
-        return emulation.body_truth.state(emulation.clock.now_ns() / 1e9)
+        assert (emulation.truth.source.accepted, emulation.truth.source.refused) == (31, 0)
+        return emulation.truth.source.state(emulation.clock.now_ns() / 1e9)
 
     state = run(scenario, clock="real", **truth_of(0, role="server"))
     assert np.degrees(np.linalg.norm(state.rate_rad_s)) == pytest.approx(np.linalg.norm(RATE_DEG_S), rel=0.6)
@@ -227,7 +227,7 @@ def test_a_42_that_comes_later_is_connected_to(run, caplog, monkeypatch):
         gone = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
         port = gone.sockets[0].getsockname()[1]
         gone.close()
-        await emulation.change_truth(type(emulation.profile).model_validate(truth_of(port)).truth)
+        await emulation.truth.set(type(emulation.profile).model_validate(truth_of(port)).truth)
         while "no connection" not in caplog.text:
             await asyncio.sleep(0.01)
         stub = Stub42(blocks_of_42(11))

@@ -7,11 +7,13 @@ import pytest
 
 from starhil.emulator.cli.endurance import live, read_life, run_once
 from starhil.emulator.device.counters import Counters
+from starhil.emulator.device.cycle import FrameCycle
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.life import Life, make_life
+from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.shrink import kind_of, shortened
 from starhil.hil_tests.endurance.truth import Error, Motion
 from starhil.protocol.icd import load_unit
@@ -39,10 +41,88 @@ def test_a_life_whose_images_are_rendered_ends_without_a_violation():
     assert outcome.violation == ""
 
 
-def test_an_end_of_the_pipeline_is_left_out_of_a_life_whose_images_are_rendered():
-    steps = ({"do": "wait", "s": 5.0}, {"do": "end_pipeline"}, {"do": "wait", "s": 3.0}, READ_MODE)
-    life = replace(life_of("cubestar", 1, 1), links=("serial",), steps=steps)
-    assert [run_once(life, rendered=rendered).violation for rendered in (False, True)] == ["", ""]
+def test_a_rendering_process_that_is_killed_is_an_error_until_its_successor_is_ready():
+    steps = (
+        {"do": "wait", "s": 3.0},
+        READ_MODE,
+        {"do": "end_pipeline"},
+        READ_MODE,
+        {"do": "wait", "s": 3.0},
+        READ_MODE,
+    )
+    life = replace(life_of("cubestar", 1, 1), links=("serial",), profile={}, steps=steps)
+    outcome = run_once(life, rendered=True)
+    assert (outcome.violation, outcome.readings) == ("", 3)
+
+
+def test_a_long_life_passes_the_wraps_of_its_counters():
+    icd = load_unit("cubestar")
+    waits = ({"do": "wait", "s": 4_295_000.0, "most": 100_000},)  # 49.7 days
+    flood = {"do": "flood", "link": "serial", "row": READ_MODE["row"], "count": 66_000}
+    counts = [
+        row
+        for row in icd.telemetry.values()
+        if {"uptime", "counters.telemetry"} & {f.value for f in row.fields}
+    ]
+    reads = tuple({**READ_MODE, "row": ["", row.id, "telemetry"]} for row in counts)
+    profile = {"parameters": {"start_mode": "standby"}}
+    life = Life("cubestar", 1, ("serial",), profile, (*waits, *reads, flood, *reads))
+    outcome = run_once(life)
+    assert outcome.violation == ""
+    assert outcome.device_s > 2**32 / 1000.0
+    assert outcome.requests > 2**16
+
+
+def test_long_lives_last_for_months():
+    icd = load_unit("sagitta")
+    life = make_life(icd, "sagitta", links_of(icd), 1, 150, is_long=True)
+    assert sum(step["s"] for step in life.steps if step["do"] == "wait") > 49.7 * 86_400.0
+    assert not {"power", "fault", "recover"} & {step["do"] for step in life.steps}
+
+
+def test_stars_are_compared_where_a_row_has_no_quaternion():
+    assert run_once(life_of("cubestar-gen2", 1)).attitudes > 0
+
+
+@pytest.mark.parametrize("start", [True, False])
+def test_the_attitudes_in_pdos_are_compared(start):
+    nmt = {"do": "nmt", "link": "canopen", "command": 1 if start else 0x80}
+    attitude = {"ra_deg": 200.0, "dec_deg": 5.0, "roll_deg": 9.0}
+    truth = {"do": "truth", "truth": {"kind": "fixed", "attitude": attitude}}
+    steps = (nmt, {"do": "wait", "s": 20.0}, truth, {"do": "wait", "s": 20.0})
+    outcome = run_once(
+        Life("cubestar", 1, ("canopen",), {"parameters": {"start_mode": "lost_in_space"}}, steps)
+    )
+    assert outcome.violation == ""
+    assert (outcome.attitudes > 10) is start
+
+
+def test_an_update_rate_that_is_not_used_is_found(monkeypatch):
+    monkeypatch.setattr(FrameCycle, "_period_ns", lambda _self: 1_000_000_000)
+    icd = load_unit("cubestar")
+    command, (field, *_) = icd.telecommands["set_update_rate"], icd.telecommands["set_update_rate"].fields
+    data = command.encode({field.name: 0.1}).hex()
+    period = next(
+        row for row in icd.telemetry.values() if any(field.value == "frame.period" for field in row.fields)
+    )
+    steps = (
+        {"do": "request", "link": "can", "row": ["", command.id, "telecommand"], "data": data},
+        {"do": "wait", "s": 200.0},
+        {"do": "request", "link": "can", "row": ["", period.id, "telemetry"]},
+    )
+    life = Life("cubestar", 1, ("can",), {"parameters": {"start_mode": "lost_in_space"}}, steps)
+    assert "sample_period: 1000, not 9999.9" in run_once(life).violation
+
+
+def test_telemetry_that_nobody_has_subscribed_to_is_found(monkeypatch):
+    monkeypatch.setattr(Oracle, "streams", False)
+    row = next(
+        row for row in load_unit("cubestar").telecommands.values() if row.action == "select_unsolicited"
+    )
+    data = row.encode({"telemetry": 160, "rate": 1.0}).hex()
+    select = {"do": "request", "link": "can", "row": ["", row.id, "telecommand"], "data": data}
+    life = Life("cubestar", 1, ("can",), {}, ({"do": "wait", "s": 5.0}, select, {"do": "wait", "s": 5.0}))
+    assert run_once(life).violation.endswith("without a subscription")
 
 
 def test_a_seed_gives_one_life_and_one_outcome():

@@ -4,68 +4,30 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 
+from starhil.hil_tests.judge import canopen
 from starhil.hil_tests.judge.can import frames_of, read_answer
-from starhil.hil_tests.judge.definition import Unit, read_unit, unit_of
+from starhil.hil_tests.judge.definition import Unit, read_unit
 from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import InterfaceDefinition, load_unit
-from starhil.protocol.link_schema import SerialLinkModel
-from starhil.protocol.messages import ErrorCode, MessageClass, Reply, ReplyKind, RequestKind
-from starhil.protocol.serial_framing import Dialect
+from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import bundled_units
-
-ID, LENGTH = {"role": "id", "type": "u8"}, {"role": "length", "type": "u16"}
-LINKS = {
-    "sum, length before the data": {
-        "framing": {"kind": "length", "start": [0xEB, 0x90]},
-        "check": {"kind": "sum", "type": "u16", "complement": "twos", "covers": ["start", "header", "data"]},
-        "request_header": [LENGTH, ID],
-        "reply_header": [LENGTH, ID, {"role": "status", "type": "u8"}],
-    },
-    "xor, all parts counted": {
-        "framing": {"kind": "length", "start": [0x55], "end": [0xAA]},
-        "check": {"kind": "xor", "init": 0x5A, "covers": ["data"]},
-        "request_header": [ID, {**LENGTH, "order": "big", "includes": ["start", "header", "data", "check", "end"]}],
-        "reply_header": [ID, {**LENGTH, "order": "big", "includes": ["header", "data"]}, {"role": "status", "type": "i8"}],
-    },
-    "crc32, DLE": {
-        "framing": {"kind": "escaped"},
-        "check": {"kind": "crc", "type": "u32", "poly": 0x04C11DB7, "init": 0xFFFFFFFF, "reflect": True, "xor": 0xFFFFFFFF},
-        "request_header": [ID, {"type": "u8", "const": 0x10}],
-        "reply_header": [ID, {"type": "bits8", "bits": [{"width": 2, "const": 1}, {"role": "ack"}, {"width": 4}, {"role": "final"}]}],
-    },
-    "hex digits": {
-        "framing": {"kind": "delimited", "start": [0x24], "end": [0x0D, 0x0A], "encoding": "hex"},
-        "check": {"kind": "xor"},
-        "request_header": [{"role": "address", "type": "u16", "default": 0x1234}, ID],
-        "reply_header": [{"role": "address", "type": "u16", "default": 0x1234}, ID, {"role": "status", "type": "u8"}],
-    },
-    "HDLC bytes": {
-        "framing": {"kind": "slip", "end": 0x7E, "escape": 0x7D, "xor": 0x20},
-        "check": {"kind": "crc", "type": "u16", "poly": 0x1021, "init": 0xFFFF, "reflect": True, "xor": 0xFFFF, "order": "big"},
-        "request_header": [ID],
-        "reply_header": [ID, {"role": "status", "type": "u8"}],
-    },
-}  # fmt: skip
-"""One link of each kind that no bundled unit has."""
-
-
-def linked(name: str) -> InterfaceDefinition:
-    """The rows of generation 2 on another link."""
-    link = SerialLinkModel.model_validate(LINKS[name])
-    icd = load_unit("cubestar-gen2")
-    return replace(icd, link=icd.link.model_copy(update={"serial": link}))
+from tests.conformance.links import LINKS, write_unit
 
 
 def definitions() -> dict[str, tuple[InterfaceDefinition, Unit]]:
-    found = {name: (load_unit(name), read_unit(name)) for name in bundled_units()}
-    return found | {name: (linked(name), unit_of(linked(name))) for name in LINKS}
+    """All bundled units, and one for each kind of link that none of them has."""
+    with TemporaryDirectory() as folder:
+        others = [write_unit(Path(folder) / link, link) for link in LINKS]
+        return {Path(name).name: (load_unit(name), read_unit(name)) for name in (*bundled_units(), *others)}
 
 
 DEFINITIONS = definitions()
@@ -78,7 +40,7 @@ def same(one: object, other: object) -> bool:
     return one == other or (isinstance(one, float) and math.isclose(one, float(str(other)), rel_tol=1e-12))
 
 
-@pytest.mark.parametrize("name", bundled_units())
+@pytest.mark.parametrize("name", DEFINITIONS)
 def test_rows_have_the_bytes_and_values_of_the_product(name):
     icd, unit = DEFINITIONS[name]
     for row, known in zip(unit.rows, icd.rows, strict=True):
@@ -197,7 +159,31 @@ def test_can_frames_are_the_published_vectors():
     assert read_answer(CanFrame(0x06850401, b"\x03"), lambda: None) == Answer("nack", 3, row_id=133, other=1)
 
 
-def test_classes_of_messages_name_the_kind_of_an_unknown_id():
-    unit = replace(read_unit("sagitta"), classes=(MessageClass("get", RequestKind.TELEMETRY, 1),))
-    assert unit.request(200, klass="get").telemetry
+def test_classes_and_ids_name_the_kind_of_an_unknown_id():
+    sagitta = read_unit("sagitta")
+    assert sagitta.request(200, klass="parameter").telemetry
+    assert not sagitta.request(200, klass="action").telemetry
     assert not read_unit("cubestar").request(31).telemetry
+
+
+def test_sdo_transfers_have_the_bytes_of_cia_301():
+    """7.2.4.3: initiate upload 40h, its answers 43h and 4Fh, segment 60h and 70h, initiate download 23h and 2Fh."""
+    assert canopen.upload_request(0x1018, 4).hex() == "40181004"
+    assert canopen.expedited_data(bytes.fromhex("4300100092010200")) == bytes.fromhex("92010200")
+    assert canopen.expedited_data(bytes.fromhex("4f01100005000000")) == b"\x05"
+    assert canopen.expedited_data(bytes.fromhex("410810001a000000")) is None
+    assert canopen.segment_request(0x10) == b"\x70"
+    assert canopen.segment_data(bytes.fromhex("0041424344454647")) == (b"ABCDEFG", False)
+    assert canopen.segment_data(bytes.fromhex("1b41420000000000")) == (b"AB", True)
+    assert canopen.expedited_download(0x1017, 0, b"\xe8\x03").hex() == "2b171000e803"
+    assert canopen.abort_code(bytes.fromhex("8000100011000906")) == 0x06090011
+
+
+def test_entries_of_a_dictionary_follow_from_the_definition():
+    """OreSat's 4002h: three numbers, the seconds, a number and a flag; TPDO 5 at 1ADh carries two of them."""
+    unit = read_unit("oresat")
+    found = {entry.name: entry for entry in canopen.entries(unit, unit.canopen)}
+    assert f"{found['4002.attitude_i'].mapping:08X}" == "40020120"
+    assert f"{found['4002.attitude_known'].mapping:08X}" == "40020608"
+    assert canopen.pdo_can_id(0x2C, 0x1804, unit.canopen.tpdo[4]) == 0x1AD
+    assert canopen.pdo_can_id(0x2C, 0x1802, unit.canopen.tpdo[2]) == 0x3AC

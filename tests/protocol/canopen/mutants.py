@@ -7,6 +7,7 @@ once, so that a mutant cannot silently become the original.
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 import types
 from dataclasses import dataclass
@@ -151,7 +152,7 @@ MUTANTS = (
     Mutant("RPDO acts in PRE-OPERATIONAL", "rpdo", "slave", "if self.state is NmtState.OPERATIONAL and not frame.remote:\n                receive", "if self._context.communicates and not frame.remote:\n                receive"),
     Mutant("synchronous RPDO acts at once", "rpdo", "pdo", "            self._pending = data\n", "            self._apply(data)\n"),
     Mutant("short RPDO processed", "rpdo", "pdo", "if len(data) < self._size:", "if not data:"),
-    Mutant("short RPDO not reported", "rpdo", "pdo", "            self._emergency.raise_error(\n                ErrorCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key\n            )\n", ""),
+    Mutant("short RPDO not reported", "rpdo", "pdo", "            self._emergency.raise_error(\n                EmergencyCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key\n            )\n", ""),
     Mutant("long RPDO not reported", "rpdo", "pdo", "        if len(data) > self._size:\n", "        if False:\n"),
     Mutant("place holders do not count", "rpdo", "pdo", "                position += mapped.size\n", "                position += mapped.size if mapped.entry is not None else 0\n"),
     Mutant("RPDO deadline ignored", "rpdo", "pdo", "self._context.now + self.records.event_s if self.records.event_s else None\n        if", "None\n        if"),
@@ -190,7 +191,7 @@ def _sources() -> dict[str, str]:
 
 @cache
 def _code(module: str, text: str) -> types.CodeType:
-    return compile(text.replace(PACKAGE, ALIAS), f"<{ALIAS}.{module}>", "exec")
+    return compile(re.sub(rf"{re.escape(PACKAGE)}\b", ALIAS, text), f"<{ALIAS}.{module}>", "exec")
 
 
 class _Finder:

@@ -11,7 +11,7 @@ from starhil.protocol.canopen import (
     build_dictionary,
     check_status,
 )
-from starhil.protocol.canopen.layout import CanopenModel, read_layout
+from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError
 
@@ -45,7 +45,7 @@ def test_telemetry_rows_are_the_same_as_on_other_links(bench, row):
     "index", [0x6001, 0x6002, 0x6003, 0x6010, 0x6030, 0x6031, 0x6032, 0x6033, 0x6041, 0x6050]
 )
 def test_fields_of_a_record_are_the_rows_bytes(bench, index):
-    name = next(item.telemetry for item in read_layout(ICD).object if item.index == index)
+    name = next(item.telemetry for item in ICD.canopen.object if item.index == index)
     row = ICD.telemetry[name]
     bench.application.rows[name] = row.example()
     data = row.encode(row.example())
@@ -113,7 +113,7 @@ def test_status_ok_passes():
 
 
 def layout(**changes) -> CanopenModel:
-    document = read_layout(ICD).model_dump(by_alias=True)
+    document = ICD.canopen.model_dump(by_alias=True)
     return CanopenModel.model_validate(document | changes)
 
 
@@ -168,7 +168,7 @@ def test_layouts_that_cannot_be_read(tmp_path, text, reason):
     path = tmp_path / "unit.toml"
     path.write_text(UNIT_HEAD + text, encoding="ascii")
     with pytest.raises(IcdError, match=reason):
-        read_layout(load_unit(path))
+        build_dictionary(load_unit(path))
 
 
 def test_object_of_two_kinds():

@@ -103,9 +103,9 @@ def test_each_group_is_stored_on_command_only(stored, index):
     assert [stored.number(index, subindex) for subindex in range(4)] == [3, 1, 1, 1]
 
 
-def test_application_parameters_are_stored_by_the_application(stored):
-    stored.slave.store.on_save = save = Mock(return_value=None)
-    stored.slave.store.on_restore = restore = Mock(return_value=None)
+def test_application_parameters_are_stored_by_the_application(new_bench, storage):
+    save, restore = Mock(return_value=None), Mock(return_value=None)
+    stored = new_bench(storage=storage, on_save=save, on_restore=restore).power_on()
     stored.write(0x1010, 2, SAVE)
     stored.write(0x1011, 2, LOAD)
     assert (save.call_count, restore.call_count) == (0, 0)
@@ -113,7 +113,7 @@ def test_application_parameters_are_stored_by_the_application(stored):
     stored.write(0x1010, 1, SAVE)
     stored.write(0x1011, 3, LOAD)
     assert (save.call_count, restore.call_count) == (2, 1)
-    stored.slave.store.on_save = Mock(side_effect=SdoAbortError(AbortCode.DEVICE_STATE))
+    save.side_effect = SdoAbortError(AbortCode.DEVICE_STATE)
     assert stored.write(0x1010, 3, SAVE) == AbortCode.DEVICE_STATE
 
 

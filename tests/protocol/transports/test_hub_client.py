@@ -6,6 +6,7 @@ import asyncio
 import socket
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import can
@@ -216,3 +217,26 @@ def test_a_hub_lost_without_a_close_is_noticed_and_found_again() -> None:
         await hub.close()
 
     asyncio.run(main())
+
+
+def test_the_library_s_client_takes_a_closed_server_for_a_silent_bus_and_loses_remote_frames() -> None:
+    """Why this project has a client of its own; if python-can mends it, use it."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    sent: list[bytes] = []
+
+    def serve() -> None:
+        connection, _ = listening.accept()
+        with connection:
+            for answer in (b"< hi >", b"< ok >", b"< ok >"):
+                connection.sendall(answer)
+                sent.append(connection.recv(256))
+
+    server = threading.Thread(target=serve)
+    server.start()
+    port = listening.getsockname()[1]
+    with can.Bus(interface="socketcand", host="127.0.0.1", port=port, channel="vcan0") as bus:
+        bus.send(can.Message(arbitration_id=0x123, is_extended_id=False, is_remote_frame=True))
+        server.join()
+        assert [bus.recv(0.1) for _ in range(3)] == [None] * 3
+    listening.close()
+    assert sent[-1] == b"< send 123 0  >"

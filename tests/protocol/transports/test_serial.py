@@ -14,10 +14,9 @@ import pytest
 import serial
 
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.serial_framing import PacingSchedule
 from starhil.protocol.transports import TransportError, open_serial
 from starhil.protocol.transports.base import Statistics
-from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedWriter
+from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedWriter, PacingSchedule
 from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 

@@ -62,12 +62,12 @@ def test_a_star_two_pixels_off_is_not_a_true_star():
     assert motion.rotation_deg == pytest.approx(1.0, abs=1e-9)
 
 
-def test_lists_of_different_length_lose_the_frame():
-    """The false object of the first frame is a copy of a star at the same place: only its list has eight."""
+def test_a_frame_with_more_objects_in_the_cluster_than_the_other_is_lost():
+    """The false object of the first frame is a copy of a star at the same place: its cluster has eight objects."""
     double = ObservedFrame(np.append(MAGNITUDES, 0.46), np.vstack([POSITIONS, POSITIONS[5]]))
     later = ObservedFrame(MAGNITUDES, turned(POSITIONS, 1.0))
     assert not MatlabFilter(PIXEL_DEG)(double, later).true_now.any()
-    assert MatlabFilter(PIXEL_DEG, pairing="mutual")(double, later).true_now.all()
+    assert MatlabFilter(PIXEL_DEG, loses_unequal=False)(double, later).true_now.all()
 
 
 @pytest.mark.parametrize(("factor", "negatives"), [(1, 213), (3, 888), (5, 1341)])

@@ -14,7 +14,8 @@ from typer.testing import CliRunner
 from starid.cli.app import build_app
 from starid.errors import StaridError
 from starid.lab.experiments import known_misses, registry, report, runner
-from starid.lab.experiments.comparison import agreement, improvement, same, sampling
+from starid.lab.experiments.choices import CHOICES, class_of, numbers_by_choice
+from starid.lab.experiments.comparison import agreement, improvement, null_model, same, sampling
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -22,6 +23,7 @@ from starid.lab.experiments.experiment import (
     Parameters,
     Part,
     Results,
+    Row,
     row,
     write_csv,
 )
@@ -273,6 +275,25 @@ def test_a_row_of_several_numbers_counts_each():
     assert "2 of 3 agree" in made.remark
 
 
+def test_the_best_constant_marks_the_checks_that_it_meets():
+    rows = [
+        agreement(f"q{x}", published=x, tolerance=(0.6, ""), author=value)
+        for x, value in ((98.0, 98.0), (100.0, 5.0), (100.5, 100.5), (90.0, 90.0))
+    ]
+    marked = null_model(rows)
+    assert [(row.weak, row.weak_met) for row in marked] == [(0, 0), (1, 0), (1, 1), (0, 0)]
+    found = report.counts([_finished(tuple(marked))])
+    assert found["weak"] == {"met": 1, "of": 2}
+    assert found["agrees"] == {"met": 2, "of": 2}
+
+
+def test_numbers_that_a_null_model_meets_are_counted_apart():
+    made = same("q", published="", matches=[True, True, False], null=[True, False, True], target="")
+    found = report.counts([_finished((made,))])
+    assert found["weak"] == {"met": 1, "of": 2}
+    assert found["agrees"] == {"met": 1, "of": 1}
+
+
 def test_the_sampling_error_combines_two_counts():
     greatest, words = sampling(50.0, 1000)
     assert greatest == pytest.approx(3.0 * np.sqrt(2.0 * 0.25 / 1000.0) * 100.0, rel=1e-2)
@@ -325,6 +346,10 @@ def test_every_known_miss_has_a_reason_and_an_experiment():
         assert experiment in names
         for quantity, entry in entries.items():
             assert entry.reason.endswith("."), quantity
+
+
+def _finished(rows):
+    return runner.FinishedExperiment(_experiment(), Outcome(rows), quick=False, seconds=0.0, parts=0)
 
 
 def _invoke(*arguments: str):
@@ -431,3 +456,37 @@ def test_the_experiments_of_the_thesis_need_nothing_else_of_the_emulator():
         for line in module.read_text(encoding="utf-8").splitlines():
             if line.strip().startswith(("from emulator", "import emulator")):
                 assert "starid.lab.experiments" in line, f"{module.name}: {line}"
+
+
+def _rate(quantity: str, published: float) -> Row:
+    return agreement(quantity, published=published, author=99.9, tolerance=(0.1, "a tenth"))
+
+
+def test_a_number_to_which_a_constant_was_fitted_is_no_agreement():
+    fitted, predicted = (
+        "position and brightness noise, σ = 1, on the grid: share",
+        "position noise, σ = 3, on the grid",
+    )
+    assert class_of("lsi-noise", _rate(fitted, 99.9)) == "fitted"
+    assert class_of("lsi-noise", _rate(predicted, 99.9)) == "agrees"
+    assert class_of("lsi-accuracy", _rate(fitted, 99.9)) == "agrees"
+    rows = [("lsi-noise", _rate(fitted, 99.9)), ("lsi-noise", _rate(predicted, 50.0))]
+    assert numbers_by_choice(rows)["noise of 0.27·√σ"] == {"numbers": 2, "agree": 1, "fitted": 1}
+
+
+def test_a_number_without_the_authors_version_depends_on_no_choice():
+    printed = agreement(
+        "position and brightness noise", published=1.0, printed=1.0, tolerance=(0.1, "a tenth")
+    )
+    assert class_of("lsi-noise", printed) == "agrees"
+
+
+def test_every_choice_names_an_experiment_and_every_quick_fitted_number_is_counted_apart(tmp_path):
+    assert {each.experiment for each in CHOICES} <= set(registry.experiments())
+    results = runner.run([registry.experiments()["worked-example"]], tmp_path, quick=True, jobs=1)
+    counts = report.counts(results)
+    assert counts["fitted"] == {"met": 18, "of": 18}
+    assert counts["agrees"] == {"met": 87, "of": 95}
+    text = report.report_text(results, quick=True, seed=1)
+    assert "| λ = 1.00 | 19 | 16 | 9 |" in text
+    assert "| 18 | 18 |" in text

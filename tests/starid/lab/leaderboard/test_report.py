@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +83,8 @@ def test_wrong_answers_rank_below_missing_ones_and_slow_below_fast() -> None:
 
 def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
     answer = {
+        "date": "2026-01-02",
+        "frames": 20,
         "seed": 3,
         "rows": [entry("one", valid=100.0, wrong=0, cpu=1.0), entry("two", valid=50.0, wrong=2, cpu=1.0, row="8°")],
         "solvers": [
@@ -95,10 +99,11 @@ def test_the_report_names_every_solver_row_and_omission(tmp_path) -> None:
         "`a command`",
         "## 0.5",
         "## 8°",
-        "| one | 10 | 100.0 | 0 (0) |",
-        "| two | 10 | 30.0 | 2 (1) |",
+        "| one | **10** of 20 | 100.0 | 0 (0) |",
+        "| two | **10** of 20 | 30.0 | 2 (1) |",
         "| one | 42° | 5.5 | 120 |",
         "three: skipped",
+        "2026-01-02, seed 3. Versions: one 1.0, two custom.",
     ):
         assert words in text
     paths = write_leaderboard(answer, tmp_path / "out", "a command")
@@ -115,6 +120,24 @@ def test_a_solver_of_ones_own_is_measured_like_the_others(oracle) -> None:
     ]
     assert answer["solvers"][0]["database_kb"] == pytest.approx(12.0)
     assert answer["versions"][oracle] == "custom"
+
+
+def test_settings_of_ruststartracker_scale_with_the_field(monkeypatch) -> None:
+    """Three pixels, and some twenty stars per field to look up, whether the field is 8° or 42° wide."""
+    made = []
+    fake = types.ModuleType("ruststartracker")
+    fake.CameraParameters = lambda *_: None
+    fake.StarTracker = lambda *_, **settings: made.append(settings)
+    monkeypatch.setitem(sys.modules, "ruststartracker", fake)
+    stars = load_catalog().brighter_than(8.0)
+    for width, side in ((8.0, 512), (42.0, 937)):
+        camera = Camera.from_fov(width, side, side)
+        make_solver("ruststartracker", camera, stars)
+        settings = made.pop()
+        assert settings["inter_star_angle_tolerance"] == pytest.approx(3.0 * camera.pixel_scale_rad)
+        looked_up = np.count_nonzero(stars.v <= settings["max_lookup_magnitude"])
+        share = field_solid_angle(camera) / (4.0 * np.pi)
+        assert looked_up * share == pytest.approx(20.0, rel=0.02)
 
 
 @pytest.mark.parametrize(

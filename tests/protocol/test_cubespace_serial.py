@@ -8,17 +8,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_framing import (
+from starhil.protocol.cubespace_serial import (
     BURST_SIZE,
     DeviceReceiver,
-    Dialect,
     HostReceiver,
-    PacingSchedule,
     encode_reply,
     encode_request,
 )
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.transports.paced import PacingSchedule
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 GOOD = Request(TC, 2, b"\x1f\x00\xff\x7f\x1f\x1f")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from typing import Annotated, Any, Final, Self
 
 from pydantic import AfterValidator, Field, model_validator
@@ -11,7 +11,7 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.parameters import memory_bits
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import Link
-from starhil.emulator.links.wire_faults import WireFaultSettings
+from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
@@ -114,25 +114,21 @@ class Faults:
 
     Parameters
     ----------
-    device
-        Device that the faults affect.
     links
-        Open links of the device.
+        The links of the device, also those that are opened later.
     """
 
-    def __init__(self, device: Device, links: Iterable[Link]) -> None:
+    def __init__(self, device: Device, links: Sequence[Link]) -> None:
         self._device = device
-        self._wires = [(link.bus, link.wire) for link in links]
+        self._links = links
         self._optical: dict[str, Any] = {}
 
-    def inject(self, request: FaultRequest) -> None:
-        """Inject the faults of a request, all or none.
+    @property
+    def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
+        return [(link.bus, link.wire) for link in self._links]
 
-        Raises
-        ------
-        EmulatorError
-            A name is unknown, or the run has no such link.
-        """
+    def inject(self, request: FaultRequest) -> None:
+        """Inject the faults of a request, all or none."""
         self.check(request)
         device = self._device
         if request.optical is not None:
@@ -159,13 +155,7 @@ class Faults:
             self._device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
 
     def check(self, request: FaultRequest) -> None:
-        """Check that the faults of a request can be injected.
-
-        Raises
-        ------
-        EmulatorError
-            A name is unknown, or the run has no such link.
-        """
+        """Check that the faults of a request can be injected."""
         enums = self._device.icd.model.enums
         if request.device is not None:
             errors = [name for name, code in enums["device_error"].values.items() if code != NO_ERROR]

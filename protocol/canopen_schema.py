@@ -1,25 +1,20 @@
-"""The table `[canopen]` of an interface definition: the layout of its object dictionary."""
+"""Keys of `[canopen]`: the layout of the object dictionary; `canopen.device_dictionary` builds it."""
 
 from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from starhil.protocol.definition import InterfaceDefinition, RawTable
 from starhil.protocol.link_schema import HEX
-from starhil.protocol.values import IcdError
+from starhil.protocol.values import DefinitionModel
 
 Index = Annotated[int, Field(ge=0x2000, le=0xFFFF, json_schema_extra=HEX)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF, json_schema_extra=HEX)]
 PackedType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u48"]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
-
-class PackedField(_Model):
+class PackedField(DefinitionModel):
     """A telemetry field as a narrower integer."""
 
     source: str = Field(alias="from")
@@ -34,7 +29,7 @@ class PackedField(_Model):
     """Whether an out-of-range value is sent modulo the range (a counter) instead of as the nearest limit."""
 
 
-class PlacedMember(_Model):
+class PlacedMember(DefinitionModel):
     """An entry of a record: give `parameter`, `domain`, or one or both of `value` and `telecommand`."""
 
     subindex: Annotated[int, Field(ge=1, le=254)] | None = None
@@ -58,7 +53,7 @@ class PlacedMember(_Model):
         return self
 
 
-class PlacedObject(_Model):
+class PlacedObject(DefinitionModel):
     """An application object.
 
     The keys after `name`, except `type`, define its content. Give one of them, or `telecommand` with
@@ -112,7 +107,7 @@ class PlacedObject(_Model):
         return self
 
 
-class PdoModel(_Model):
+class PdoModel(DefinitionModel):
     """Default configuration of a PDO."""
 
     name: str
@@ -133,7 +128,7 @@ class PdoModel(_Model):
     """Mapped entries, as `INDEX.NAME` or `INDEX` in hexadecimal digits."""
 
 
-class CanopenModel(_Model):
+class CanopenModel(DefinitionModel):
     """The CANopen node: its identity and the content of its object dictionary."""
 
     device_type: Unsigned32
@@ -156,36 +151,3 @@ class CanopenModel(_Model):
     """Transmit PDOs: `[[canopen.tpdo]]`."""
     rpdo: list[PdoModel] = []
     """Receive PDOs: `[[canopen.rpdo]]`."""
-
-
-def read_layout(icd: InterfaceDefinition) -> CanopenModel:
-    """Return the layout of the object dictionary.
-
-    Raises
-    ------
-    IcdError
-        The definition has no `[canopen]`, or it is invalid; the text names file and key.
-    """
-    table = icd.canopen
-    if table is None:
-        raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
-    try:
-        return CanopenModel.model_validate(table.document)
-    except ValidationError as error:
-        raise IcdError(_errors(table, error)[0]) from None
-
-
-def layout_errors(table: RawTable) -> list[str]:
-    """Return all errors in the keys of the layout."""
-    try:
-        CanopenModel.model_validate(table.document)
-    except ValidationError as error:
-        return _errors(table, error)
-    return []
-
-
-def _errors(table: RawTable, error: ValidationError) -> list[str]:
-    return [
-        f"{table.file}: {'.'.join(str(step) for step in ('canopen', *item['loc']))}: {item['msg']}"
-        for item in error.errors()
-    ]

@@ -1,0 +1,62 @@
+"""The image pipeline of a profile, and the camera constants that it reports."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from starhil.emulator.pipeline.imager import PipelineImager, ProcessImager, ThreadImager
+from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
+from starhil.emulator.pipeline.worker_process import WorkerProcess
+from starhil.emulator.profile import Profile
+from starhil.protocol.values import Value
+
+
+def make_imager(
+    profile: Profile, worker: WorkerProcess | None, *, repeatable: bool, previews: bool
+) -> PipelineImager:
+    """Return the pipeline of a profile; a worker that was started earlier is used, or ended."""
+    setup = pipeline_setup(profile, repeatable=repeatable, previews=previews)
+    if profile.run.worker == "process":
+        return ProcessImager(setup, worker or WorkerProcess())
+    if worker is not None:
+        worker.end()
+    if profile.run.worker == "error_model":
+        from starhil.emulator.pipeline.error_model import ErrorModelImager
+
+        return ErrorModelImager(setup)
+    return ThreadImager(setup)
+
+
+def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool = False) -> PipelineSetup:
+    """Return the pipeline configuration of a profile; `repeatable`: results independent of machine speed."""
+    path = profile.catalog.path
+    return PipelineSetup(
+        camera=profile.camera.values(),
+        sensor=dict(profile.sensor),
+        sky=dict(profile.sky),
+        identifier=dict(profile.identifier),
+        catalog_path=str(profile.folder / Path(path).expanduser()) if path else "",
+        epoch=profile.epoch,
+        algorithm=profile.run.algorithm,
+        seed=profile.run.seed,
+        build_in_background=profile.run.clock != "stepped" and not repeatable,
+        previews=previews,
+        dark_frames=profile.device.dark_frames,
+        images=profile.images.resolved(profile.folder),
+    )
+
+
+def camera_constants(warm: PipelineReady) -> dict[str, Value]:
+    """Return the camera parameters of a calibrated unit: focal length, centre and distortion, in pixels."""
+    camera = warm.camera
+    k1, k2, p1, p2, _ = camera["distortion"]
+    focal_x, focal_y = camera["focal_px"]
+    return {
+        "focal_length": (focal_x * focal_y) ** 0.5,
+        "centroid_x": camera["centre_px"][0],
+        "centroid_y": camera["centre_px"][1],
+        "k1": k1,
+        "k2": k2,
+        "p1": p1,
+        "p2": p2,
+    }

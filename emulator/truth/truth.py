@@ -1,0 +1,215 @@
+"""The truth of a run: its source, the mount of the sensors, and the socket and lock-step of a live feed.
+
+All heads of a run are mounted on one body. `Truth` describes the body, and each head sees it through a
+`SensorTruth`, which applies the mount of the head. The source can be replaced at any time, with everything that
+belongs to it:
+
+- `set` reads the files of a configuration, opens the socket of a live feed, and then replaces the source. The
+  previous source stays if this fails, except that a feed on the same port is closed first.
+- `put` replaces the source at once. Scenarios use it, because their files are read when the run starts.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from starhil.emulator.clock import NANOSECONDS, Clock, make_clock
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
+from starhil.emulator.truth.feed import LiveFeed
+from starhil.emulator.truth.file import FileTruth
+from starhil.emulator.truth.live import LiveTruth
+from starhil.emulator.truth.lock_step import Step
+from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
+from starid.attitude import Attitude
+
+
+@dataclass(frozen=True)
+class TruthHost:
+    """The run, as its truth sees it.
+
+    Attributes
+    ----------
+    clock
+        Clock of the run.
+    clock_name
+        Configured clock: that of a replay differs.
+    time_passes
+        Set when every pipeline is ready.
+    step
+        Advances the stepped clock, for lock-step.
+    record
+        Records an entry on the tape, if there is one: its kind and values.
+    opens_sockets
+        Whether live feeds open sockets; the messages of a replay come from the tape.
+    """
+
+    clock: Clock
+    clock_name: str
+    time_passes: asyncio.Event
+    step: Step
+    record: Callable[..., None]
+    opens_sockets: bool = True
+
+    def now_s(self) -> float:
+        """Return the simulation time, seconds."""
+        return self.clock.now_ns() / NANOSECONDS
+
+
+class Truth:
+    """The truth of the body on which the heads of a run are mounted.
+
+    Parameters
+    ----------
+    config
+        The configured truth; `open` builds it.
+    folder
+        Folder to which relative paths of truth files refer.
+
+    Attributes
+    ----------
+    configured
+        The configured truth.
+    source
+        Truth of the body: attitude ICRS→body, rate in the body frame.
+    mount
+        Mount in the current configuration; None: each head has that of its profile.
+    feed
+        The live feed, or None.
+    address
+        Address of the live feed; empty if there is none.
+    """
+
+    def __init__(self, config: TruthConfig, folder: Path, host: TruthHost) -> None:
+        self.configured = config
+        self.source: TruthSource = FixedTruth(Attitude.identity())
+        self.mount: Attitude | None = None
+        self.feed: LiveFeed | None = None
+        self.address = ""
+        self._wanted_address = ""
+        """Address of the live feed as configured."""
+        self._folder = folder
+        self._host = host
+
+    async def open(self) -> None:
+        """Build the configured truth."""
+        self.put(*await self._load(self.configured, None))
+
+    async def set(self, config: TruthConfig, at_s: float | None = None) -> None:
+        """Replace the truth.
+
+        Parameters
+        ----------
+        at_s
+            Simulation time at which its motion begins, as in a recorded run; by default now.
+        """
+        loaded = await self._load(config, at_s)
+        start_s = getattr(loaded[0], "start_s", self._host.now_s())
+        self._host.record("truth", config=config.model_dump(mode="json"), start_s=start_s)
+        self.put(*loaded)
+
+    def put(
+        self, source: TruthSource, config: TruthConfig, feed: LiveFeed | None = None, address: str = ""
+    ) -> None:
+        """Replace source, mount and feed."""
+        self.close()
+        self.source, self.feed, self.address = source, feed, address
+        self.mount = None if config.mount is None else config.mount.build()
+        if address and isinstance(config, FeedConfig):
+            self._wanted_address = _address(config)
+
+    def close(self) -> None:
+        """Close the socket of the live feed, if there is one."""
+        if self.feed is not None:
+            self.feed.close()
+        self.feed, self.address, self._wanted_address = None, "", ""
+
+    async def _load(
+        self, config: TruthConfig, at_s: float | None
+    ) -> tuple[TruthSource, TruthConfig, LiveFeed | None, str]:
+        """Return what `put` needs: read the file of the source, or open its socket."""
+        host = self._host
+        now_s = host.now_s() if at_s is None else at_s
+        source = await asyncio.to_thread(config.build, now_s, self._folder)
+        live = at_s is None
+        if (
+            live
+            and isinstance(source, FileTruth)
+            and isinstance(config, FileConfig)
+            and config.start == "now"
+        ):
+            source = source.starting_at(host.now_s())  # reading has taken time
+        if not isinstance(config, FeedConfig) or not isinstance(source, LiveTruth):
+            return source, config, None, ""
+        source.set_clock_speed(make_clock(host.clock_name).speed)
+        feed = LiveFeed(
+            source, host.now_s, host.step if self._is_lockstep(config) else None, self._message_received
+        )
+        if not host.opens_sockets:
+            return source, config, feed, ""
+        if config.port != 0 and _address(config) in (self.address, self._wanted_address):
+            self.close()  # the same port: it must be free first
+            await asyncio.sleep(0)  # the loop closes it in its next turn
+        return source, config, feed, await feed.start(config.socket, config.host, config.port)
+
+    def _is_lockstep(self, config: FeedConfig) -> bool:
+        """Return whether the messages of a feed advance the clock."""
+        stepped = self._host.clock_name == "stepped"
+        if isinstance(config, Config42):
+            return stepped
+        if config.lockstep and not stepped:
+            raise EmulatorError(
+                f"truth.lockstep: the clock must be stepped, not {self._host.clock.name}; run with --clock stepped"
+            )
+        return config.lockstep
+
+    def _message_received(self, data: bytes) -> None:
+        """Record a message of the feed; until time passes, each message replaces the earlier ones."""
+        self._host.record("feed", data=data.decode("latin-1"))
+        live = None if self.feed is None else self.feed.truth
+        if live is not None and live.timeline == "anchor" and not self._host.time_passes.is_set():
+            live.begin_timeline()
+
+
+class SensorTruth:
+    """The truth of a sensor that is mounted on the body.
+
+    Parameters
+    ----------
+    mount
+        Rotation body→sensor, unless the truth's configuration has one; None: the frames are the same.
+    """
+
+    def __init__(self, body: Truth, mount: Attitude | None) -> None:
+        self._body = body
+        self._mount = mount
+
+    @property
+    def kind(self) -> str:
+        """Kind of the truth source of the body."""
+        return self._body.source.kind
+
+    def state(self, t_s: float) -> TruthState:
+        """Return the truth of the sensor at a simulation time in seconds."""
+        body = self._body
+        return seen_from(self._mount if body.mount is None else body.mount, body.source.state(t_s))
+
+
+def seen_from(mount: Attitude | None, body: TruthState) -> TruthState:
+    """Return the truth of a sensor, from that of its body and the rotation body→sensor (None: no rotation)."""
+    if mount is None:
+        return body
+    turn = mount.matrix
+    return replace(
+        body,
+        attitude=Attitude.from_matrix(turn @ body.attitude.matrix),
+        rate_rad_s=turn @ body.rate_rad_s,
+    )
+
+
+def _address(config: FeedConfig) -> str:
+    """Return the address of a feed as configured."""
+    return f"{'udp' if config.socket == 'udp' else 'tcp'}:{config.host}:{config.port}"

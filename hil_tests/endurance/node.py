@@ -1,0 +1,131 @@
+"""What a CANopen node sends by itself, decoded by the default mapping of its definition: PDOs, EMCY, heartbeats.
+
+A TPDO carries entries of the object dictionary, each a field of a telemetry row or the same in a narrower type. The
+values of the TPDOs of one instant are judged as one row, so that an attitude spread over two of them is compared, and
+modes that last for no time are left out.
+Lives do not change the mapping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from starhil.hil_tests.endurance.oracle import Oracle
+from starhil.hil_tests.endurance.violation import Violation
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen.communication import TPDO_CAN_IDS
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary, in_order, span_of
+from starhil.protocol.canopen_schema import PackedField
+from starhil.protocol.codec import Field, Row
+from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.values import Value
+
+EMERGENCY: Final = 0x080
+HEARTBEAT: Final = 0x700
+DEVICE_ERROR: Final = 0xFF00
+"""Base of the EMCY error codes of the error mode (docs/canopen.md)."""
+STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
+"""States in a heartbeat: boot-up, stopped, operational, pre-operational."""
+
+Readings = dict[str, tuple[Field, Value]]
+
+
+@dataclass(frozen=True)
+class _Mapped:
+    """An entry of a TPDO: its size, and the field that it carries, possibly in a narrower type."""
+
+    size: int
+    row: Row
+    field: Field
+    packed: PackedField | None
+
+    def read(self, data: bytes) -> Readings:
+        """Return the quantities that are carried."""
+        packed, field = self.packed, self.field
+        if packed is not None and packed.wrap:
+            return {}
+        if packed is not None and field.width == 0:
+            raw = int.from_bytes(data, "little", signed=packed.type.startswith("i"))
+            return {} if field.value is None else {field.value: (field, raw * packed.scale)}
+        content = bytearray(self.row.size)
+        content[span_of(field.slot)] = in_order(field.slot, data)
+        values = self.row.decode(bytes(content))
+        return {
+            other.value: (other, values[name])
+            for name, other in self.row.named_fields.items()
+            if other.slot.index == field.slot.index and other.value is not None
+        }
+
+
+class Node:
+    """Judges the messages of a node.
+
+    Parameters
+    ----------
+    icd
+        Definition of the unit.
+    dictionary
+        Its object dictionary.
+    """
+
+    def __init__(self, icd: InterfaceDefinition, dictionary: DeviceDictionary) -> None:
+        self._errors: Mapping[int, str] = icd.enum("device_error").names
+        self._tpdos: dict[tuple[int, bool], list[_Mapped]] = {}
+        """Entries by CAN ID, and whether the node ID is added to it."""
+        for number, model in enumerate(dictionary.layout.tpdo):
+            if model.enabled:
+                can_id = model.can_id or TPDO_CAN_IDS[number]
+                self._tpdos[can_id, model.relative] = [_mapped(dictionary, name) for name in model.objects]
+        self._together: Readings = {}
+
+    def judge(self, frame: CanFrame, node: int, oracle: Oracle) -> int:
+        """Judge a message sent now; return the number of rows read."""
+        entries = self._tpdos.get((frame.id - node, True)) or self._tpdos.get((frame.id, False))
+        if entries is not None:
+            self._keep(frame, entries)
+            return 1
+        if frame.id == EMERGENCY + node and len(frame.data) == 8:
+            self._judge_emergency(int.from_bytes(frame.data[:2], "little"), oracle)
+        elif frame.id != HEARTBEAT + node or len(frame.data) != 1 or frame.data[0] & 0x7F not in STATES:
+            raise Violation(
+                f"canopen: a frame {frame.id:03X}h {frame.data.hex()} that the unit does not define"
+            )
+        return 0
+
+    def _keep(self, frame: CanFrame, entries: list[_Mapped]) -> None:
+        if len(frame.data) != sum(entry.size for entry in entries):
+            raise Violation(f"TPDO {frame.id:03X}h: {len(frame.data)} bytes")
+        offset = 0
+        for entry in entries:
+            self._together |= entry.read(frame.data[offset : offset + entry.size])
+            offset += entry.size
+
+    def judge_instant(self, oracle: Oracle) -> None:
+        """Judge the TPDOs of the last instant; the last value of each quantity counts."""
+        read, self._together = self._together, {}
+        oracle.judge("TPDOs", read)
+        four = [read.get(f"attitude.{letter}") for letter in "xyzw"]
+        if any(item is None for item in four):
+            return
+        if "attitude.valid" not in read:  # sent only when it changes
+            numbers = [item for item in four if item is not None]
+            read["attitude.valid"] = (numbers[0][0], any(value != 0.0 for _, value in numbers))
+        oracle.judge_attitude("TPDOs", read)
+
+    def _judge_emergency(self, code: int, oracle: Oracle) -> None:
+        if code and code - DEVICE_ERROR not in self._errors:
+            raise Violation(f"canopen: EMCY {code:04X}h, which no event has caused")
+        if code and "error" not in oracle.modes:
+            raise Violation(f"canopen: EMCY {code:04X}h in {', '.join(sorted(oracle.modes))}")
+
+
+def _mapped(dictionary: DeviceDictionary, name: str) -> _Mapped:
+    """Return the entry of a name as in the mapping of a definition, `INDEX.NAME` or `INDEX`."""
+    key = dictionary.key_of(name)
+    reading = dictionary.readings[key]
+    field, packed = reading.fields[0], reading.packed
+    if packed is not None and field.width == 0:
+        field = field.changed(kind="integer", scale=packed.scale)
+    return _Mapped(dictionary.entries[key].size or 0, reading.row, field, packed)

@@ -1,0 +1,180 @@
+"""CANopen: the bytes of SDO transfers, the entries of a unit's object dictionary, and what a PDO carries of them.
+
+    SDO      | command | index, low byte first | sub-index | data or size, 4 bytes |    600h + node, 580h + node
+    segment  | command with toggle 10h | 7 bytes of data |
+    PDO      | object | object | …         each as long as its mapping entry says, the lowest byte first
+    mapping  index << 16 | sub-index << 8 | number of bits
+
+Source: CiA 301, 7.2.4.3 (SDO), 7.4.7 (PDO mapping), 7.3.5 (CAN IDs). All numbers are little-endian; a row that is
+big-endian on its other links is converted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.rows import Field, Row
+
+PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
+"""CAN IDs of the first four RPDOs and TPDOs, to which the node ID is added (CiA 301 7.3.5)."""
+EXPEDITED: Final = 4
+"""Maximum number of bytes in an expedited SDO."""
+ABORT: Final = 0x80
+"""Command of an abort."""
+
+
+# --- SDO ---
+
+
+def multiplexer(index: int, subindex: int) -> bytes:
+    """Return index and sub-index as encoded in an SDO."""
+    return index.to_bytes(2, "little") + bytes([subindex])
+
+
+def upload_request(index: int, subindex: int) -> bytes:
+    """Return the request that begins to read an object."""
+    return bytes([0x40]) + multiplexer(index, subindex)
+
+
+def expedited_download(index: int, subindex: int, data: bytes) -> bytes:
+    """Return the request that writes an object of up to 4 bytes, with its size."""
+    return bytes([0x23 | (EXPEDITED - len(data)) << 2]) + multiplexer(index, subindex) + data
+
+
+def expedited_data(answer: bytes) -> bytes | None:
+    """Return the data in the answer to a read, or None if segments follow."""
+    return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & 0x02 else None
+
+
+def segment_request(toggle: int) -> bytes:
+    """Return the request for the next segment; `toggle` is 0 and 10h in turn."""
+    return bytes([0x60 | toggle])
+
+
+def segment_data(answer: bytes) -> tuple[bytes, bool]:
+    """Return the data in a segment, and whether it is the last."""
+    return answer[1 : 8 - (answer[0] >> 1 & 7)], bool(answer[0] & 1)
+
+
+def abort_code(answer: bytes) -> int:
+    """Return the code of an abort."""
+    return int.from_bytes(answer[4:], "little")
+
+
+# --- the object dictionary of a unit ---
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An entry of the object dictionary, as defined in `[canopen]`.
+
+    Attributes
+    ----------
+    name
+        Name used by PDOs: `INDEX.NAME`, or `INDEX`.
+    size
+        Size in bytes; 0 if it varies, as for a text.
+    row, slot
+        Telemetry row, and the slot that the entry reads.
+    command, part
+        Telecommand that a write executes, and the part of its data that is written; None: all of it.
+    """
+
+    index: int
+    subindex: int
+    name: str
+    size: int
+    row: Row | None = None
+    slot: Field | None = None
+    command: Row | None = None
+    part: Field | None = None
+
+    @property
+    def mapping(self) -> int:
+        """Mapping entry of a PDO."""
+        return self.index << 16 | self.subindex << 8 | 8 * self.size
+
+
+def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
+    """Yield the entries of the application."""
+    for placed in layout.object:
+        index, at = placed.index, f"{placed.index:04x}"
+        if placed.telemetry is not None:
+            row = unit.telemetry[placed.telemetry]
+            command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
+            for number, slot in enumerate(places(row), 1):
+                part = None if command is None else slot
+                yield Entry(index, number, f"{at}.{slot.name}", slot.size, row, slot, command, part)
+        elif placed.members:
+            subindex = 0
+            for member in placed.members:
+                subindex = member.subindex or subindex + 1
+                yield _entry(unit, member, index, subindex, f"{at}.{member.name.lower()}")
+        elif placed.value is not None or placed.telecommand is not None:
+            yield _entry(unit, placed, index, 0, at)
+        elif placed.parameters:
+            for parameter in unit.parameters.values():
+                yield Entry(index, parameter.id, f"{at}.{parameter.name}", _bytes_of(parameter.type))
+        for number, packed in enumerate(placed.packed, 1):
+            name = packed.name or packed.source.partition(".")[2]
+            yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type))
+
+
+def _entry(unit: Unit, placed: Any, index: int, subindex: int, name: str) -> Entry:
+    row, slot, size = None, None, 0
+    if placed.value is not None:
+        row_name, _, field = placed.value.partition(".")
+        row = unit.telemetry[row_name]
+        slot = row.named[field]
+        size = 0 if slot.kind == "text" else slot.size
+    command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
+    if command is not None and not is_text(command):
+        size = size or command.size
+    if getattr(placed, "parameter", None) is not None:
+        size = _bytes_of(unit.parameters[placed.parameter].type)
+    return Entry(index, subindex, name, size, row, slot, command)
+
+
+def places(row: Row) -> list[Field]:
+    """Return the first named field at each place of a row; fields of bits share one."""
+    return list({item.offset: item for item in reversed(list(row.named.values()))}.values())[::-1]
+
+
+def is_text(command: Row) -> bool:
+    """Return whether a telecommand has a text, which is written without padding."""
+    return [field.kind for field in command.fields] == ["text"]
+
+
+def _bytes_of(type_: str) -> int:
+    """Return the bytes of a type; names end in the number of bits, but for `bool`."""
+    return int("".join(filter(str.isdigit, type_)) or 8) // 8
+
+
+def with_byte_order(slot: Field | None, data: bytes) -> bytes:
+    """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
+    return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
+
+
+def written(entry: Entry, command: Row, data: bytes) -> bytes:
+    """Return the bytes to be written to an entry to execute a telecommand with this data."""
+    part = places(command)[0] if entry.part is None and len(places(command)) == 1 else entry.part
+    if not data:
+        return b"\x01"
+    if is_text(command):
+        return data.rstrip(b"\0") or b"\0"
+    return data if part is None else with_byte_order(part, data[part.offset : part.offset + part.size])
+
+
+# --- PDOs ---
+
+
+def pdo_can_id(node: int, index: int, model: Any) -> int:
+    """Return the default CAN ID of a PDO, given the index of its communication record; 0 for none."""
+    predefined = PREDEFINED[index & ~0x1FF]
+    number = index & 0x1FF
+    if model.can_id is None:
+        return predefined[number] + node if number < len(predefined) else 0
+    return int(model.can_id) + (node if model.relative else 0)

@@ -1,0 +1,81 @@
+"""Conformance finds errors of the protocol code that the device shares with the product's own client."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.conformance.canopen_suite import canopen_suite
+from starhil.hil_tests.conformance.runner import run_case
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
+from starhil.hil_tests.judge.definition import read_unit
+from starhil.protocol.unit_examples import check_unit
+from tests.conformance.links import LINKS, write_unit
+from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutant, read_mutants
+from tests.conformance.simulated import SimulatedUnit
+
+MUTANTS = read_mutants()
+SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
+MECHANISMS = (
+    "checks", "framings", "headers", "scalar types", "scaling", "bits", "enumerations", "lengths", "segmentation",
+    "PDO mapping",
+)  # fmt: skip
+
+
+def unit_of(name: str, folder: Path) -> str | Path:
+    """Return a bundled unit, or a unit with another link, in little-endian order if the name ends in `-le`."""
+    if not name.startswith("link:"):
+        return name
+    link, _, order = name.removeprefix("link:").partition("-")
+    return write_unit(folder, link, "little" if order == "le" else "big")
+
+
+def test_each_mechanism_has_at_least_five_mutants() -> None:
+    counts = Counter(mutant.mechanism for mutant in MUTANTS)
+    assert set(counts) == set(MECHANISMS)
+    assert min(counts.values()) >= 5
+    assert len({(mutant.mechanism, mutant.name) for mutant in MUTANTS}) == len(MUTANTS) >= 50
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: f"{mutant.mechanism}: {mutant.name}")
+def test_an_error_of_both_ends_fails_a_case(mutant: ProtocolMutant, tmp_path: Path) -> None:
+    folder = unit_of(mutant.unit, tmp_path / "unit")
+    with mutant.planted():
+        assert bool(check_unit(folder)) is not mutant.hidden, check_unit(folder)
+        unit = read_unit(folder)
+        cases = {case.id: case for case in SUITES[mutant.link](unit)}
+        failed = []
+        with SimulatedUnit(mutant.link, unit=folder) as simulated:
+            for case in mutant.cases:
+                outcome = run_case(simulated.probe, cases[f"{mutant.link}.{case}"])
+                failed += [outcome] if outcome.status == "failed" else []
+    assert [outcome.id for outcome in failed] == [f"{mutant.link}.{case}" for case in mutant.cases]
+    assert all(outcome.expected and outcome.seen for outcome in failed)
+
+
+@pytest.mark.parametrize("link", LINKS)
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_a_unit_on_any_link_passes_every_case(link: str, order: str, tmp_path: Path) -> None:
+    folder = write_unit(tmp_path / "unit", link, order)
+    with SimulatedUnit("serial", unit=folder) as simulated:
+        outcomes = [run_case(simulated.probe, case) for case in serial_suite(read_unit(folder))]
+    assert [(o.id, o.expected, o.seen, o.log[-4:]) for o in outcomes if o.status != "passed"] == []
+    assert len(outcomes) >= 45
+
+
+@pytest.mark.parametrize(
+    "edit",
+    [
+        Edit("checks:no_such_function", "a", "b"),
+        Edit("no_such_module:crc", "a", "b"),
+        Edit("checks:crc", "no such text", "b"),
+        Edit("checks:crc", "register", "b"),
+    ],
+    ids=["function", "module", "text", "text that occurs several times"],
+)
+def test_a_mutant_whose_aim_is_lost_is_an_error(edit: Edit) -> None:
+    mutant = ProtocolMutant("checks", "lost", "cubestar", (), (edit,))
+    with pytest.raises(LostAimError), mutant.planted():
+        pass

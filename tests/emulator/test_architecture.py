@@ -1,0 +1,121 @@
+"""The page on the architecture describes the run as it is."""
+
+import asyncio
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+from starhil.emulator.device.signals import Signals
+from starhil.emulator.profile import Profile
+from starhil.emulator.run import Run
+from tests.emulator.runs import FakeImager
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+LINE = re.compile(r"(?P<indent>[│├└─ ]*)(?:(?P<name>\w+): )?(?P<class>\w+) +(?P<file>[\w/]+\.py)")
+OPTIONAL = {"feed": "truth", "recorder": "", "stepper": "", "latest": "device", "warm": ""}
+"""Attributes that a run need not have, which are None."""
+
+
+def section(heading):
+    return PAGE.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+
+
+def drawing():
+    """Return the parts of the drawing: path of attributes, class and file."""
+    block = section("A run, part by part").partition("```text\n")[2].partition("```")[0]
+    parts, above = [], []
+    for line in block.splitlines():
+        match = LINE.fullmatch(line)
+        assert match, line
+        depth = len(match["indent"]) // 3
+        above[depth:] = [match["name"]]
+        parts.append((tuple(above[1:]), match["class"], match["file"]))
+    return parts
+
+
+@pytest.fixture
+def opened(make_bench, monkeypatch):
+    """Return what a function makes of a run with all links that has published a frame."""
+    handle = make_bench().pipeline.handle
+    monkeypatch.setattr("starhil.emulator.run.make_imager", lambda *_, **__: FakeImager(handle))
+
+    def opened(look):
+        links = {"serial": {"port": "auto"}, "can": {"channel": "virtual:drawn"}, "canopen": {"node": 5}}
+
+        async def whole():
+            run = Run([Profile.model_validate({"links": links, "run": {"clock": "stepped"}})])
+            try:
+                await run.open()
+                return look(run)
+            finally:
+                await run.close()
+
+        return asyncio.run(whole())
+
+    return opened
+
+
+def part_of(run, path):
+    found = run
+    for name in path:
+        found = getattr(found, name)
+        found = found[0] if isinstance(found, list) else found
+    return found
+
+
+def named(path, class_name, file):
+    """Return the class that the drawing names, from its file."""
+    module = __import__("starhil." + file.removesuffix(".py").replace("/", "."), fromlist=[class_name])
+    return getattr(module, class_name)
+
+
+def test_every_part_of_the_drawing_is_where_it_says(opened):
+    def look(run):
+        return [part_of(run, path) for path, _, _ in drawing()]
+
+    for (path, class_name, file), found in zip(drawing(), opened(look), strict=True):
+        wanted = named(path, class_name, file)
+        assert Path(inspect.getsourcefile(wanted)).resolve() == (ROOT / file).resolve()
+        if path and path[-1] in OPTIONAL and found is None:
+            continue
+        same_kind = type(found).__module__ == wanted.__module__ or type(found) is FakeImager
+        assert isinstance(found, wanted) or same_kind, path
+
+
+def test_the_drawing_leaves_no_part_out(opened):
+    """Every public attribute of run, head and device whose class is defined in the emulator or the protocol."""
+    drawn = {path for path, _, _ in drawing()}
+    shared = {"wiring", "truth", "clock", "profile", "recorder"}
+
+    def look(run):
+        missing = set()
+        for path in ((), ("heads",), ("heads", "device")):
+            for name, value in vars(part_of(run, path)).items():
+                is_part = type(value).__module__.startswith("starhil.")
+                if (
+                    is_part
+                    and not name.startswith("_")
+                    and name not in shared | {"icd"}
+                    and (*path, name) not in drawn
+                ):
+                    missing.add((*path, name))
+        return missing
+
+    assert opened(look) == set()
+
+
+def test_every_signal_has_its_sender_and_its_observers_in_the_drawing():
+    from starhil.emulator.device import signals
+
+    for name in Signals.__dataclass_fields__:
+        assert f"──{name}──►" in signals.__doc__
+
+
+@pytest.mark.parametrize(("heading", "most"), [("The way of an image", 14), ("The way of a telecommand", 7)])
+def test_a_way_visits_no_file_twice(heading, most):
+    steps = re.findall(r"^\d+\. `([\w/.]+\.py)`", section(heading), re.MULTILINE)
+    assert len(steps) == len(set(steps)) <= most
+    assert all((ROOT / file).is_file() for file in steps)
