@@ -180,7 +180,7 @@ def test_a_field_is_drawn_until_it_has_its_least_number_of_stars() -> None:
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_raw_answers_are_not_verified_and_know_the_noise(monkeypatch: pytest.MonkeyPatch, raw: bool) -> None:
+def test_raw_answers_are_not_verified_and_all_know_the_noise(monkeypatch: pytest.MonkeyPatch, raw: bool) -> None:
     asked: list[object] = []
 
     class Noting(Classic):
@@ -195,7 +195,7 @@ def test_raw_answers_are_not_verified_and_know_the_noise(monkeypatch: pytest.Mon
     monkeypatch.setattr(peers, "make_identifier", made)
     bench.run(1, 5, own=["pyramid"], rows=["2"], raw=raw)
     assert asked[0] is not raw
-    assert asked[-1] == (2.0 if raw else None)
+    assert asked[-1] == 2.0
 
 
 def test_evenly_spread_guide_stars_are_the_brightest_of_each_neighbourhood_and_unverified(
