@@ -180,14 +180,14 @@ def test_a_field_is_drawn_until_it_has_its_least_number_of_stars() -> None:
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_raw_answers_are_not_verified_and_both_know_the_noise(
+def test_raw_answers_are_not_verified_and_all_know_the_noise(
     monkeypatch: pytest.MonkeyPatch, raw: bool
 ) -> None:
     asked: list[object] = []
 
     class Noting(Classic):
         def identify(self, *arguments):
-            asked.append(float(arguments[2][0]))
+            asked.append(None if arguments[2] is None else float(arguments[2][0]))
             return Solution.invalid(Reason.NO_MATCH)
 
     def made(*_, **options):
