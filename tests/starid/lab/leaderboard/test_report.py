@@ -180,7 +180,9 @@ def test_a_field_is_drawn_until_it_has_its_least_number_of_stars() -> None:
 
 
 @pytest.mark.parametrize("raw", [False, True])
-def test_raw_answers_are_not_verified_and_all_know_the_noise(monkeypatch: pytest.MonkeyPatch, raw: bool) -> None:
+def test_raw_answers_are_not_verified_and_all_know_the_noise(
+    monkeypatch: pytest.MonkeyPatch, raw: bool
+) -> None:
     asked: list[object] = []
 
     class Noting(Classic):
