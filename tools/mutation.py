@@ -30,7 +30,7 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "out" / "mutation"
-CODECS = "checks codec framings composed_stack envelope serial_framing can_framing flow socketcand candump image_transfer values"
+CODECS = "checks codec framings composed_stack envelope cubespace_serial can_framing flow socketcand candump image_transfer values"
 GROUPS = {
     "emulator/device": [
         "tests/emulator/device",

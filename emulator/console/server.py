@@ -20,7 +20,7 @@ from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import ConnectionLimit
+from starhil.protocol.flow import REQUEST_S, ConnectionLimit
 
 log = logging.getLogger("starhil.console")
 
@@ -39,10 +39,6 @@ HEARTBEAT_S: Final = 20.0
 """Time after which a page that does not answer is disconnected, seconds."""
 
 MAX_VIEWERS: Final = 32
-
-REQUEST_S: Final = 10.0
-"""Time within which a peer must send a request after it has connected or received the last response, and the
-body of a request after its headers, seconds."""
 
 LINGER_S: Final = 1.0
 """Time for which the rest of a rejected request is read, so that its peer receives the answer, seconds."""

@@ -143,9 +143,7 @@ def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
         answer = probe.expect_telemetry(probe.lively)
         probe.sleep(probe.times.quiet_s)
         echo = sent if "echo" in probe.lively.answers else b""
-        whole = echo + probe.line.framing.encode(answer.body)
-        if probe.dialect == "c":
-            whole = whole.replace(b"\x1f\x7f", b"\x1f\x07", 1)
+        whole = echo + probe.line.telemetry_frame(answer.body)
         end = (
             marks[:1] if probe.unit.serial.framing.kind == "slip" else b""
         )  # which may be omitted before a frame

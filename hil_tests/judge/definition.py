@@ -41,7 +41,7 @@ class Unit:
     Attributes
     ----------
     folder
-        Folder of its files; None for a definition that was not read from one.
+        Folder of its files, in which its own cases stand; None for a definition in one file.
     serial, can
         Models of `[link.serial]` and `[link.can]`; None if the unit does not have the link.
     unanswered
@@ -112,7 +112,7 @@ class Unit:
 def read_unit(name_or_folder: str | Path) -> Unit:
     """Return the definition of a unit: a bundled unit by name, a folder of TOML files, or one file."""
     path = find_unit(name_or_folder)
-    return unit_of(load_unit(name_or_folder), path if path.is_dir() else path.parent)
+    return unit_of(load_unit(name_or_folder), path if path.is_dir() else None)
 
 
 def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:

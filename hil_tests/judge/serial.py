@@ -37,6 +37,8 @@ CUBESPACE: Final = (0x1F, 0x7F, 0xFF)
 """Escape, start of a request, and end."""
 KINDS: Final[dict[int, AnswerKind]] = {0x07: "ack", 0x0F: "nack", 0x2F: "unsolicited", 0x4F: "unsolicited"}
 """Start bytes of generation 2: acknowledge, refusal, event, unsolicited telemetry."""
+TELEMETRY: Final = 0x07
+"""Start byte of telemetry in generation 2, which is an acknowledge with data."""
 
 
 class Envelope(Protocol):
@@ -96,6 +98,12 @@ class SerialLine:
     def encode(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
         return self.framing.encode(self.envelope.body(request))
+
+    def telemetry_frame(self, body: bytes) -> bytes:
+        """Return the body of a telemetry answer as bytes on the line."""
+        if isinstance(self.framing, Escaped) and self.dialect == "c":
+            return self.framing.encode(body, TELEMETRY)
+        return self.framing.encode(body)
 
     def expect(self, request: Request) -> None:
         """Note a request, in order."""

@@ -99,6 +99,11 @@ def test_a_units_own_settings_are_restored_and_otherwise_those_that_can_be_read(
             assert simulated.probe.telemetry("numbers")["a"] == 77
 
 
+def test_a_definition_in_one_file_runs_no_files_beside_it(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", "raise SystemError")
+    assert serial_suite(read_unit(folder / "unit.toml"))
+
+
 def test_a_file_that_fails_is_named(tmp_path: Path) -> None:
     folder = unit_with(tmp_path / "unit", "import no_such_module")
     with pytest.raises(

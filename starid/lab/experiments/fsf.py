@@ -498,8 +498,8 @@ EXPERIMENTS: Final = (
             "kinds": ["both"],
             "false_stars": [0, 5],
             "stretches": [1.0],
-            "first_frames": 3,
-            "frames": 50,
+            "first_frames": 5,
+            "frames": 40,
         },
     ),
 )

@@ -165,7 +165,6 @@ KNOWN: Final[dict[str, dict[str, KnownMiss]]] = {
                 for method in _RSI
                 for what in ("mean", "deviation of")
                 for symbol in ("ε_f", "ε_θ", "ε_ψ")
-                if (what, symbol) != ("mean", "ε_f") or method == "FSF-aided LSI" or m > 1
             ),
         ),
         **_each(
