@@ -32,7 +32,11 @@ ROOT = Path(__file__).parent.parent
 OUT = ROOT / "out" / "mutation"
 CODECS = "checks codec framings composed_stack envelope cubespace_serial can_framing flow socketcand candump image_transfer values"
 GROUPS = {
-    "emulator/device": ["tests/emulator/device", "tests/emulator/units"],
+    "emulator/device": [
+        "tests/emulator/device",
+        "tests/emulator/units",
+        "tests/emulator/control/test_upsets.py",
+    ],
     "emulator/links": ["tests/emulator/links"],
     "protocol/canopen": ["tests/protocol/canopen", "tests/emulator/links/test_canopen.py"],
     "protocol": ["tests/protocol", "--ignore=tests/protocol/canopen", "--ignore=tests/protocol/transports"],

@@ -3,6 +3,8 @@
 import pytest
 
 from starhil.emulator.device.cycle import MAX_PENDING
+from starhil.emulator.device.quantities import QUANTITIES
+from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode
@@ -135,3 +137,12 @@ def test_exposures_that_the_machine_has_no_time_for_are_skipped_and_tracking_con
     bench.imager.pending = MAX_PENDING
     bench.step(10.0)
     assert bench.read("precise_attitude")["reason"] == "no_frame"  # what stands is too old by now
+
+
+def test_the_age_of_a_frame_counts_from_the_middle_of_its_exposure(bench):
+    bench.command("set_mode", mode="lost_in_space")
+    bench.step(2.5)
+    measured = Snapshot(bench.device).frame
+    age_s = (bench.clock.now_ns() - measured.mid_ns) / 1e9
+    assert QUANTITIES["frame.age"](Snapshot(bench.device)) == age_s
+    assert 0.0 < age_s < 2.5
