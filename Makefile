@@ -5,18 +5,23 @@
 # make reproduce   every experiment of the thesis again; report.md, tables and plots in out/reproduce
 # make cosmos      the COSMOS exports, read and driven by OpenC3's own code (installed apart, 110 MB)
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
+# make fuzz-guided every decoder and reader of files against inputs guided by coverage, SECONDS (60) each
+# make coverage    all tests under measurement; fails below 95 % of lines and branches (docs/figures.md)
+# make mutation    a random SAMPLE (40) of the mutants of each module (MODULES: protocol/canopen, …); table in out/mutation
 # make years       random lives of all units on JOBS (2) processors for HOURS (8), judged by an oracle (docs/endurance.md)
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
 MINUTES ?= 15
 HOURS ?= 8
+SECONDS ?= 60
+SAMPLE ?= 40
 JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint docs reproduce fuzz soak years cosmos clean
+.PHONY: help demo test lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -66,6 +71,22 @@ reproduce: $(VENV)/.lab
 
 fuzz: $(VENV)/.developer
 	STARHIL_FUZZ_INPUTS=1000000 $(BIN)/python -m pytest tests/protocol/test_fuzz.py tests/protocol/test_composed_faults.py tests/protocol/test_unit_fuzz.py tests/protocol/canopen/test_slave_fuzz.py
+
+$(VENV)/.measuring: $(VENV)/.developer
+	$(BIN)/pip install --quiet --no-compile --editable '.[measuring]'
+	@touch $@
+
+fuzz-guided: $(VENV)/.measuring
+	$(BIN)/python tools/fuzz.py --seconds $(SECONDS)
+
+coverage: $(VENV)/.measuring
+	rm -rf out/coverage
+	STARHIL_FUZZ_INPUTS=3000 nice $(BIN)/python -m coverage run -m pytest -q -m "not socketcan and not browser" tests
+	$(BIN)/python -m coverage combine -q
+	$(BIN)/python -m coverage report
+
+mutation: $(VENV)/.measuring
+	nice $(BIN)/python tools/mutation.py $(MODULES) --sample $(SAMPLE) --jobs 2
 
 soak: $(VENV)/.product
 	$(BIN)/python tools/soak.py --minutes $(MINUTES)

@@ -34,22 +34,40 @@ def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-async def read_lines(reader: asyncio.StreamReader, end: bytes = b"\n") -> AsyncIterator[bytes | None]:
+async def read_lines(
+    reader: asyncio.StreamReader, end: bytes = b"\n", *, within_s: float | None = None
+) -> AsyncIterator[bytes | None]:
     """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped.
 
-    `end` is the line terminator.
+    Parameters
+    ----------
+    reader
+        Stream of lines.
+    end
+        Line terminator; one byte if `within_s` is given.
+    within_s
+        Time within which a line that has begun must be complete, seconds; a peer may be silent between lines.
+
+    Raises
+    ------
+    TimeoutError
+        A line was not complete in time.
     """
     too_long = False
     while True:
+        begun = b""
         try:
-            line = await reader.readuntil(end)
+            if within_s is not None and not too_long:
+                begun = await reader.readexactly(1)
+            async with asyncio.timeout(within_s):
+                line = begun if begun == end else begun + await reader.readuntil(end)
         except asyncio.LimitOverrunError as overrun:
             await reader.readexactly(overrun.consumed)
             too_long = True
             continue
-        except asyncio.IncompleteReadError as end:
-            if too_long or end.partial:
-                yield None if too_long else end.partial
+        except asyncio.IncompleteReadError as rest:
+            if too_long or begun + rest.partial:
+                yield None if too_long else begun + rest.partial
             return
         yield None if too_long else line
         too_long = False

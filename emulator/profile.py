@@ -323,6 +323,11 @@ class Profile(Strict):
             return self.catalog.epoch
         return round(2000.0 + (self.start_unix_s - _J2000_UNIX_S) / _JULIAN_YEAR_S, 1)
 
+    def read_from(self, path: Path) -> Self:
+        """Note the file of the profile, to whose folder its relative paths refer; return the profile."""
+        self._source = path
+        return self
+
     @property
     def source(self) -> str:
         """File of the profile, or its name if there is none, for messages."""
@@ -401,8 +406,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
             raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
-    profile._source = path  # noqa: SLF001 (private: not a key of the file)
-    return profile
+    return profile.read_from(path)
 
 
 def camera_of(name_or_path: str) -> Camera:

@@ -314,8 +314,7 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
         raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
     run = _validated(_RunFile, text, path)
     is_copied = isinstance(run.profile.truth, FileConfig)
-    run.profile._source = (folder if is_copied else Path(run.folder)) / RUN_FILE  # noqa: SLF001 (private: not a key of the file)
-    return run.profile, run.ends
+    return run.profile.read_from((folder if is_copied else Path(run.folder)) / RUN_FILE), run.ends
 
 
 def _read(path: Path) -> str:

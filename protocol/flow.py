@@ -35,6 +35,10 @@ UNREAD_LIMIT_MS: Final = 10_000
 MAX_CONNECTIONS: Final = 64
 """Maximum number of connections of a server."""
 
+REQUEST_S: Final = 10.0
+"""Time within which a peer must complete a request: for HTTP, after it has connected or received the last response,
+and the body after the headers; for a line, after its first byte; seconds."""
+
 SHARE_OF_DESCRIPTORS: Final = 8
 """A server uses at most one in this many of the file descriptors that the process may open."""
 

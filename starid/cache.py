@@ -30,7 +30,7 @@ BYTES_PER_MB: Final = 1_000_000
 _KERNELS: Final = "kernels"
 KERNEL_SUFFIX: Final = ".kernel"
 _OWN_NAME: Final = re.compile(
-    rf"(?:hipparcos|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
+    rf"(?:hipparcos|stars|index|features)-[0-9a-f]{{16}}\.(?:npz|bin)|{_KERNELS}/[0-9a-f]{{16}}"
 )
 """Paths that the cache owns, relative to its folder; nothing else in the folder is ever removed."""
 

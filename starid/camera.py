@@ -18,21 +18,17 @@ from starid.arrays import Array, Mask
 from starid.attitude import Attitude
 from starid.errors import StaridError
 from starid.projection import (
-    CX,
-    CY,
     EQUIDISTANT,
     FLAT,
-    FX,
-    FY,
     K1,
     LIMIT2,
     PINHOLE,
     WIDTH,
     back_project_kernel,
-    distort_slopes,
+    is_one_to_one,
     jacobian_kernel,
     project_kernel,
-    undistort,
+    undistorted_reach,
 )
 
 Model = Literal["pinhole", "equidistant", "flat"]
@@ -371,18 +367,10 @@ def _one_to_one_limit(params: Array, border: Array) -> float:
     fold = math.sqrt(min([*turns, params[LIMIT2]]))
     probe = params.copy()
     probe[LIMIT2] = fold**2
-    reach = 0.0
-    for u, v in border:
-        a, b, solved = undistort(probe, (u - params[CX]) / params[FX], (v - params[CY]) / params[FY])
-        if not solved:
-            raise _fold_error(params[K1:WIDTH].tolist())
-        reach = max(reach, math.hypot(a, b))
+    reach = undistorted_reach(probe, border)
     limit = min(_MARGIN * reach, reach + _FOLD_SHARE * (fold - reach))
-    for radius in np.linspace(0.0, limit, 40):
-        for angle in np.linspace(0.0, 2.0 * math.pi, 48, endpoint=False):
-            j11, j12, j22 = distort_slopes(params, radius * math.cos(angle), radius * math.sin(angle))
-            if j11 * j22 - j12 * j12 <= 0.0 or j11 <= 0.0:
-                raise _fold_error(params[K1:WIDTH].tolist())
+    if not (math.isfinite(reach) and is_one_to_one(params, limit, 40, 48)):
+        raise _fold_error(params[K1:WIDTH].tolist())
     return limit
 
 

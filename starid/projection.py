@@ -99,7 +99,7 @@ def distort(params: Array, a: float, b: float) -> tuple[float, float]:
     )
 
 
-@compiled
+@inner_checked
 def distort_slopes(params: Array, a: float, b: float) -> tuple[float, float, float]:
     """Return the derivatives of `distort`: (∂a'/∂a, ∂a'/∂b = ∂b'/∂a, ∂b'/∂b)."""
     s = a * a + b * b
@@ -114,7 +114,7 @@ def distort_slopes(params: Array, a: float, b: float) -> tuple[float, float, flo
     )
 
 
-@compiled
+@inner_checked
 def undistort(params: Array, a: float, b: float) -> tuple[float, float, bool]:
     """Invert `distort` by damped Newton steps inside the one-to-one disc; False if there is no solution."""
     limit2 = params[LIMIT2]
@@ -246,3 +246,28 @@ def jacobian_kernel(params: Array, vectors: Array) -> Array:
         jacobian[i, 1, 1] = fy * (j12 * ay + j22 * by)
         jacobian[i, 1, 2] = fy * (j12 * az + j22 * bz)
     return jacobian
+
+
+@compiled
+def undistorted_reach(params: Array, xy: Array) -> float:
+    """Return the largest radius, in the plane without distortion, of pixel positions (n, 2); NaN if one has none."""
+    reach = 0.0
+    for row in range(xy.shape[0]):
+        u, v = (xy[row, 0] - params[CX]) / params[FX], (xy[row, 1] - params[CY]) / params[FY]
+        a, b, solved = undistort(params, u, v)
+        if not solved:
+            return math.nan
+        reach = max(reach, math.hypot(a, b))
+    return reach
+
+
+@compiled
+def is_one_to_one(params: Array, limit: float, radii: int, angles: int) -> bool:
+    """Whether the distortion turns nothing over at points of a disc in the image plane."""
+    for i in range(radii):
+        for j in range(angles):
+            radius, angle = limit * i / (radii - 1), 2.0 * math.pi * j / angles
+            j11, j12, j22 = distort_slopes(params, radius * math.cos(angle), radius * math.sin(angle))
+            if j11 * j22 - j12 * j12 <= 0.0 or j11 <= 0.0:
+                return False
+    return True

@@ -23,11 +23,16 @@ def _numbers(values: ArrayLike, name: str) -> Array:
         raise StaridError(f"detections: {name} must be an array of numbers ({error})") from error
 
 
-def _all_finite(array: Array) -> bool:
-    """Whether all values are finite; fast if the sum of the squares does not overflow."""
-    flat = array.ravel()
+def _magnitudes(xy: Array, brightness: Array) -> tuple[float, float]:
+    """Return the root of the sum of squares of each array: infinite or NaN if a value is, or if squares overflow."""
+    positions = xy.ravel()
     with np.errstate(over="ignore"):
-        return math.isfinite(float(flat @ flat)) or bool(np.isfinite(flat).all())
+        return math.sqrt(positions @ positions), math.sqrt(brightness @ brightness)
+
+
+def _is_finite(array: Array, magnitude: float) -> bool:
+    """Whether all values are finite; fast unless their squares overflow."""
+    return math.isfinite(magnitude) or bool(np.isfinite(array).all())
 
 
 def checked_detections(
@@ -47,9 +52,10 @@ def checked_detections(
         raise StaridError(
             f"detections: shapes of positions and flux must be (n, 2) and (n,), not {xy.shape} and {brightness.shape}"
         )
-    if not (_all_finite(xy) and _all_finite(brightness)):
+    extent, light = _magnitudes(xy, brightness)
+    if not (_is_finite(xy, extent) and _is_finite(brightness, light)):
         raise StaridError("detections: positions and flux must be finite numbers")
-    if xy.size and float(np.abs(xy).max()) > FARTHEST_PX:
+    if extent > FARTHEST_PX and float(np.abs(xy).max()) > FARTHEST_PX:
         raise StaridError(f"detections: every position must lie within ±{FARTHEST_PX:g} pixels")
     sigmas = np.ones(xy.shape)
     if xy_sigma_px is not None:

@@ -377,8 +377,7 @@ def scenario() -> str:
 
 def unit_definition() -> str:
     """Tables and keys of the files of a unit."""
-    from starhil.protocol import icd_schema, link_schema, values
-    from starhil.protocol.canopen import layout
+    from starhil.protocol import canopen_schema, icd_schema, link_schema, values
     from starhil.protocol.conventions import Conventions
     from starhil.protocol.messages import ErrorCode
 
@@ -409,11 +408,11 @@ def unit_definition() -> str:
         "request_header, reply_header": link_schema.HeaderFieldModel,
         "bits of a header": link_schema.HeaderBitModel,
         "[link.can]": link_schema.CubeSpaceCanModel,
-        "[canopen]": layout.CanopenModel,
-        "[[canopen.object]]": layout.PlacedObject,
-        "packed": layout.PackedField,
-        "members": layout.PlacedMember,
-        "[[canopen.tpdo]], [[canopen.rpdo]]": layout.PdoModel,
+        "[canopen]": canopen_schema.CanopenModel,
+        "[[canopen.object]]": canopen_schema.PlacedObject,
+        "packed": canopen_schema.PackedField,
+        "members": canopen_schema.PlacedMember,
+        "[[canopen.tpdo]], [[canopen.rpdo]]": canopen_schema.PdoModel,
     }
     parts = []
     for heading, model in headings.items():

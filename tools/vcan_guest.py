@@ -100,7 +100,6 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
             "environment": dict(os.environ),
             "shares": [str(path.resolve()) for path in shares],
             "job_folder": str(folder),
-            "times_ns": source_times(Path.cwd()),
         }
         (folder / JOB_FILE).write_text(json.dumps(job), encoding="utf-8")
         init = folder / "init"
@@ -122,22 +121,6 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
             raise GuestError(
                 f"the guest did not run the command; its console:\n{text}", EXIT_GUEST_FAILED
             ) from None
-
-
-def source_times(folder: Path) -> dict[str, int]:
-    """Return the modification times (ns) of the Python files below a folder, except in hidden folders.
-
-    A guest sees only whole seconds on the host file system. Caches of compiled code compare the full time, so
-    the guest must restore it; otherwise everything would be compiled again.
-    """
-    times = {}
-    for directory, names, files in os.walk(folder):
-        names[:] = [name for name in names if not name.startswith(".")]
-        for name in files:
-            if name.endswith(".py"):
-                path = Path(directory, name)
-                times[str(path)] = path.stat().st_mtime_ns
-    return times
 
 
 def boot(init: Path, folder: Path, console: BinaryIO, *, memory: str, time_out_s: float) -> bool:
@@ -248,9 +231,6 @@ def prepare_root(libc: ctypes.CDLL, job: dict[str, Any]) -> Path:
         mount(libc, "hostfs", root / share.lstrip("/"), data=share)
     os.chroot(root)
     os.chdir(job["folder"])
-    for path, time_ns in job["times_ns"].items():
-        with contextlib.suppress(OSError):  # below a shared folder, or removed since
-            os.utime(path, ns=(time_ns, time_ns))
     return Path("/run/vcan-guest")
 
 

@@ -20,7 +20,7 @@ from starhil.emulator.console.console import Console
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.errors import reason
-from starhil.protocol.flow import ConnectionLimit
+from starhil.protocol.flow import REQUEST_S, ConnectionLimit
 
 log = logging.getLogger("starhil.console")
 
@@ -39,10 +39,6 @@ HEARTBEAT_S: Final = 20.0
 """Time after which a page that does not answer is disconnected, seconds."""
 
 MAX_VIEWERS: Final = 32
-
-REQUEST_S: Final = 10.0
-"""Time within which a peer must send a request after it has connected or received the last response, and the
-body of a request after its headers, seconds."""
 
 LINGER_S: Final = 1.0
 """Time for which the rest of a rejected request is read, so that its peer receives the answer, seconds."""
@@ -125,6 +121,8 @@ class ConsoleServer:
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Reject other origins and, except for static files, requests without the token."""
+        if not all(value.isascii() for value in request.headers.values()):  # aiohttp fails on some of them
+            return web.Response(status=400, text="400: a header is not ASCII\n", headers=HEADERS)
         if not _is_same_origin(request):
             return web.Response(
                 status=403, text="403: the request comes from a page of another origin\n", headers=HEADERS

@@ -59,7 +59,7 @@ from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError, reason
-from starhil.protocol.flow import ConnectionLimit
+from starhil.protocol.flow import REQUEST_S, ConnectionLimit
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -67,6 +67,8 @@ log = logging.getLogger("starhil.control")
 MAX_LINE: Final = 1 << 20
 KEPT_FRAMES: Final = 200
 BUSY: Final = b'{"ok": false, "error": "too many connections to the control channel; close others first"}\n'
+
+LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
 
 Answer = dict[str, Any]
 
@@ -146,12 +148,14 @@ class ControlServer:
             return
         self._writers.add(writer)
         try:
-            async for line in read_lines(reader):
+            async for line in read_lines(reader, within_s=REQUEST_S):
                 if line is None or line.strip():
                     writer.write(json.dumps(await self.answer(line)).encode() + b"\n")
                     await writer.drain()
         except ConnectionError as error:
             log.info("control channel: connection lost (%s)", error)
+        except TimeoutError:
+            writer.write(LATE)
         finally:
             self._writers.discard(writer)
             writer.close()

@@ -7,6 +7,9 @@
     device ──started──► subscriptions      device ──restarted──► links, revival of the pipeline
     subscriptions ──row_due──► requests    requests ──unsolicited──► links
 
+Two parts that know nothing of the device have a signal of their own: `Scheduler.added` wakes a sleeping pump, and
+`PipelineImager.ended` starts the pipeline again.
+
 The sender changes its own state before it reports. Observers are called in the order in which the parts were made:
 first the device, so that every other part finds it up to date.
 """

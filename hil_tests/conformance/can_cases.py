@@ -33,8 +33,6 @@ SEGMENT_RULE: Final = "more than 8 bytes: 7 and a counter down to 0, no padding 
 TYPES: Final = "message types 0 to 12 (libCubeObc)"
 
 OTHER_HOST: Final = 0x4D
-CUBESTAR: Final = frozenset({128, 230, 211, 200, 60, 103, 96, 2, 112, 37})
-"""Rows, and gaps between them, that a case uses if they are suitable."""
 LONGEST: Final = 56
 """Maximum size of telemetry whose segments are checked: 8 segments."""
 
@@ -47,7 +45,7 @@ class CanRows:
     single, small
         Telemetry that fits into a frame; the second has fewer than 8 bytes.
     long
-        Telemetry in segments.
+        Telemetry in segments, if possible with a last one that is not full.
     unknown_telemetry, unknown_telecommand
         IDs that the unit does not have.
     empty
@@ -67,9 +65,8 @@ class CanRows:
         bad = [(row, data) for row in commands for data in _bad_data(row) if len(data) <= 8]
         self.single = _first(row for row in telemetry if row.size <= 8)
         self.small = _first(row for row in telemetry if row.size < 8)
-        self.long = _first(
-            sorted((row for row in telemetry if 8 < row.size <= LONGEST), key=lambda row: -row.size)
-        )
+        shown = [row for row in telemetry if 8 < row.size <= LONGEST]
+        self.long = _first(sorted(shown, key=lambda row: (row.size % 7 == 0, -row.size)))
         self.unknown_telemetry = _gap(range(128, 256), {row.id for row in telemetry})
         self.unknown_telecommand = _gap(range(128), {row.id for row in commands})
         self.empty = _first(row for row in commands if not row.size and row.action != "reset")
@@ -101,14 +98,11 @@ def _bad_data(row: Row) -> list[bytes]:
 
 
 def _first(rows: Iterable[Row]) -> Row | None:
-    """Return CubeStar's row if it is among these, otherwise the first."""
-    found = list(rows)
-    return next((row for row in found if row.id in CUBESTAR), found[0] if found else None)
+    return next(iter(rows), None)
 
 
 def _gap(numbers: range, known: set[int]) -> int | None:
-    gaps = [number for number in numbers if number not in known]
-    return next((number for number in gaps if number in CUBESTAR), gaps[0] if gaps else None)
+    return next((number for number in numbers if number not in known), None)
 
 
 FRAME_RULE: Final = "29-bit CAN ID: type[28:24] row[23:16] source[15:8] destination[7:0] (libCubeObc)"

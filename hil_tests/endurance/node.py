@@ -17,7 +17,6 @@ from starhil.hil_tests.endurance.violation import Violation
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.communication import TPDO_CAN_IDS
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, in_order, span_of
-from starhil.protocol.canopen.dictionary import type_size
 from starhil.protocol.canopen_schema import PackedField
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.icd import InterfaceDefinition
@@ -78,9 +77,7 @@ class Node:
         for number, model in enumerate(dictionary.layout.tpdo):
             if model.enabled:
                 can_id = model.can_id or TPDO_CAN_IDS[number]
-                self._tpdos[can_id, model.relative] = [
-                    _mapped(icd, dictionary, name) for name in model.objects
-                ]
+                self._tpdos[can_id, model.relative] = [_mapped(dictionary, name) for name in model.objects]
         self._together: Readings = {}
 
     def judge(self, frame: CanFrame, node: int, oracle: Oracle) -> int:
@@ -124,24 +121,11 @@ class Node:
             raise Violation(f"canopen: EMCY {code:04X}h in {', '.join(sorted(oracle.modes))}")
 
 
-def _mapped(icd: InterfaceDefinition, dictionary: DeviceDictionary, name: str) -> _Mapped:
+def _mapped(dictionary: DeviceDictionary, name: str) -> _Mapped:
     """Return the entry of a name as in the mapping of a definition, `INDEX.NAME` or `INDEX`."""
-    index, _, member = name.partition(".")
-    placed = next(item for item in dictionary.layout.object if item.index == int(index, 16))
-    packed = next(
-        (item for item in placed.packed if member in (item.name, item.source.partition(".")[2])), None
-    )
-    if placed.telemetry is not None:
-        source = f"{placed.telemetry}.{member}"
-    elif packed is not None:
-        source = packed.source
-    else:
-        named = [item.value for item in placed.members if item.name.lower() == member.lower()]
-        source = str(named[0] if named else placed.value)
-    row_name, _, field_name = source.partition(".")
-    row = icd.telemetry[row_name]
-    size = type_size(dictionary.entries[dictionary.key_of(name)].variable.data_type)
-    field = row.named_fields[field_name]
+    key = dictionary.key_of(name)
+    reading = dictionary.readings[key]
+    field, packed = reading.fields[0], reading.packed
     if packed is not None and field.width == 0:
         field = field.changed(kind="integer", scale=packed.scale)
-    return _Mapped(size or 0, row, field, packed)
+    return _Mapped(dictionary.entries[key].size or 0, reading.row, field, packed)

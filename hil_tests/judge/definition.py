@@ -41,7 +41,7 @@ class Unit:
     Attributes
     ----------
     folder
-        Folder of its files; None for a definition that was not read from one.
+        Folder of its files, in which its own cases stand; None for a definition in one file.
     serial, can
         Models of `[link.serial]` and `[link.can]`; None if the unit does not have the link.
     unanswered
@@ -112,7 +112,7 @@ class Unit:
 def read_unit(name_or_folder: str | Path) -> Unit:
     """Return the definition of a unit: a bundled unit by name, a folder of TOML files, or one file."""
     path = find_unit(name_or_folder)
-    return unit_of(load_unit(name_or_folder), path if path.is_dir() else path.parent)
+    return unit_of(load_unit(name_or_folder), path if path.is_dir() else None)
 
 
 def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
@@ -187,6 +187,7 @@ class _PluginFraming:
     def __init__(self, unit: Unit) -> None:
         link = unit.serial
         self._framing = unit.plugin.framings[link.framing.name]()
+        self.start, self.end = self._framing.start, self._framing.end
         self._sizes = link.max_size or 1 << 16, link.timeout
 
     def encode(self, body: bytes) -> bytes:

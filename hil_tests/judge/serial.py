@@ -37,6 +37,8 @@ CUBESPACE: Final = (0x1F, 0x7F, 0xFF)
 """Escape, start of a request, and end."""
 KINDS: Final[dict[int, AnswerKind]] = {0x07: "ack", 0x0F: "nack", 0x2F: "unsolicited", 0x4F: "unsolicited"}
 """Start bytes of generation 2: acknowledge, refusal, event, unsolicited telemetry."""
+TELEMETRY: Final = 0x07
+"""Start byte of telemetry in generation 2, which is an acknowledge with data."""
 
 
 class Envelope(Protocol):
@@ -84,7 +86,7 @@ class SerialLine:
             self.envelope = Dialect(unit, self.dialect)
         else:
             self.framing = _framing(unit)
-            self.envelope = Headed(unit)
+            self.envelope = Headed(unit, self.framing)
         self.clear()
 
     def clear(self) -> None:
@@ -96,6 +98,12 @@ class SerialLine:
     def encode(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
         return self.framing.encode(self.envelope.body(request))
+
+    def telemetry_frame(self, body: bytes) -> bytes:
+        """Return the body of a telemetry answer as bytes on the line."""
+        if isinstance(self.framing, Escaped) and self.dialect == "c":
+            return self.framing.encode(body, TELEMETRY)
+        return self.framing.encode(body)
 
     def expect(self, request: Request) -> None:
         """Note a request, in order."""
@@ -170,20 +178,14 @@ class Headed:
 
     has_unsolicited = True
 
-    def __init__(self, unit: Unit) -> None:
+    def __init__(self, unit: Unit, framing: Framing) -> None:
         link = unit.serial
         self._unit = unit
-        self._start = bytes(
-            getattr(link.framing, "start", [])
-            if link.framing.kind != "escaped"
-            else (link.framing.escape, link.framing.start)
-        )
-        end = getattr(link.framing, "end", [])
-        ending = {"escaped": 2, "slip": 1}.get(link.framing.kind) or len(end)
+        self._start = framing.start
         self._compute = check_function(link.check, unit.byte_order, partial(plugin_check, unit))
         self.covers = getattr(link.check, "covers", [])
         self.check_size = len(self._compute(b""))
-        sizes = {"start": len(self._start), "check": self.check_size, "end": ending}
+        sizes = {"start": len(self._start), "check": self.check_size, "end": len(framing.end)}
         coded = [item for item in unit.classes if item.code is not None]
         requests = [(item.name, item.code) for item in coded]
         replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Final, NoReturn
 
@@ -52,6 +53,18 @@ DATA_TYPES: Final[dict[str, int]] = {
 Key = tuple[int, int]
 
 
+@dataclass(frozen=True)
+class Reading:
+    """What an entry reads: a slot of a telemetry row, or all of it, as it is or as a narrower integer."""
+
+    row: Row
+    slot: Slot | None = None
+    """None for the whole row."""
+    fields: Sequence[Field] = ()
+    """Fields of the slot."""
+    packed: PackedField | None = None
+
+
 class DeviceDictionary(Dictionary):
     """Object dictionary of a device, built from its interface definition.
 
@@ -66,6 +79,8 @@ class DeviceDictionary(Dictionary):
 
     Attributes
     ----------
+    readings
+        Key of an entry → the part of a telemetry row that it reads.
     sources
         Telemetry row → keys of the entries that contain it.
     parameters
@@ -78,6 +93,7 @@ class DeviceDictionary(Dictionary):
         self.icd = icd
         self.layout = layout
         self.application: Application = application or StandInApplication(icd)
+        self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
         self.parameters: dict[str, Key] = {}
         self._readers: dict[Key, Callable[[], bytes]] = {}
@@ -163,7 +179,7 @@ class DeviceDictionary(Dictionary):
             key = (placed.index, row.id)
             if row.kind == "telemetry":
                 member = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
-                self._bind_reader(key, row, row.name, partial(self.row_bytes, row))
+                self._bind_reader(key, Reading(row), row.name, partial(self.row_bytes, row))
                 self._placed[row.kind, row.name, None] = key
             else:
                 member = self._telecommand_variable(row.name, key, row)
@@ -179,7 +195,9 @@ class DeviceDictionary(Dictionary):
             member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
             _describe(member, fields)
             for field in fields:
-                self._bind_reader(key, row, field.name, partial(self._read_slot, row, slot))
+                self._bind_reader(
+                    key, Reading(row, slot, fields), field.name, partial(self._read_slot, row, slot)
+                )
             self._placed[row.kind, row.name, slot.index] = key
             if placed.telecommand is not None:
                 member.access_type = "rw"
@@ -222,7 +240,9 @@ class DeviceDictionary(Dictionary):
                 member.access_type = "rw"
             read = partial(self._read_slot, row, slot)
             text = fields[0].kind == "text"
-            self._bind_reader(key, row, name, (lambda: read().rstrip(b"\0")) if text else read)
+            self._bind_reader(
+                key, Reading(row, slot, fields), name, (lambda: read().rstrip(b"\0")) if text else read
+            )
             self._placed[row.kind, row.name, slot.index] = key
         return member
 
@@ -311,7 +331,8 @@ class DeviceDictionary(Dictionary):
             _describe(member, fields)
             member.min = member.max = None
             member.factor = model.scale
-            self._bind_reader(key, row, name, _Packer(self, row, slot, fields, model))
+            packer = _Packer(self, row, slot, fields, model)
+            self._bind_reader(key, Reading(row, slot, fields, model), name, packer)
             members.append(member)
         add_record(objects, placed.name, members)
 
@@ -362,9 +383,10 @@ class DeviceDictionary(Dictionary):
     def _read_slot(self, row: Row, slot: Slot) -> bytes:
         return in_order(slot, self.row_bytes(row)[span_of(slot)])
 
-    def _bind_reader(self, key: Key, row: Row, name: str, reader: Callable[[], bytes]) -> None:
+    def _bind_reader(self, key: Key, reading: Reading, name: str, reader: Callable[[], bytes]) -> None:
+        self.readings[key] = reading
         self._readers[key] = reader
-        self.sources.setdefault(row.name, set()).add(key)
+        self.sources.setdefault(reading.row.name, set()).add(key)
         self._names[f"{key[0]:04x}.{name}"] = key
 
     def _slot_of(self, reference: str) -> tuple[Row, Slot, list[Field]]:

@@ -31,7 +31,7 @@ EXIT_INTERRUPTED: Final = 130
 USAGE_ERROR: Final[type[Exception]] = typer.BadParameter.__mro__[1]
 """Base class of errors about options; which library defines it depends on typer's version."""
 
-LAB_PACKAGES: Final = ("matplotlib", "sklearn")
+LAB_PACKAGES: Final = ("joblib", "matplotlib", "sklearn")
 """Packages of the extra `lab`."""
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -27,9 +28,10 @@ from starid.geometric.index_choice import (
     default_limiting_magnitude,
     index_settings,
     obtain_index,
+    obtain_stars,
     pixels_per_radian,
 )
-from starid.geometric.pattern_index import field_solid_angle, resolved_stars
+from starid.geometric.pattern_index import IndexArrays, field_solid_angle
 from starid.geometric.search import identify_kernel
 from starid.geometric.settings import (
     ACCEPTED,
@@ -53,6 +55,7 @@ from starid.geometric.settings import (
 )
 from starid.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KNOWN, track_kernel
 from starid.geometric.verification import WHOLE_SKY
+from starid.jit import BoundKernel
 from starid.single_camera import CheckedDetections, SingleCameraIdentifier, near
 from starid.solution import Mode, Reason, Solution
 
@@ -180,10 +183,15 @@ class Identifier(SingleCameraIdentifier):
         if limiting_magnitude is None:
             limiting_magnitude = default_limiting_magnitude(self._catalog, field_solid_angle(typical))
         settings = index_settings(typical, self._catalog, limiting_magnitude, blend_px, effort.window_px)
-        self._stars = resolved_stars(self._catalog, limiting_magnitude, settings.blend_rad)
+        self._stars = obtain_stars(self._catalog, settings, cache)
         self._rows = self._catalog.index_of(self._stars.hip).astype(np.int64)
-        self._index = obtain_index(self._stars, settings, cache)
+        self._set_index(obtain_index(self._stars, settings, cache))
         self._configure(camera, fov_tolerance, effort)
+
+    def _set_index(self, index: IndexArrays) -> None:
+        self._index = index
+        self._identify_kernel: Callable[..., Answer] = BoundKernel(identify_kernel, index)
+        self._track_kernel: Callable[..., Answer] = BoundKernel(track_kernel, index)
 
     def _configure(self, camera: Camera, fov_tolerance: float, effort: Effort) -> None:
         """Set what depends on the camera and the bounds of the search."""
@@ -214,7 +222,7 @@ class Identifier(SingleCameraIdentifier):
     def _search(self, camera: Camera, measured: CheckedDetections, numbers: Array) -> Answer:
         """Search the whole sky with a given camera and kernel settings."""
         detections = measured.xy, measured.flux, measured.sigmas
-        return identify_kernel(self._index, camera.params, *detections, numbers)
+        return self._identify_kernel(camera.params, *detections, numbers)
 
     def _numbers_for(self, measured: CheckedDetections) -> Array:
         """Kernel settings for one call."""
@@ -287,8 +295,8 @@ class Identifier(SingleCameraIdentifier):
         if anywhere:
             prior, least, numbers = WHOLE_SKY, MIN_MATCHED, numbers.copy()
             numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
-        answer = track_kernel(
-            self._index, self._camera.params, measured.xy, measured.flux, measured.sigmas, numbers,
+        answer = self._track_kernel(
+            self._camera.params, measured.xy, measured.flux, measured.sigmas, numbers,
             predicted.matrix, window, least, prior,
         )  # fmt: skip
         return self._solution(answer, "tracking")
@@ -344,7 +352,7 @@ class Identifier(SingleCameraIdentifier):
         )
         other = object.__new__(Identifier)
         other.__dict__.update(self.__dict__)
-        other._index = self._index._replace(stars=stars)
+        other._set_index(self._index._replace(stars=stars))
         return other
 
     def _solution(self, answer: Answer, mode: Mode) -> Solution:

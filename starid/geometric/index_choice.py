@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import math
-from dataclasses import astuple
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
-from starid.cache import cache_dir, evict, mark_used
+from starid.cache import Tables, cache_dir, cached_tables, evict, mark_used
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -21,6 +21,7 @@ from starid.geometric.pattern_index import (
     IndexSettings,
     build_arrays,
     field_solid_angle,
+    resolved_stars,
 )
 
 STARS_PER_FIELD: Final = 200
@@ -55,6 +56,10 @@ _STARS_PER_QUOTA: Final = 30.0
 
 _TRIANGLES_PER_QUOTA2: Final = 6.0
 """(Triangles per pattern star) / (quota² · (longest side / width)⁴); measured on indices."""
+
+
+_MERGED: Final = ("vectors", "ra_rad", "dec_rad", "hp", "v")
+"""Columns of the catalogue that differ for merged stars."""
 
 
 def default_limiting_magnitude(catalog: StarCatalog, field_area_sr: float) -> float:
@@ -128,19 +133,34 @@ def _longest_share(triangles: int, quota: int, area: float) -> float:
     return float((per_star / (_TRIANGLES_PER_QUOTA2 * quota**2)) ** 0.25)
 
 
+def obtain_stars(catalog: StarCatalog, settings: IndexSettings, cache: bool | str | Path) -> StarCatalog:
+    """Return the stars of an index (`resolved_stars`), from the cache if it is the cache folder (True)."""
+
+    def build() -> Tables:
+        stars = resolved_stars(catalog, settings.limiting_magnitude, settings.blend_rad)
+        return {name: getattr(stars, name) for name in ("hip", *_MERGED)}
+
+    text = repr((INDEX_VERSION, catalog.identity, settings.limiting_magnitude, settings.blend_rad))
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    stars = cached_tables(f"stars-{key}", build) if cache is True else build()
+    rows = catalog.index_of(stars["hip"])
+    merged: dict[str, Any] = {name: stars[name] for name in _MERGED}
+    return dataclasses.replace(catalog.subset(rows), **merged)
+
+
 def obtain_index(stars: StarCatalog, settings: IndexSettings, cache: bool | str | Path) -> IndexArrays:
     """Map the index from the cache, or build and cache it.
 
     Parameters
     ----------
     stars : StarCatalog
-        From `starid.geometric.pattern_index.resolved_stars`.
+        From `obtain_stars`.
     settings : IndexSettings
         From `index_settings`.
     cache : bool or path
         True for the cache folder, a path for another folder, False for memory only.
     """
-    text = repr((INDEX_VERSION, stars.identity, astuple(settings)))
+    text = repr((INDEX_VERSION, stars.identity, dataclasses.astuple(settings)))
     key = hashlib.sha256(text.encode()).hexdigest()[:16]
     if cache is False:
         return index_file.unpack(index_file.pack(build_arrays(stars, settings), key), key)

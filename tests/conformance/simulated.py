@@ -169,7 +169,7 @@ class SimulatedUnit:
         link: str,
         damage: Callable[[SimulatedUnit], None] | None = None,
         dialect: str = "b",
-        unit: str = DEFAULT_UNIT,
+        unit: str | Path = DEFAULT_UNIT,
         served: Path | None = None,
     ) -> None:
         self.loop = SimulatedLoop()

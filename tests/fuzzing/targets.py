@@ -31,6 +31,7 @@ from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
@@ -314,10 +315,14 @@ def requests_of(unit: str, _folder: Path) -> Run:
         while at < len(data):
             row, size = rows[data[at] % len(rows)], data[at + 1] if at + 1 < len(data) else 0
             request = icd.request(row, data[at + 2 : at + 2 + size])
-            for reply in bench.requests.handle(request, bench.later.append) or []:
-                assert isinstance(reply, Reply)
+            answer = bench.requests.handle(request)
+            if isinstance(answer, PendingAnswer):
+                answer.when_done(bench.later.extend)
+            else:
+                bench.later.extend(answer)
             bench.step(0.01 * (size % 50))
             at += 2 + size
+        assert all(isinstance(reply, Reply) for reply in bench.later)
 
     return run
 

@@ -140,3 +140,14 @@ def test_a_row_of_a_section_has_a_cell_a_column(tmp_path):
     )
     with pytest.raises(IcdError, match=r"section\.Frames: row 2 has 1 cells, must have 2"):
         load_unit(tmp_path)
+
+
+def test_errors_speak_of_lists_as_toml_does(tmp_path):
+    (tmp_path / "a.toml").write_text(
+        'unit = { name = "x", version = "1", doc = "x" }\n'
+        'conventions = { axes = ["+x", "+y"] }\n'
+        '[[section]]\nheading = "Frames"\ncolumns = "a"\nrows = []\n'
+    )
+    axes, columns = check_unit(tmp_path)
+    assert axes.endswith("conventions.axes: List should have at least 3 items after validation, not 2")
+    assert columns.endswith("section.Frames.columns: Input should be a valid list")

@@ -36,6 +36,10 @@ class Taken:
 class Framing(Protocol):
     """A way to mark messages in a stream of bytes."""
 
+    start: bytes
+    """Bytes before a body, which a check may cover and a length may count."""
+    end: bytes
+    """Bytes after a body, which a length may count."""
     marks: bytes
     """Bytes that are special within a message."""
 

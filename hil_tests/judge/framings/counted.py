@@ -16,26 +16,26 @@ class Counted:
     """A body of a known size between marks."""
 
     def __init__(self, start: list[int], end: list[int]) -> None:
-        self._start, self._end = bytes(start), bytes(end)
-        self.marks = self._start + self._end or b"\x1f\x7f\xff"
+        self.start, self.end = bytes(start), bytes(end)
+        self.marks = self.start + self.end or b"\x1f\x7f\xff"
 
     def encode(self, body: bytes) -> bytes:
         """Return the body between its marks."""
-        return self._start + body + self._end
+        return self.start + body + self.end
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:
         """Remove a message that must begin at once."""
-        begun = bytes(received[: len(self._start)])
-        if begun != self._start[: len(begun)]:
+        begun = bytes(received[: len(self.start)])
+        if begun != self.start[: len(begun)]:
             return junk(received)
         try:
-            size = measure(bytes(received[len(self._start) :]))
+            size = measure(bytes(received[len(self.start) :]))
         except ValueError:
             return junk(received)
-        if size is None or len(received) < len(self._start) + size + len(self._end):
+        if size is None or len(received) < len(self.start) + size + len(self.end):
             return None
-        line = bytes(received[: len(self._start) + size + len(self._end)])
-        if line[len(self._start) + size :] != self._end:
+        line = bytes(received[: len(self.start) + size + len(self.end)])
+        if line[len(self.start) + size :] != self.end:
             return junk(received)
         del received[: len(line)]
-        return Taken(line[len(self._start) : len(self._start) + size])
+        return Taken(line[len(self.start) : len(self.start) + size])

@@ -15,25 +15,25 @@ class Delimited:
     """`start`, the body, `end`."""
 
     def __init__(self, model: Any) -> None:
-        self._start, self._end = bytes(model.start), bytes(model.end)
+        self.start, self.end = bytes(model.start), bytes(model.end)
         self._hex = model.encoding == "hex"
-        self.marks = self._start + self._end
+        self.marks = self.start + self.end
 
     def encode(self, body: bytes) -> bytes:
         """Return the body between its delimiters."""
         text = "".join(f"{byte:02X}" for byte in body).encode() if self._hex else body
-        return self._start + text + self._end
+        return self.start + text + self.end
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:  # noqa: ARG002 -- the end is marked
         """Remove a message that must begin at once."""
-        begun = bytes(received[: len(self._start)])
-        if begun != self._start[: len(begun)]:
+        begun = bytes(received[: len(self.start)])
+        if begun != self.start[: len(begun)]:
             return junk(received)
-        end = received.find(self._end, len(self._start))
+        end = received.find(self.end, len(self.start))
         if end < 0:
             return None
-        text = bytes(received[len(self._start) : end])
-        del received[: end + len(self._end)]
+        text = bytes(received[len(self.start) : end])
+        del received[: end + len(self.end)]
         if not self._hex:
             return Taken(text)
         digits = text.decode("latin-1")

@@ -17,6 +17,7 @@ class Escaped:
 
     def __init__(self, escape: int, starts: tuple[int, ...], end: int) -> None:
         self._escape, self._starts, self._end = escape, starts, end
+        self.start, self.end = bytes((escape, starts[0])), bytes((escape, end))
         self.marks = bytes((escape, starts[0], end))
 
     def encode(self, body: bytes, start: int | None = None) -> bytes:

@@ -23,6 +23,7 @@ class Slip:
         else:
             end, escape = model.end ^ model.xor, model.escape ^ model.xor
         self._written = {self._end: end, self._escape: escape}
+        self.start, self.end = b"", bytes((model.end,))
         self.marks = bytes((self._end, self._escape, end, escape))
 
     def encode(self, body: bytes) -> bytes:

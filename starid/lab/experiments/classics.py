@@ -12,6 +12,7 @@ import numpy as np
 from starid.arrays import Array
 from starid.lab.classic.registry import CLASSICS, class_of, make_identifier
 from starid.lab.experiments.classics_sky import SkyName, ThesisSky, thesis_sky
+from starid.lab.experiments.comparison import published
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -47,24 +48,9 @@ SHORT: Final = {
     "lsi": "LSI (thesis)",
     "geometric": "geometric (ours)",
 }
-_PUBLISHED: Final = {
-    "none": {"lsi": 99.99, "subgraph": 99.86, "improved-grid": 99.80, "iterative": 99.56, "pyramid": 99.34},
-    "position-3": {"lsi": 99.41, "improved-grid": 99.40, "pyramid": 98.56},
-    "brightness-3": {"lsi": 97.99, "pyramid": 97.80},
-}
-"""Identification rates in the text of the thesis, %; its figures show the rest as curves."""
-
-TABLE_6_2: Final = {
-    "pyramid": (130.57, 27.5),
-    "modified-grid": (7380.0, 394.6),
-    "log-polar": (665.89, 73.8),
-    "vector-pattern": (280.72, 7.8),
-    "grid": (331.0, 185.6),
-    "svd": (1483.0, 13.4),
-    "oriented-svd": (145.0, 35.2),
-    "lsi": (6300.0, 46.1),
-}
-"""Database in kB and run time in ms."""
+IN_TABLE_6_2: Final = (
+    "pyramid", "modified-grid", "log-polar", "vector-pattern", "grid", "svd", "oriented-svd", "lsi",
+)  # fmt: skip
 
 _CASES: Final = (
     "none",
@@ -100,6 +86,11 @@ to {stars} faint stars and compiled code; the remark "12° sensor" gives the siz
 papers, 12° and stars to V 6. Times are wall time on the machine that made this report. (5) The papers' guide
 stars are evenly spread. On the flat sky their density falls with distance from its equator, so that PA has
 only two stars in one frame in sixty, and fails there."""
+
+
+def table_6_2(name: str) -> list[float]:
+    """Database in kB and run time in ms."""
+    return published("classics", f"table 6.2, {name}")
 
 
 def _parts(parameters: Parameters) -> list[Part]:
@@ -240,7 +231,7 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 rows.append(
                     row(
                         f"{SHORT[name]}, {_SKY_LABELS[sky]}, {_case_label(case)}: identified",
-                        published=_PUBLISHED.get(case, {}).get(name),
+                        published=next(iter(published("classics", f"{name}, {case}")), None),
                         ours=_rate(result, case),
                         unit="%",
                         at_least=_FLOORS.get(name) if case == "none" else None,
@@ -249,8 +240,8 @@ def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
                 )
     first = context.parameters["skies"][0]
     # the first sky is the flat one if both are selected
-    for name, (size, milliseconds) in TABLE_6_2.items():
-        key = f"{first}-{name}"
+    for name in IN_TABLE_6_2:
+        key, (size, milliseconds) = f"{first}-{name}", table_6_2(name)
         if key not in results:
             continue
         here, papers, build = results[key]["kb"]
@@ -316,8 +307,11 @@ def _figures(context: Context, results: Mapping[str, Results]) -> list[str]:
                     label=SHORT[part.values["algorithm"]],
                 )
             for level in levels:
-                for value in _PUBLISHED.get(f"{kind}-{level}" if level else "none", {}).values():
-                    axis.plot([level], [value], "rx", ms=7)
+                for name in SHORT:
+                    for value in published(
+                        "classics", f"{name}, {kind}-{level}" if level else f"{name}, none"
+                    ):
+                        axis.plot([level], [value], "rx", ms=7)
             axis.set(
                 xlabel=label, ylabel="identified / %", title=_SKY_LABELS[sky], xticks=levels, ylim=(0, 102)
             )

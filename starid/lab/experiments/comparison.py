@@ -5,7 +5,8 @@ and marks the checks that it meets as weak. (Constants fitted to published numbe
 
 `published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
 tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
-``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``the same``, or a number and its origin.
+``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``sampling`` (see `sampling`), ``the
+same``, or a number and its origin.
 """
 
 from __future__ import annotations
@@ -206,6 +207,7 @@ def compared(
     author: Any = None,
     printed: Any = None,
     ours: Any = None,
+    trials: int = 0,
     remark: str = "",
 ) -> Row:
     """Check a quantity of `published.csv`; several numbers must agree one by one.
@@ -216,19 +218,19 @@ def compared(
         Key in `published.csv`.
     author, printed, ours
         The number, or as many as are published; the first that is given is checked.
+    trials
+        Number of trials, for the tolerance ``sampling``.
     remark
-        By default that of the table.
+        Added to that of the table.
     """
     line, numbers = _published()[experiment, quantity], published(experiment, quantity)
-    unit, digits, rule, remark = (
-        line["unit"],
-        int(line["digits"]),
-        line["tolerance"],
-        remark or line["remark"],
-    )
+    unit, digits, rule = line["unit"], int(line["digits"]), line["tolerance"]
+    remark = f"{line['remark']} {remark}".strip()
     if len(numbers) == 1 and rule != "the same":
         word, _, rest = rule.partition(" ")
-        if word in ("digit", "rounding"):
+        if word == "sampling":
+            tolerance = sampling(numbers[0], trials)
+        elif word in ("digit", "rounding"):
             tolerance = rounding(digits if word == "digit" else int(rest), unit)
         else:
             tolerance = float(word), rest

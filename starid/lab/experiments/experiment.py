@@ -103,7 +103,7 @@ class Row:
     kind: Kind = ""
     met: int = 0
     of: int = 0
-    interval: Sequence[float] = ()
+    interval: tuple[float, ...] = ()
     weak: int = 0
     weak_met: int = 0
 
@@ -128,7 +128,7 @@ class Outcome:
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Outcome:
         """Make an outcome from the values of `to_dict`."""
-        rows = tuple(Row(**row) for row in values["rows"])
+        rows = tuple(Row(**{**row, "interval": tuple(row["interval"])}) for row in values["rows"])
         return cls(rows, tuple(values["files"]), tuple(values["notes"]))
 
 

@@ -207,13 +207,13 @@ def _largest(results: Mapping[str, Results], kind: str, f: int, k: int, indicato
     starts, frames, _ = counts.shape
     place = {"recall": (0, 2), "precision": (0, 1)}[indicator]
     ratio = np.array([_percent(part, indicator) for part in counts.sum(axis=1)])
-    within = counts[..., place[1]].var(axis=1).mean() / counts[..., place].sum(axis=-1).mean() ** 2
+    members = counts[..., place].sum(axis=-1).mean()
+    within = 1e4 * counts[..., place[1]].var(axis=1).mean() / members**2
     between = 1.4826 * float(np.median(np.abs(ratio - np.median(ratio))))
-    # at least half a star is lost in a published set, so that 100 % has an uncertainty too
-    least = 1e4 * 0.5 / (_PUBLISHED_FRAMES * counts[..., place].sum(axis=-1).mean()) ** 2
-    frame = 1e4 * within
-    once = frame / _PUBLISHED_FRAMES + max(between**2 - frame / frames, 0.0) + least
-    return 3.0 * math.sqrt(once + (frame / frames + between**2) / starts)
+    # one star more or less in either sample, so that 100 % has an uncertainty too
+    least = sum((100.0 / (n * members)) ** 2 for n in (_PUBLISHED_FRAMES, starts * frames))
+    once = within / _PUBLISHED_FRAMES + max(between**2 - within / frames, 0.0)
+    return 3.0 * math.sqrt(once + (within / frames + between**2) / starts + least)
 
 
 def _table(context: Context, results: Mapping[str, Results]) -> str:
@@ -498,8 +498,8 @@ EXPERIMENTS: Final = (
             "kinds": ["both"],
             "false_stars": [0, 5],
             "stretches": [1.0],
-            "first_frames": 3,
-            "frames": 50,
+            "first_frames": 5,
+            "frames": 40,
         },
     ),
 )

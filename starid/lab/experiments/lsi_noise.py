@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.lab.experiments.author_noise import identification_noise
-from starid.lab.experiments.comparison import Readings, agreement, same, sampling, shown
+from starid.lab.experiments.comparison import Readings, compared, published, same, shown
 from starid.lab.experiments.experiment import (
     Context,
     Experiment,
@@ -46,17 +46,12 @@ _NOISE_LABELS: Final = {
     "brightness": "brightness noise",
     "both": "position and brightness noise",
 }
-_PUBLISHED_03: Final = {1.0: 99.94, 2.0: 99.59, 3.0: 99.18}
-_PUBLISHED_FINE: Final = {
-    0.2: {1.0: 91.89, 2.0: 91.59, 3.0: 90.65},
-    0.1: {1.0: 71.19, 2.0: 70.66, 3.0: 70.08},
-    0.013: {1.0: 35.57, 2.0: 24.40, 3.0: 18.99},
-}
-_RATES: Final = {"position": {0.0: 99.99, 3.0: 99.41}, "brightness": {0.0: 99.99, 3.0: 97.99}}
-_RIVALS: Final = {
-    "position": {0.0: "SGS 99.86, IG 99.80, IA 99.56, PA 99.34", 3.0: "IG 99.40, PA 98.56"},
-    "brightness": {3.0: "PA 97.80"},
-}
+_LIMITS: Final = (0.3, 0.2, 0.1, 0.013)
+_CASES: Final = (
+    *(("both", level, limit) for level in _LEVELS for limit in _LIMITS),
+    *((kind, level, IDENTIFIED_DEG) for kind in ("position", "brightness") for level in (0.0, 3.0)),
+)
+"""Kind of noise, σ and limit of ε_f of the published shares."""
 
 _NOTE: Final = """p = 99.5 %, the MSE solution. Position noise is normal with σ in pixels of 42°/937 per axis,
 brightness noise with σ in units of an 8-bit intensity, of which 255 span the magnitudes 11.5 … 15; "μ drawn"
@@ -215,9 +210,13 @@ def _rate_figures(context: Context, results: Mapping[str, Results]) -> list[str]
                         lines.append(line)
                 words = f"{word}, {GRID_LABELS[grid]}"
                 axis.plot(list(rates), list(rates.values()), style, marker="o", color=colour, label=words)
-        published = _RATES.get(kind)
-        if published:
-            axis.plot(list(published), list(published.values()), "rx", ms=8, label="published (on the grid)")
+        known = {
+            level: published("lsi-noise", _quantity(kind, level, IDENTIFIED_DEG))
+            for case, level, _ in _CASES
+            if case == kind != "both"
+        }
+        if known:
+            axis.plot(list(known), list(known.values()), "rx", ms=8, label="published (on the grid)")
         axis.set(xlabel=label, ylabel=f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %", xticks=range(4))
         lowest = min(line["rate_percent"] for line in lines)
         axis.set_ylim((0, 102) if kind == "false" else (min(50.0, lowest - 3.0), 101))
@@ -240,62 +239,24 @@ def _readings(results: Mapping[str, Results], kind: str, level: float, limit: fl
     return found
 
 
-def _noise_row(
-    results: Mapping[str, Results],
-    kind: str,
-    level: float,
-    limit: float,
-    published: float,
-    *,
-    words: str = "",
-) -> Row | None:
-    """Make a row for a published share on the grid, in all variants."""
-    values = _readings(results, kind, level, limit, ON)
-    if "author" not in values:
-        return None
-    frames = results[f"none-{ON}"]["f_mse"].size
-    angle = results.get(f"six-{kind}-{level:g}-{ON}")
-    remark = (
-        words
-        if angle is None
-        else f"{words} Interpretation (i): {share(angle['f_six'], limit):.2f} %.".strip()
-    )
-    return agreement(
-        f"{_NOISE_LABELS[kind]}, σ = {level:g}, on the grid: share with ε_f ≤ {limit:g}°",
-        published=published,
-        tolerance=sampling(published, frames),
-        **values,
-        unit="%",
-        remark=remark,
-    )
+def _quantity(kind: str, level: float, limit: float, grid: str = ON) -> str:
+    return f"{_NOISE_LABELS[kind]}, σ = {level:g}, {GRID_LABELS[grid]}: share with ε_f ≤ {limit:g}°"
 
 
 def _noise_rows(results: Mapping[str, Results]) -> list[Row]:
-    rows: list[Row | None] = []
-    for level in _LEVELS:
-        rows.append(_noise_row(results, "both", level, 0.3, _PUBLISHED_03[level]))
-        rows += [
-            _noise_row(results, "both", level, limit, published[level])
-            for limit, published in _PUBLISHED_FINE.items()
-        ]
-    for kind, rates in _RATES.items():
-        for level, published in rates.items():
-            rivals = _RIVALS[kind].get(level)
-            words = f"Quoted by the thesis: {rivals} %." if rivals else ""
-            rows.append(_noise_row(results, kind, level, IDENTIFIED_DEG, published, words=words))
-    for level in _LEVELS:
-        for limit in (0.3, 0.1):
-            values = _readings(results, "both", level, limit, OFF)
-            rows.append(
-                shown(
-                    f"{_NOISE_LABELS['both']}, σ = {level:g}, off the grid: share with ε_f ≤ {limit:g}°",
-                    **values,
-                    unit="%",
-                )
-                if values
-                else None
-            )
-    return [made for made in rows if made is not None]
+    rows: list[Row] = []
+    frames = results[f"none-{ON}"]["f_mse"].size
+    for kind, level, limit in _CASES:
+        values = _readings(results, kind, level, limit, ON)
+        if "author" in values:
+            angle = results.get(f"six-{kind}-{level:g}-{ON}")
+            remark = "" if angle is None else f"Interpretation (i): {share(angle['f_six'], limit):.2f} %."
+            quantity = _quantity(kind, level, limit)
+            rows.append(compared("lsi-noise", quantity, **values, trials=frames, remark=remark))
+    for level, limit in itertools.product(_LEVELS, (0.3, 0.1)):
+        if values := _readings(results, "both", level, limit, OFF):
+            rows.append(shown(_quantity("both", level, limit, OFF), **values, unit="%"))
+    return rows
 
 
 def _object_rows(results: Mapping[str, Results], grid: str) -> list[Row]:

@@ -85,6 +85,22 @@ def test_a_page_that_closes_before_it_is_answered_leaves_no_error_in_the_log(run
     assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
 
 
+@pytest.mark.parametrize(
+    "header",
+    [b"Upgrade: \xff", b"Upgrade: websocket\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: \xc3\xa9"],
+)
+def test_a_header_that_is_not_ascii_is_answered_400(run, caplog, header):
+    async def scenario(emulation, _line):
+        host, path = emulation.ready_fields["view"].removeprefix("http://").split("/")
+        reader, writer = await asyncio.open_connection(*host.split(":"))
+        writer.write(f"GET /ws{path} HTTP/1.1\r\nHost: {host}\r\n".encode() + header + b"\r\n\r\n")
+        assert b" 400 " in await reader.readline()
+        writer.close()
+
+    run(scenario, options=OPTIONS)
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == []
+
+
 def test_previews_are_made_only_while_a_page_shows_images(run):
     async def scenario(emulation, _line):
         await emulation.stepper.step(1.0)

@@ -8,6 +8,7 @@ import threading
 import pytest
 
 import starhil.protocol.transports.can
+from starhil.emulator.control.channel import MAX_LINE
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from tests.emulator.runs import Control, command
@@ -139,6 +140,20 @@ def test_bad_requests_are_answered_and_the_next_good_one_too(run, line):
             assert answer["ok"] is False
             assert answer["error"]
             assert (await control.raw(b'{"do": "status", "id": [7]}'))["id"] == [7]
+
+    run(scenario)
+
+
+@pytest.mark.parametrize("begun", [b'{"do": "sta', b"x" * (MAX_LINE + 1)])
+def test_a_line_that_is_not_completed_in_time_ends_its_connection_only(run, monkeypatch, begun):
+    monkeypatch.setattr("starhil.emulator.control.channel.REQUEST_S", 0.2)
+
+    async def scenario(emulation, _line):
+        async with Control(emulation) as silent, Control(emulation) as control:
+            control.writer.write(begun)
+            answer, rest = json.loads(await control.reader.readline()), await control.reader.read()
+            assert (answer, rest) == ({"ok": False, "error": "no complete line within 10 s"}, b"")
+            assert (await silent.raw(b'{"do": "status"}'))["ok"], "silent between lines for as long"
 
     run(scenario)
 

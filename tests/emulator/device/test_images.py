@@ -246,6 +246,8 @@ def test_files_that_are_not_there_are_refused(bench, file_type, offset, length):
     assert load(bench, file_type, offset, length) is ErrorCode.INVALID_PARAMETER
     assert bench.read("file_block") == {"ready": False, "parameter_error": True, "checksum": 0, "length": 0}
     assert bench.command("start_burst") is ErrorCode.SEQUENCE
+    bench.device.power_on()
+    assert not bench.device.files.parameter_error
 
 
 @pytest.mark.parametrize(

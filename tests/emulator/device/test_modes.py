@@ -1,6 +1,7 @@
 import pytest
 
 from starhil.emulator.device.modes import Cause, Mode, Modes
+from starhil.protocol.messages import ErrorCode
 
 
 def modes_in(mode: Mode) -> Modes:
@@ -83,3 +84,26 @@ def test_boot_ends_only_from_boot():
     modes = modes_in(Mode.ERROR)
     modes.booted()
     assert modes.mode is Mode.ERROR
+
+
+def test_the_device_counts_changes_of_mode_and_not_commands_of_the_present_one(bench):
+    before = bench.read("device_status")["mode_changes"]
+    for mode in ("lost_in_space", "lost_in_space", "standby"):
+        assert bench.command("set_mode", mode=mode) is ErrorCode.OK
+    assert bench.read("device_status")["mode_changes"] == before + 2
+
+
+def test_only_a_reset_leaves_the_error_of_a_pipeline_that_was_given_up(bench):
+    bench.device.pipeline_lost()
+    assert bench.mode == "error"
+    bench.device.pipeline_given_up()
+    assert (bench.mode, bench.device.modes.error) == ("error", "pipeline_ended")
+    bench.command("set_mode", mode="standby")
+    assert bench.mode == "error"
+
+
+def test_a_device_boots_whose_clock_was_set_in_its_last_life(bench):
+    bench.command("set_unix_time", seconds=1, milliseconds=0)
+    assert bench.device.time.was_set
+    bench.device.power_on()
+    assert not bench.device.time.was_set

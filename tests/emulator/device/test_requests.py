@@ -6,7 +6,7 @@ from starhil.emulator.device.actions import ACTIONS
 from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.profile import Profile
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import ErrorCode, ReplyKind, Request
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, ReplyKind, Request
 
 
 def test_the_device_has_what_its_model_declares():
@@ -69,6 +69,19 @@ def test_counters_count_and_clear(bench):
     assert bench.command("clear_counters") is ErrorCode.OK
     status = bench.read("communication_status")
     assert (status["telecommand_count"], status["telemetry_count"]) == (0, 1)
+
+
+def test_before_the_first_telecommand_nothing_is_pending(bench):
+    assert bench.read("acknowledge") == {
+        "last_telecommand": 0, "processed": True, "error": "ok", "parameter_index": 0,
+    }  # fmt: skip
+
+
+def test_each_fault_of_a_link_counts_once(bench):
+    for expected in (1, 2):
+        bench.requests.count_fault(LinkFault(FaultKind.UART_PROTOCOL, "noise"))
+        assert bench.device.counters.faults == {FaultKind.UART_PROTOCOL: expected}
+    assert bench.read("communication_status")["uart_protocol_error"]
 
 
 def test_counters_wrap_at_16_bits(bench):

@@ -7,6 +7,7 @@ once, so that a mutant cannot silently become the original.
 from __future__ import annotations
 
 import importlib.util
+import re
 import sys
 import types
 from dataclasses import dataclass
@@ -190,7 +191,7 @@ def _sources() -> dict[str, str]:
 
 @cache
 def _code(module: str, text: str) -> types.CodeType:
-    return compile(text.replace(PACKAGE, ALIAS), f"<{ALIAS}.{module}>", "exec")
+    return compile(re.sub(rf"{re.escape(PACKAGE)}\b", ALIAS, text), f"<{ALIAS}.{module}>", "exec")
 
 
 class _Finder:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from pathlib import Path
 
@@ -9,10 +10,13 @@ import numpy as np
 import pytest
 
 from starid.attitude import Attitude
-from starid.camera import Camera
+from starid.camera import DEFAULT_CAMERA, Camera
+from starid.catalog import load_catalog
 from starid.errors import StaridError
 from starid.geometric import index_file
 from starid.geometric.identifier import Identifier
+from starid.geometric.index_choice import index_settings, obtain_stars
+from starid.geometric.pattern_index import resolved_stars
 from tests.starid.geometric.sky_points import sky
 
 CAMERA = Camera.from_fov(60.0, 512, 512)
@@ -96,3 +100,15 @@ def test_an_unwritable_folder_only_prevents_caching(tmp_path: Path, caplog: pyte
 def test_a_sky_without_triangles_is_rejected() -> None:
     with pytest.raises(StaridError, match="raise the limiting magnitude"):
         Identifier(Camera.from_fov(5.0, 512, 512), limiting_magnitude=1.0, cache=False)
+
+
+def test_the_stars_of_an_index_are_the_same_from_the_cache(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("STARHIL_CACHE_DIR", str(tmp_path))
+    catalog = load_catalog()
+    settings = index_settings(DEFAULT_CAMERA, catalog, 5.0, 2.0, 12.0)
+    expected = resolved_stars(catalog, 5.0, settings.blend_rad)
+    for _ in range(2):
+        stars = obtain_stars(catalog, settings, cache=True)
+        assert len(list(tmp_path.glob("stars-*.npz"))) == 1
+        for field in dataclasses.fields(expected):
+            np.testing.assert_array_equal(getattr(stars, field.name), getattr(expected, field.name))

@@ -1,0 +1,112 @@
+"""Files `*_cases.py` beside a definition add cases to those that the definition yields."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.conformance.link_probe import ReadableSettings
+from starhil.hil_tests.conformance.runner import run_cases
+from starhil.hil_tests.conformance.suites import serial_suite, settings_of
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.judge.definition import read_unit
+from tests.conformance.links import write_unit
+from tests.conformance.simulated import SimulatedUnit
+
+OWN = """
+from starhil.hil_tests.conformance.case import Case, CaseArea, check_equal
+
+BOOTS = CaseArea("boots", "ICD 1")
+ON_CAN = CaseArea("on_can", "ICD 2", links=("can",))
+FRAMING = CaseArea("framing", "ICD 3")
+
+
+@BOOTS.case("first", "the unit has booted once")
+def first(probe):
+    check_equal(probe.telemetry("attitude")["boots"], BOOTED, "boots")
+
+
+@ON_CAN.case("none", "not on the serial line")
+def none(probe):
+    raise AssertionError
+
+
+@FRAMING.case("junk", "this unit answers junk in a way of its own")
+def junk(probe):
+    probe.expect_alive()
+
+
+def generated(unit):
+    for name in unit.telemetry:
+        yield Case(f"names.{name}", "names", name, "ICD 4", lambda probe, name=name: probe.telemetry(name))
+
+
+class settings:
+    def prepare(self, probe):
+        self.before = probe.telemetry("numbers")
+
+    def restore(self, probe):
+        probe.command("set_numbers", **self.before)
+"""
+
+
+def unit_with(folder: Path, own: str) -> Path:
+    write_unit(folder, "sum")
+    (folder / "own_cases.py").write_text(own, encoding="utf-8")
+    return folder
+
+
+def test_own_cases_are_run_with_those_of_the_definition(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", OWN.replace("BOOTED", "1"))
+    derived = {case.id for case in serial_suite(read_unit(write_unit(tmp_path / "plain", "sum")))}
+    cases = {case.id: case for case in serial_suite(read_unit(folder))}
+    own = {
+        "serial.boots.first",
+        "serial.names.numbers",
+        "serial.names.attitude",
+        "serial.names.short_attitude",
+    }
+    assert cases.keys() - derived == own
+    assert derived <= cases.keys()
+    assert cases["serial.framing.junk"].clause == "ICD 3", "the unit's own case replaces the derived one"
+    with SimulatedUnit("serial", unit=folder) as simulated:
+        outcomes = run_cases(simulated.probe, [cases[name] for name in sorted(own)])
+    assert [outcome.status for outcome in outcomes] == ["passed"] * 4
+
+
+def test_an_own_case_can_fail(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", OWN.replace("BOOTED", "7"))
+    with SimulatedUnit("serial", unit=folder) as simulated:
+        chosen = [case for case in serial_suite(read_unit(folder)) if case.id == "serial.boots.first"]
+        (outcome,) = run_cases(simulated.probe, chosen)
+    assert (outcome.status, outcome.expected, outcome.seen) == ("failed", "boots 7", "1")
+
+
+def test_a_units_own_settings_are_restored_and_otherwise_those_that_can_be_read(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", OWN.replace("BOOTED", "1"))
+    assert type(settings_of(read_unit(folder))).__name__ == "settings"
+    plain = read_unit(write_unit(tmp_path / "plain", "sum"))
+    assert isinstance(settings_of(plain), ReadableSettings)
+    for path in (folder, tmp_path / "plain"):
+        with SimulatedUnit("serial", unit=path) as simulated:
+            simulated.probe.command("set_numbers", a=77)
+            cases = [
+                case for case in serial_suite(read_unit(path)) if case.id == "serial.commands.set_numbers"
+            ]
+            (outcome,) = run_cases(simulated.probe, cases)
+            assert outcome.status == "passed"
+            assert simulated.probe.telemetry("numbers")["a"] == 77
+
+
+def test_a_definition_in_one_file_runs_no_files_beside_it(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", "raise SystemError")
+    assert serial_suite(read_unit(folder / "unit.toml"))
+
+
+def test_a_file_that_fails_is_named(tmp_path: Path) -> None:
+    folder = unit_with(tmp_path / "unit", "import no_such_module")
+    with pytest.raises(
+        BenchError, match=r"own_cases\.py: ModuleNotFoundError: No module named 'no_such_module'"
+    ):
+        serial_suite(read_unit(folder))
