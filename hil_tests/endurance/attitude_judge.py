@@ -32,6 +32,8 @@ PROCESSING_S: Final = 1.0
 STALE_PERIODS: Final = 3
 STALE_S: Final = 2.0
 """An attitude is not reported longer than `STALE_PERIODS` update periods and `STALE_S` after its exposure."""
+LONGEST_PERIOD_S: Final = 100.0
+"""Longest update period that a unit can have."""
 KEPT_PERIODS: Final = 20
 SMALLEST_SCALAR: Final = 0.1
 """Smallest scalar that is computed from the other three numbers of a quaternion."""
@@ -229,9 +231,10 @@ class AttitudeJudge:
         """Check the time between exposures, which changes with the next image after a telecommand."""
         low, high = field.physical_limits
         scale = factor("s", field.unit) or 1.0
-        possible = [min(max(period * scale, low), high) for period in self._recent_periods(now_s, values)]
-        if isinstance(value, (str, bytes)) or not all(map(math.isfinite, possible)):
+        recent = self._recent_periods(now_s, values)
+        if isinstance(value, (str, bytes)) or not all(map(math.isfinite, recent)):
             return
+        possible = [min(max(period * scale, low), high) for period in recent]
         if all(abs(value - period) > resolution(field) + 1e-6 * period for period in possible):
             raise Violation(f"{where}: {value!r}, not {possible[0]!r}")
 
@@ -240,7 +243,7 @@ class AttitudeJudge:
         recent = [period_s(values)]
         for number, (_, period) in enumerate(self._periods):
             until_s = self._periods[number + 1][0] if number + 1 < len(self._periods) else now_s
-            if now_s - until_s <= _window_of(period):
+            if now_s - until_s <= _window_of(min(period, LONGEST_PERIOD_S)):
                 recent.append(period)
         return recent
 

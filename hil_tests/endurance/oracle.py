@@ -360,7 +360,7 @@ class Oracle:
         known = self.values[name]
         if known is None:
             if not field.aliases and not (field.kind == "enum" and not isinstance(value, str)):
-                self.values[name] = (value, resolution(field))
+                self._set({name: (value, resolution(field))})
             return
         expected, tolerance = known
         if isinstance(expected, bool) or isinstance(value, bool):
