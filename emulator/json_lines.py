@@ -46,7 +46,8 @@ async def read_lines(
     end
         Line terminator; one byte if `within_s` is given.
     within_s
-        Time within which a line that has begun must be complete, seconds; a peer may be silent between lines.
+        Time within which a line that has begun must be complete, seconds; a peer may be silent between lines. The first
+        byte of a line is read apart then and does not count towards the reader's limit.
 
     Raises
     ------

@@ -115,7 +115,7 @@ class ControlServer:
             self._server = await asyncio.start_unix_server(
                 until_cancelled(self._serve_connection),
                 sock=self._socket.socket,
-                limit=MAX_LINE,
+                limit=MAX_LINE - 1,
                 backlog=self._limit.size,
             )
             return f"unix:{path}"
@@ -125,7 +125,7 @@ class ControlServer:
         try:
             serve = until_cancelled(self._serve_connection)
             self._server = await asyncio.start_server(
-                serve, host, int(port), limit=MAX_LINE, backlog=self._limit.size
+                serve, host, int(port), limit=MAX_LINE - 1, backlog=self._limit.size
             )
         except (OSError, ValueError) as error:  # an invalid host name is a ValueError
             raise EmulatorError(
