@@ -61,6 +61,7 @@ MODULES: Final = (
 OVERLAY_MODULE: Final = "fs/overlayfs/overlay"
 JOB_FILE: Final = "job.json"
 STATUS_FILE: Final = "status"
+PROCESSOR_FILE: Final = "cpuinfo"
 KILL_GRACE_S: Final = 5.0
 POWER_OFF: Final = 0x4321FEDC
 """LINUX_REBOOT_CMD_POWER_OFF of reboot(2)."""
@@ -102,6 +103,7 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
             "job_folder": str(folder),
         }
         (folder / JOB_FILE).write_text(json.dumps(job), encoding="utf-8")
+        (folder / PROCESSOR_FILE).write_bytes(Path("/proc/cpuinfo").read_bytes())
         init = folder / "init"
         here = Path(__file__).resolve()
         words = shlex.join([sys.executable, "-I", str(here), "--inside-guest", str(folder / JOB_FILE)])
@@ -227,6 +229,8 @@ def prepare_root(libc: ctypes.CDLL, job: dict[str, Any]) -> Path:
     report = root / "run" / "vcan-guest"
     report.mkdir()
     mount(libc, "hostfs", report, data=job["job_folder"])
+    # the guest runs on the host's processor: machine code that the host has compiled is found by its description
+    subprocess.run(["mount", "--bind", report / PROCESSOR_FILE, root / "proc" / "cpuinfo"], check=True)
     for share in job["shares"]:
         mount(libc, "hostfs", root / share.lstrip("/"), data=share)
     os.chroot(root)

@@ -76,7 +76,7 @@ class Truth:
     source
         Truth of the body: attitude ICRS→body, rate in the body frame.
     mount
-        Mount in the current configuration; None: each head has that of its profile.
+        Mount in the configuration that has replaced the first one; None: each head has that of its profile.
     feed
         The live feed, or None.
     address
@@ -117,7 +117,8 @@ class Truth:
         """Replace source, mount and feed."""
         self.close()
         self.source, self.feed, self.address = source, feed, address
-        self.mount = None if config.mount is None else config.mount.build()
+        of_profiles = config is self.configured  # where the profile of the first head has its own mount only
+        self.mount = None if config.mount is None or of_profiles else config.mount.build()
         if address and isinstance(config, FeedConfig):
             self._wanted_address = _address(config)
 

@@ -203,8 +203,11 @@ class Obc:
         return row.kind == "telemetry" or len(entries) == 1
 
     async def _unknown_outcome(self, link: str, kind: str) -> None:
-        """The answer may have been lost: nothing that the request may have changed is known."""
-        if kind == "telecommand":
+        """The answer may have been lost: nothing that the request may have changed is known.
+
+        With messages of fixed length, a unit does not even recognise, and count, a request of another length.
+        """
+        if kind == "telecommand" or self._fixed_framing:
             self._oracle.forget()
         await self.settle(link)
 

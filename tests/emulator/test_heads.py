@@ -56,6 +56,22 @@ def test_two_heads_on_one_bus_report_one_turn_each_in_its_own_frame(run, tmp_pat
     assert rows[0] == rows[1] > 8
 
 
+def test_each_head_keeps_the_mount_of_its_profile(run):
+    async def scenario(emulation, _line):
+        async with Control(emulation) as control:
+            return [(await control.do("truth", head=number))["rate_deg_s"] for number in (1, 2)]
+
+    truth = {
+        "kind": "rate",
+        "rate_deg_s": [0.1, 0.2, 0.3],
+        "mount": {"matrix": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]},
+    }
+    other = head(5, truth={"kind": "fixed", "mount": BORESIGHT_ALONG_X})
+    first, second = run(scenario, others=[other], **head(4, truth=truth))
+    assert first == pytest.approx([0.1, -0.3, 0.2])
+    assert second == pytest.approx([-0.3, 0.2, 0.1])
+
+
 def test_the_control_channel_commands_each_head_and_changes_the_truth_of_all(run):
     async def scenario(emulation, _line):
         async with Control(emulation) as control:

@@ -14,7 +14,7 @@ from starid.camera import DEFAULT_CAMERA, Camera
 from starid.earth import earth_and_sun, earth_velocity, julian_year, terrestrial_time
 from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
-from starid.interface import make_identifier
+from starid.lab.classic.registry import make_identifier
 from starid.tracker import Tracker
 
 NEW_YEAR = 1_767_225_600.0

@@ -80,6 +80,19 @@ def test_long_lives_last_for_months():
     assert not {"power", "fault", "recover"} & {step["do"] for step in life.steps}
 
 
+def test_a_message_of_a_wrong_length_that_nobody_sees_answered_may_be_uncounted():
+    request = {
+        "do": "request",
+        "link": "serial",
+        "row": ["request", 2, "telemetry"],
+        "data": "267ba35ff66f8f",
+    }
+    unread, read = ({"do": "peer", "link": "serial", "reads": reads} for reads in (False, True))
+    counter = {"do": "request", "link": "serial", "row": ["request", 1, "telemetry"]}
+    steps = (unread, request, read, {"do": "clear"}, counter)
+    assert run_once(Life("nos3", 1, ("serial",), {}, steps)).violation == ""
+
+
 def test_stars_are_compared_where_a_row_has_no_quaternion():
     assert run_once(life_of("cubestar-gen2", 1)).attitudes > 0
 
