@@ -32,8 +32,9 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.pump import StepPump
 from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import Truth, TruthHost
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.icd_bindings import unbound
 
 

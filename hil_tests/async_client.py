@@ -14,8 +14,8 @@ from starhil.hil_tests.images import Image, download_by_bursts, download_by_fram
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.codec import Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import Value
 

@@ -14,8 +14,8 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog, WireLog
 from starhil.protocol.candump import bus_name
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 
 SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 

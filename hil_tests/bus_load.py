@@ -19,8 +19,8 @@ from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import CanLoad, Spread
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, CanId, MessageType, encode_request_frames
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.transports import open_can
 

@@ -10,7 +10,7 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, SdoTransfer, row_transfer
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.transports import open_can
 from starhil.protocol.values import IcdError

@@ -21,7 +21,8 @@ from starhil.hil_tests.links import (
 from starhil.hil_tests.loop_thread import LoopThread
 from starhil.hil_tests.transactions import Transaction
 from starhil.hil_tests.wire_log import WireLog
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import LinkFault, Reply, RequestKind
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 

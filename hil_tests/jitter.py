@@ -14,7 +14,7 @@ from typing import Final
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import Jitter, Spread
 from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame, CanHostReceiver, encode_request_frames
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.transports import CanTransport, open_can
 

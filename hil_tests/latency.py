@@ -23,7 +23,8 @@ from typing import Final
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanId, encode_request_frames
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.socketcand import format_send

@@ -11,8 +11,8 @@ from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
 from starhil.protocol.codec import Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, Request
 from starhil.protocol.serial_interface import HostEnd, Receiver
 from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect, serial_answers

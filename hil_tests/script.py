@@ -72,8 +72,8 @@ from starhil.hil_tests.script_model import (
 )
 from starhil.hil_tests.script_reader import TableReader
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import Parameter, Value
 

@@ -12,7 +12,7 @@ from typing import Final
 
 from starhil.hil_tests.load_figures import SerialLoad
 from starhil.protocol.cubespace_serial import HostReceiver, encode_request
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.image_transfer import MAP_PART_SIZE
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect

@@ -31,8 +31,9 @@ from starhil.hil_tests.script import load_script
 from starhil.hil_tests.script_model import Script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 

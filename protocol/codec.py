@@ -82,8 +82,8 @@ class Field(FieldKeys):
     def changed(self, **changes: object) -> Field:
         """Return the field with other keys or another place."""
         field = self.model_copy(update=changes)
-        for name in ("raw_limits", "physical_limits", "divisor", "empty"):  # computed from the former keys
-            field.__dict__.pop(name, None)
+        for name in field.__dict__.keys() - Field.model_fields.keys():  # computed from the former keys
+            del field.__dict__[name]
         return field
 
     @property

@@ -25,7 +25,6 @@ from starhil.protocol.definition import (
     OTHER_ERROR,
     InterfaceDefinition,
     Names,
-    UnknownNameError,
 )
 from starhil.protocol.device_model import DeviceModel, device_model, did_you_mean
 from starhil.protocol.icd_bindings import check_row
@@ -44,15 +43,6 @@ from starhil.protocol.values import (
     Parameter,
     Section,
 )
-
-__all__ = [
-    "IcdError",
-    "InterfaceDefinition",
-    "Names",
-    "UnknownNameError",
-    "load_unit",
-    "read_definition",
-]
 
 _Table = TypeVar("_Table")
 

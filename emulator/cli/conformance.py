@@ -26,7 +26,7 @@ from starid.cli.options import AsJson, one_of
 from starid.cli.output import output_help
 
 if TYPE_CHECKING:
-    from starhil.protocol.icd import InterfaceDefinition
+    from starhil.protocol.definition import InterfaceDefinition
 
 
 def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, str | None, int | None]:

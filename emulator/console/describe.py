@@ -16,7 +16,7 @@ from starhil.emulator.profile import configs_folder
 from starhil.emulator.run import Run
 from starhil.emulator.sky.objects import SkyObjects, range_of
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starid.catalog import load_catalog
 from starid.star_names import STAR_NAMES
 

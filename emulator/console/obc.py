@@ -12,8 +12,8 @@ from typing import Any, Final, Literal, Protocol
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError, Value
 

@@ -25,8 +25,8 @@ from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
 from starhil.protocol.codec import Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect, HostEnd
 from starhil.protocol.serial_stack import build_serial_stack

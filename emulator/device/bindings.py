@@ -12,8 +12,8 @@ from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.protocol.checks import crc
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.device_model import HEALTH, HEALTH_DEFAULTS, PARAMETER
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.icd_bindings import quantity_of
 from starhil.protocol.icd_layout import text_of
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind

@@ -29,8 +29,8 @@ from starhil.emulator.pipeline.messages import IDENTITY, Quaternion
 from starhil.emulator.profile import LINK_PARAMETERS, Profile
 from starhil.emulator.truth.source import TruthSource
 from starhil.protocol.codec import Field
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import Value
 

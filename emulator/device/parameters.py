@@ -10,7 +10,7 @@ from typing import Final
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import STRUCT_CODES
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import FieldError, MessageError, Parameter, Value
 
 ParameterValue = bool | int | float | str

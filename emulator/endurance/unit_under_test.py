@@ -31,7 +31,7 @@ from starhil.emulator.tape import TRUTH_FILE, Recorder, Wiring
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 

@@ -31,8 +31,8 @@ from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.values import MessageError, Value

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import Parameter, Value
 
 Step = dict[str, Any]

@@ -19,7 +19,7 @@ from starhil.protocol.canopen.communication import TPDO_CAN_IDS
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, in_order, span_of
 from starhil.protocol.canopen_schema import PackedField
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import Value
 
 EMERGENCY: Final = 0x080

@@ -21,8 +21,8 @@ from starhil.protocol.can_framing import CanFrame, CanId
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.codec import Row
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.link_schema import FixedFraming
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect

@@ -17,8 +17,8 @@ from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
 from starhil.hil_tests.endurance.truth import Motion
 from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.device_model import PARAMETER
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import MessageError, Value

@@ -10,7 +10,7 @@ from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, row_transfer
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect, SerialStack
 

@@ -12,7 +12,7 @@ from starhil.hil_tests.endurance.outcome import Outcome
 from starhil.hil_tests.endurance.truth import Motion
 from starhil.hil_tests.endurance.unit import Unit
 from starhil.hil_tests.endurance.violation import Violation
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 
 DESCRIPTOR_LIMIT: Final = 4
 QUEUE_LIMIT: Final = 5000

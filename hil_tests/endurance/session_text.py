@@ -6,7 +6,7 @@ import json
 
 from starhil.hil_tests.endurance.life import Life
 from starhil.protocol.can_framing import encode_request_frames
-from starhil.protocol.icd import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import Request, RequestKind
 from starhil.protocol.serial_stack import build_serial_stack
 

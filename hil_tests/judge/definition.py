@@ -16,8 +16,9 @@ from typing import Any, Literal
 from starhil.hil_tests.judge.framings import Framing, Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import SIZES, Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.framings import Receiving
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_folders import find_unit
 
 

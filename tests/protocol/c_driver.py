@@ -16,8 +16,8 @@ import pytest
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c import files, prefix_of
-from starhil.protocol.icd import InterfaceDefinition
 from starhil.protocol.quoting import c_member
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack

@@ -8,8 +8,8 @@ import types
 from pathlib import Path
 from typing import Any
 
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import export_folder
-from starhil.protocol.icd import InterfaceDefinition
 
 
 class ProtocolWithoutCosmos:

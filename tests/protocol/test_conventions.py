@@ -10,9 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starhil.protocol.export import export
-from starhil.protocol.icd import IcdError, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_examples import check_unit
-from starhil.protocol.values import Section
+from starhil.protocol.values import IcdError, Section
 from starid.attitude import Attitude
 
 ICD = load_unit()

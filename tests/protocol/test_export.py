@@ -21,11 +21,12 @@ from space_packet_parser.xtce import definitions, validation
 
 from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
 from starhil.protocol.export.describe import anchor, example_text, field_cells
 from starhil.protocol.export.packets import key_bits, key_of
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.quoting import cosmos_state
 from starhil.protocol.serial_stack import build_serial_stack

@@ -11,10 +11,11 @@ from typing import Any
 import pytest
 
 from starhil.protocol.composed_stack import ComposedStack
+from starhil.protocol.definition import Names
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export.cosmos_plugin.composed import link_text
 from starhil.protocol.export.packets import row_key
-from starhil.protocol.icd import Names, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_stack import build_stack

@@ -18,9 +18,10 @@ import cantools
 import pytest
 from markdown_it import MarkdownIt
 
+from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.icd import load_unit
 from starhil.protocol.quoting import c_member
 from tests.protocol.c_driver import COMPILER
 

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.icd import UnknownNameError, load_unit
+from starhil.protocol.definition import UnknownNameError
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32

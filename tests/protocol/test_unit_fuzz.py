@@ -7,7 +7,8 @@ import random
 
 import pytest
 
-from starhil.protocol.icd import InterfaceDefinition, load_unit
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import SerialStack
 from starhil.protocol.serial_stack import build_serial_stack

@@ -252,7 +252,7 @@ def compared(
         return None if values is None else ", ".join(f"{value:.{digits}f}" for value in values) + unit
 
     checked = next(values for values in (author, printed, ours) if values is not None)
-    largest = 0.0 if rule == "the same" else 0.51 * 10.0**-digits
+    largest, origin = (0.0, rule) if rule == "the same" else rounding(digits, unit)
     return same(
         quantity,
         published=text(numbers) or "",
@@ -260,8 +260,6 @@ def compared(
         printed=text(printed),
         ours=text(ours),
         matches=[bool(abs(a - b) <= largest) for a, b in zip(checked, numbers, strict=True)],
-        target=rule
-        if rule == "the same"
-        else f"each within half of the last digit, {0.5 * 10.0**-digits:g}{unit}",
+        target=origin if rule == "the same" else f"each ± {origin}",
         remark=remark,
     )
