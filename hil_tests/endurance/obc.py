@@ -256,9 +256,12 @@ class Obc:
             raise Violation(f"{sent}: {sum(reply.final for reply in replies)} answers")
         if request.kind is RequestKind.TELECOMMAND:
             refused = ErrorCode.INTERNAL if nack is not None else ErrorCode.OK
-            await self._executed(
-                row, request, verdict or refused, unknown=nack is not None and verdict is None
-            )
+            unknown = nack is not None and verdict is None
+            if link == "canopen" and verdict is ErrorCode.INVALID_PARAMETER:
+                # the object dictionary refuses some values before the device has seen a telecommand
+                self._oracle.counts["telecommands"] = None
+                unknown = True
+            await self._executed(row, request, verdict or refused, unknown=unknown)
         for reply in replies:
             if reply.kind is ReplyKind.TELEMETRY:
                 self._read(what, row, request, reply)

@@ -93,6 +93,14 @@ def test_a_message_of_a_wrong_length_that_nobody_sees_answered_may_be_uncounted(
     assert run_once(Life("nos3", 1, ("serial",), {}, steps)).violation == ""
 
 
+def test_a_value_that_the_object_dictionary_refuses_may_be_uncounted():
+    mode = {"do": "request", "link": "canopen", "row": ["", 96, "telecommand"], "data": "e7"}
+    reads = [
+        {"do": "request", "link": "serial", "row": ["", row, "telemetry"], "data": ""} for row in (240, 144)
+    ]
+    assert run_once(Life("cubestar", 1, ("serial", "canopen"), {}, (mode, *reads))).violation == ""
+
+
 def test_stars_are_compared_where_a_row_has_no_quaternion():
     assert run_once(life_of("cubestar-gen2", 1)).attitudes > 0
 
