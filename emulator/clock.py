@@ -1,7 +1,9 @@
 """Simulation time, and the Unix clock of the device, which is derived from it.
 
-Simulation time is counted in nanoseconds since the pipelines of all heads were ready: no time passes while kernels
-are compiled. The model uses no other time; only `RealClock` and `ScaledClock` read the wall clock.
+Simulation time is counted in nanoseconds since the devices were switched on, which is when the command started: the
+device boots while its pipeline starts. At the end of the boot, time stands still until the pipelines of all heads are
+ready, however long kernels are compiled. The stepped clock stands at zero until then. The model uses no other time;
+only `RealClock` and `ScaledClock` read the wall clock.
 """
 
 from __future__ import annotations
@@ -33,18 +35,22 @@ class Clock(Protocol):
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
 
+    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
+        """Let time pass since a time of the monotonic wall clock, up to `limit_ns`; before this, it is zero."""
+
     def start(self) -> None:
-        """Let time pass; before this, it is zero."""
+        """Let time pass without a limit."""
 
 
 class ScaledClock:
-    """A clock that runs `speed` times as fast as wall time, once it is started."""
+    """A clock that runs `speed` times as fast as wall time."""
 
     def __init__(self, speed: float) -> None:
         if not 0.0 < speed <= MAX_SCALE:
             raise EmulatorError(f"clock: scale {speed:g} is outside 0 … {MAX_SCALE:g}; try scaled:10")
         self.speed = speed
-        self._origin_ns: int | None = None
+        self._origin_ns = 0
+        self._limit_ns: int | None = 0
 
     @property
     def name(self) -> str:
@@ -53,13 +59,17 @@ class ScaledClock:
 
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
-        if self._origin_ns is None:
-            return 0
-        return int((time.monotonic_ns() - self._origin_ns) * self.speed)
+        now_ns = int((time.monotonic_ns() - self._origin_ns) * self.speed)
+        return now_ns if self._limit_ns is None else min(now_ns, self._limit_ns)
+
+    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
+        """Let time pass since a time of the monotonic wall clock, up to `limit_ns`; before this, it is zero."""
+        self._origin_ns, self._limit_ns = wall_ns, limit_ns
 
     def start(self) -> None:
-        """Let time pass; before this, it is zero."""
-        self._origin_ns = time.monotonic_ns()
+        """Let time pass without a limit."""
+        self._origin_ns = time.monotonic_ns() - round(self.now_ns() / self.speed)
+        self._limit_ns = None
 
 
 class RealClock(ScaledClock):
@@ -86,6 +96,9 @@ class SteppedClock:
     def now_ns(self) -> int:
         """Return the simulation time, nanoseconds."""
         return self._now_ns
+
+    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
+        """Do nothing: time passes on request."""
 
     def start(self) -> None:
         """Do nothing: time passes on request."""

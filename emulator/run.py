@@ -2,7 +2,7 @@
 
 ::
 
-    Run ── clock     time, which begins when the pipelines of all heads are ready
+    Run ── clock     time, which stands still at the end of the boot until the pipelines of all heads are ready
      ├──── wiring    ports, pipelines and slow writes as they are, recorded, or played from a recording
      ├──── truth     where the body points; sees each head through its mount
      ├──── stepper   advances the stepped clock; other clocks advance by themselves
@@ -18,10 +18,11 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from starhil.emulator.clock import SteppedClock, make_clock
+from starhil.emulator.clock import NANOSECONDS, SteppedClock, make_clock
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.head import Head, check_links
@@ -57,7 +58,7 @@ class Run:
     stepper
         Advances the stepped clock, once the run has begun; None with another clock.
     time_passes
-        Set when the pipeline of every head is ready, which starts the clock.
+        Set when the pipeline of every head is ready: time then passes beyond the boot.
     """
 
     def __init__(
@@ -74,6 +75,8 @@ class Run:
         self.recorder = self.wiring if isinstance(self.wiring, Recorder) else None
         self.stepper: StepPump | None = None
         self.time_passes = asyncio.Event()
+        self._switched_on_ns = time.monotonic_ns() if worker is None else worker.started_ns
+        """Time at which the devices were switched on, on the monotonic wall clock, nanoseconds."""
         self.heads: list[Head] = []
         host = TruthHost(
             self.clock,
@@ -99,8 +102,7 @@ class Run:
         return len(self.heads) + len(self._plans)
 
     async def open(self) -> None:
-        """Open the truth, and switch on the heads; time does not pass yet. If one fails, no start is counted."""
-        await self.truth.open()
+        """Make the heads, open links and truth, and let the boot time pass. If one fails, no start is counted."""
         try:
             while self._plans:
                 profile, icd, imager = self._plans[0]
@@ -110,9 +112,12 @@ class Run:
                 self.heads.append(head)
                 self._plans.pop(0)
                 await head.open_links()
+            await self.truth.open()
         except (EmulatorError, ProtocolError):
             self.withdraw_starts()
             raise
+        boot_s = min(head.profile.device.boot_s for head in self.heads)
+        self.clock.switch_on(self._switched_on_ns, round(boot_s * NANOSECONDS))
 
     def withdraw_starts(self) -> None:
         """Do not count the last starts of the devices, because the run is rejected."""
@@ -120,7 +125,7 @@ class Run:
             head.device.withdraw_start()
 
     def begin(self) -> None:
-        """Start the pipelines; time passes when all are ready."""
+        """Start the pipelines; time passes beyond the boot when all are ready."""
         if isinstance(self.clock, SteppedClock):
             devices = [(head.device.scheduler, head.imager) for head in self.heads]
             transports = [link.transport for head in self.heads for link in head.links]

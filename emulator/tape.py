@@ -82,6 +82,10 @@ class LatchedClock:
         """Return the time of the last entry, nanoseconds."""
         return self._now_ns
 
+    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
+        """Switch on the running clock."""
+        self.source.switch_on(wall_ns, limit_ns)
+
     def start(self) -> None:
         """Start the running clock."""
         self.source.start()

@@ -8,15 +8,23 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import time
 from typing import Final
 
 EXIT_GRACE_S: Final = 2.0
 
 
 class WorkerProcess:
-    """A pipeline worker process and the socket connected to it."""
+    """A pipeline worker process and the socket connected to it.
+
+    Attributes
+    ----------
+    started_ns : int
+        Time at which it was started, on the monotonic wall clock, nanoseconds.
+    """
 
     def __init__(self) -> None:
+        self.started_ns = time.monotonic_ns()
         self.socket, inherited = socket.socketpair()
         command = [sys.executable, "-m", "starhil.emulator.pipeline.worker", str(inherited.fileno())]
         self.process = subprocess.Popen(command, pass_fds=[inherited.fileno()], stdin=subprocess.DEVNULL)  # noqa: S603

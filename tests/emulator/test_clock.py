@@ -23,11 +23,28 @@ def test_scaled_clock_follows_its_factor(monkeypatch):
     wall = [1_000]
     monkeypatch.setattr("time.monotonic_ns", lambda: wall[0])
     clock = ScaledClock(10.0)
-    wall[0] += 5_000_000
-    assert clock.now_ns() == 0
+    clock.switch_on(wall[0], 50_000_000)
     clock.start()
     wall[0] += 7_000_000
     assert clock.now_ns() == 70_000_000
+
+
+@pytest.mark.parametrize(
+    ("start_ns", "stands_at_ns"),
+    [(3_000_000, 30_000_000), (5_000_000, 50_000_000), (900_000_000, 50_000_000)],
+)
+def test_time_stands_still_at_the_end_of_the_boot_until_it_is_started(monkeypatch, start_ns, stands_at_ns):
+    wall = [1_000]
+    monkeypatch.setattr("time.monotonic_ns", lambda: wall[0])
+    clock = ScaledClock(10.0)
+    assert clock.now_ns() == 0
+    clock.switch_on(0, 50_000_000)
+    wall[0] = start_ns
+    assert clock.now_ns() == stands_at_ns
+    clock.start()
+    assert clock.now_ns() == stands_at_ns
+    wall[0] += 700_000_000
+    assert clock.now_ns() == stands_at_ns + 7_000_000_000
 
 
 @pytest.mark.parametrize(
@@ -62,6 +79,7 @@ def test_real_clock_passes_with_the_wall_clock(monkeypatch):
     wall = [5]
     monkeypatch.setattr("time.monotonic_ns", lambda: wall[0])
     clock = RealClock()
+    clock.switch_on(wall[0], 0)
     clock.start()
     wall[0] += 42
     assert clock.now_ns() == 42
