@@ -16,11 +16,11 @@ from typing import Any, Final, TypeAlias, TypeVar
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.measurement import Measurement, as_triple
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.reported import SEQUENCES, to_reported_frame
 from starhil.emulator.device.snapshot import Snapshot
-from starhil.emulator.pipeline.messages import MatchedStar, Triple
+from starhil.emulator.pipeline.messages import MatchedStar, Triple, as_triple
 from starhil.protocol.conventions import DAY_NS
 from starhil.protocol.device_model import HEALTH, PARAMETER, generic, number_in
 from starhil.protocol.icd_schema import QuantityModel

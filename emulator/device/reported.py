@@ -11,10 +11,9 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.device.device import Device
-from starhil.emulator.device.measurement import as_quaternion, as_triple
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple
+from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
 from starhil.protocol.conventions import Conventions
 from starid.attitude import Attitude
 
