@@ -11,8 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.device.measurement import Measurement, as_quaternion
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.output_file import Output, OutputFile
+from starhil.emulator.pipeline.messages import as_quaternion
 from starid.attitude import Attitude
 
 COLUMNS: Final = (

@@ -1,4 +1,6 @@
-"""Write the tables in docs/ that are generated from the code: `python tools/make_reference.py`.
+"""Write what is generated from the code: the tables in docs/, and the quantities in configs/units/model.toml.
+
+Run `python tools/make_reference.py`.
 
 A page contains its own text and, between two comments with the name of a table, the table written here::
 
@@ -6,7 +8,7 @@ A page contains its own text and, between two comments with the name of a table,
     …
     <!-- end: profile -->
 
-tests/test_reference.py compares every table with the code.
+In a TOML file the comments are `# begin: …` and `# end: …`. tests/test_reference.py compares every table with the code.
 """
 
 from __future__ import annotations
@@ -26,7 +28,9 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-DOCS: Final = Path(__file__).resolve().parent.parent / "docs"
+ROOT: Final = Path(__file__).resolve().parent.parent
+DOCS: Final = ROOT / "docs"
+MODEL_FILE: Final = ROOT / "configs" / "units" / "model.toml"
 
 UNITS: Final = {
     "baud": "Bd",
@@ -439,16 +443,27 @@ def unit_definition() -> str:
 
 
 def quantities() -> str:
-    """Every quantity of the device model."""
+    """Every quantity of the device."""
+    from starhil.emulator.device.quantities import QUANTITIES
     from starhil.protocol.device_model import device_model
 
-    model = device_model()
+    enums = device_model().enums
     rows: list[Row] = []
-    for item in model.quantities.values():
-        kind = item.type if item.enum is None else f"name: {', '.join(model.enums[item.enum].values)}"
+    for item in (quantity.declared for quantity in QUANTITIES.values()):
+        kind = item.type if item.enum is None else f"name: {', '.join(enums[item.enum].values)}"
         count = f" n from 1 to {item.count}." if item.count else ""
         rows.append((f"`{item.name}`", kind, item.unit, item.doc + count))
     return table(rows, ("quantity", "type", "unit", "meaning"))
+
+
+def model_quantities() -> str:
+    """Every quantity of the device, as TOML."""
+    from starhil.emulator.device.quantities import QUANTITIES
+
+    return "\n\n".join(
+        "\n".join(["[[quantity]]", *(f"{key} = {json.dumps(value)}" for key, value in keys.items())])
+        for keys in (item.declared.model_dump(exclude_defaults=True) for item in QUANTITIES.values())
+    )
 
 
 def actions() -> str:
@@ -546,6 +561,7 @@ TABLES: Final[dict[str, Callable[[], str]]] = {
     "device_parameters": device_parameters,
     "faults": faults,
     "identifier": identifier,
+    "model_quantities": model_quantities,
     "orbit": orbit,
     "profile": profile,
     "quantities": quantities,
@@ -557,7 +573,7 @@ TABLES: Final[dict[str, Callable[[], str]]] = {
 }
 """Name of a table in a page → function that writes it."""
 
-_BLOCK: Final = re.compile(r"(<!-- begin: (\w+) -->\n).*?(<!-- end: \2 -->)", re.DOTALL)
+_BLOCK: Final = re.compile(r"((?:<!--|#) begin: (\w+).*?\n).*?((?:<!--|#) end: \2)", re.DOTALL)
 
 
 def with_tables(page: str) -> str:
@@ -566,12 +582,13 @@ def with_tables(page: str) -> str:
 
 
 def pages() -> list[Path]:
-    """Return the pages that contain generated tables."""
-    return [path for path in sorted(DOCS.glob("*.md")) if _BLOCK.search(path.read_text(encoding="utf-8"))]
+    """Return the files that contain generated tables."""
+    files = [MODEL_FILE, *sorted(DOCS.glob("*.md"))]
+    return [path for path in files if _BLOCK.search(path.read_text(encoding="utf-8"))]
 
 
 def main() -> None:
-    """Write the tables of all pages."""
+    """Write the tables of all files."""
     for path in pages():
         text = path.read_text(encoding="utf-8")
         new = with_tables(text)

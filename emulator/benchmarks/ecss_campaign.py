@@ -19,7 +19,6 @@ import numpy as np
 from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_store, run_parts
 from starhil.emulator.benchmarks.hard_sky import direction_around
 from starhil.emulator.device.device import profile_defaults
-from starhil.emulator.device.measurement import as_quaternion, as_triple
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
 from starhil.emulator.device.power import FrameTiming, PowerModel
@@ -29,6 +28,7 @@ from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, Pipeli
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
 from starhil.emulator.profile import load_profile
+from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 from starid.result_store import Results
@@ -185,8 +185,7 @@ class EcssDevice:
             temperature_c += self.swing_c * math.sin(2.0 * math.pi * shot.point)
         request = FrameRequest(
             index=condition.stream * 1_000_000 + number,
-            attitude_xyzw=as_quaternion(shot.attitude),
-            rate_rad_s=as_triple(shot.rate_rad_s),
+            truth=TruthState(shot.attitude, shot.rate_rad_s),
             exposure_s=self.exposure_s,
             gain=self.gain,
             settings=self.settings,
@@ -203,15 +202,8 @@ class EcssDevice:
 
     def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
         """Return the request for a frame at a date, with the orbit and the velocity assumed by the device."""
-        state = None if self.orbit is None else self.orbit.state(unix_s)
-        own = observer_velocity(self.parameters, unix_s)
-        return replace(
-            request,
-            unix_s=unix_s,
-            position_m=None if state is None else as_triple(state.position_m),
-            velocity_m_s=None if state is None else as_triple(state.velocity_m_s),
-            observer_velocity=None if own is None else as_triple(own),
-        )
+        truth = request.truth.completed(unix_s, self.orbit)
+        return replace(request, truth=truth, observer_velocity=observer_velocity(self.parameters, unix_s))
 
     def field_attitude(self, condition: Condition, number: int) -> Attitude:
         """Return the attitude of a field, the same for all its frames."""

@@ -47,12 +47,13 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
-from starhil.emulator.device.measurement import Measurement, as_quaternion
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import until_cancelled
 from starhil.emulator.head import Head
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
+from starhil.emulator.pipeline.messages import as_quaternion
 from starhil.emulator.run import Run
 from starhil.emulator.truth.config import FixedConfig, TruthConfig
 from starhil.emulator.truth.live import LiveTruth

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
-from starhil.emulator.device.measurement import Measurement, as_quaternion, as_triple
+from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s
@@ -264,21 +264,17 @@ class FrameCycle:
         conditions = self._surroundings.conditions(truth)
         return FrameRequest(
             index=index,
-            attitude_xyzw=as_quaternion(truth.attitude),
-            rate_rad_s=as_triple(truth.rate_rad_s),
+            truth=truth,
             exposure_s=exposure_s,
             gain=float(parameters["analog_gain"]),
             solve=solve,
-            predicted_xyzw=None if predicted is None else as_quaternion(predicted),
+            predicted=predicted,
             settings=settings,
             faults=self._surroundings.faults,
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,
             upsets=self.upsets,
-            unix_s=truth.unix_s,
-            position_m=None if truth.orbit is None else as_triple(truth.orbit.position_m),
-            velocity_m_s=None if truth.orbit is None else as_triple(truth.orbit.velocity_m_s),
-            observer_velocity=None if velocity is None else as_triple(velocity),
+            observer_velocity=velocity,
         )
 
     def _predict(self, mid_ns: int) -> Attitude | None:

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.modes import Mode
-from starhil.emulator.pipeline.messages import ZERO, FrameResult, Quaternion, Triple
+from starhil.emulator.pipeline.messages import ZERO, FrameResult, Triple
 from starhil.emulator.truth.source import TruthState
-from starid.attitude import Attitude
 
 
 @dataclass(frozen=True)
@@ -65,15 +61,3 @@ class Measurement:
     def latency_s(self) -> float:
         """Time from mid-exposure to publication, seconds of simulation time."""
         return (self.published_ns - self.mid_ns) / NANOSECONDS
-
-
-def as_quaternion(attitude: Attitude) -> Quaternion:
-    """Return the quaternion of an attitude as Python floats, scalar last."""
-    x, y, z, w = attitude.quaternion_xyzw.tolist()
-    return (x, y, z, w)
-
-
-def as_triple(vector: NDArray[np.float64]) -> Triple:
-    """Return a vector (3,) as Python floats."""
-    x, y, z = vector.tolist()
-    return (x, y, z)

@@ -4,18 +4,26 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, reduce
+from itertools import product
+from typing import Final
 
 import numpy as np
 
-from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.device import Device
-from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple
-from starhil.protocol.conventions import SENSOR_AXES, Conventions
+from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
+from starhil.protocol.conventions import Conventions
 from starid.attitude import Attitude
+
+_IDENTITY: Final = Attitude.identity()
+
+SEQUENCES: Final = tuple(a + b + c for a, b, c in product("xyz", repeat=3) if a != b != c)
+"""Sequences of Euler angles: the axes of three rotations, of which no two successive ones are the same."""
+
+GIMBAL_LOCK_RAD: Final = 1e-7
+"""With a second Euler angle this near to where the first and third axes coincide, the third angle is 0."""
 
 
 @dataclass(frozen=True)
@@ -24,21 +32,73 @@ class Reported:
 
     Attributes
     ----------
-    valid, reason
-        Whether the attitude is valid, and the reason if not.
+    reason
+        Why the attitude is invalid, `ok` if it is valid.
     quaternion_xyzw
         ICRS → reported frame in the convention of the unit, scalar last; zeros if invalid.
     rate_rad_s
         Body rate in the reported frame, rad/s; zeros if unknown.
-    mid_unix_s
-        Unix time of mid-exposure on the device's clock, seconds.
+    attitude
+        ICRS → reported frame; the identity if invalid.
+    mounted
+        ICRS → sensor frame after the mounting angles; the reported frame differs from it in the names of its axes.
     """
 
-    valid: bool
     reason: str
     quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 0.0)
     rate_rad_s: Triple = ZERO
-    mid_unix_s: float = 0.0
+    attitude: Attitude = _IDENTITY
+    mounted: Attitude = _IDENTITY
+
+    @property
+    def valid(self) -> bool:
+        """Whether the attitude is valid."""
+        return self.reason == "ok"
+
+    @property
+    def rotation_vector_rad(self) -> Triple:
+        """Rotation vector of the quaternion in the convention of the unit, of at most π."""
+        x, y, z, w = self.quaternion_xyzw
+        sine = math.sqrt(x * x + y * y + z * z)
+        scale = 2.0 if sine == 0.0 else 2.0 * math.atan2(math.copysign(sine, w), abs(w)) / sine
+        return (scale * x, scale * y, scale * z)
+
+    def euler_rad(self, sequence: str) -> Triple:
+        """Return the Euler angles that turn the ICRS axes to the reported axes, (3,), rad.
+
+        Each rotation is about an axis as the previous rotations have turned it (an intrinsic sequence). The first
+        and third angle are in (−π, π]; the second is in [0, π] if the first and last axis are the same, otherwise
+        in [−π/2, π/2]. Where the first and third rotation are about one line, the third angle is 0.
+
+        From the quaternion, by Bernardes and Viollet, PLoS ONE 17(11):e0276302 (2022), whose extrinsic sequence is
+        this one in reverse.
+        """
+        x, y, z, w = self.attitude.quaternion_xyzw.tolist()
+        q = (-x, -y, -z, w)
+        i, j, k = ("xyz".index(axis) for axis in reversed(sequence))
+        proper = i == k
+        if proper:
+            k = 3 - i - j
+        sign = (i - j) * (j - k) * (k - i) // 2
+        a, b, c, d = q[3], q[i], q[j], q[k] * sign
+        if not proper:
+            a, b, c, d = a - c, b + d, c + a, d - b
+        second = 2.0 * math.atan2(math.hypot(c, d), math.hypot(a, b))
+        half_sum, half_difference = math.atan2(b, a), math.atan2(d, c)
+        if second < GIMBAL_LOCK_RAD:
+            first, third = 2.0 * half_sum, 0.0
+        elif second > math.pi - GIMBAL_LOCK_RAD:
+            first, third = 2.0 * half_difference, 0.0
+        else:
+            first, third = half_sum + half_difference, half_sum - half_difference
+        if not proper:
+            first, second = first * sign, second - 0.5 * math.pi
+        return _half_turn(first), second, _half_turn(third)
+
+
+def _half_turn(angle: float) -> float:
+    """Return an angle in (−π, π]."""
+    return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
 def reported(device: Device) -> Reported:
@@ -47,23 +107,19 @@ def reported(device: Device) -> Reported:
     if last is None:
         running = device.modes.mode.makes_frames
         failed = device.modes.mode is Mode.ERROR
-        return Reported(False, "processing_error" if failed else "no_frame" if running else "not_running")  # noqa: FBT003
-    mid_unix_s = last.mid_unix_ns / NANOSECONDS
+        return Reported("processing_error" if failed else "no_frame" if running else "not_running")
     if not last.valid:
-        return Reported(False, last.reason, mid_unix_s=mid_unix_s)  # noqa: FBT003
-    attitude = Attitude(np.array(last.result.quaternion_xyzw))
-    rate = np.array(last.rate_rad_s)
-    turns = _turns(device)
-    for turn in turns:
-        attitude = attitude.rotated(turn)
-        rate = Attitude.identity().rotated(turn).to_sensor(rate)
-    x, y, z = rate.tolist()
-    return Reported(True, "ok", _in_convention(attitude, device), (x, y, z), mid_unix_s)  # noqa: FBT003
+        return Reported(last.reason)
+    measured = Attitude(np.array(last.result.quaternion_xyzw))
+    mounted = reduce(Attitude.rotated, mounting_turns(device.parameters), measured)
+    attitude = reduce(Attitude.rotated, axes_turns(device.icd.conventions), mounted)
+    rate = to_reported_frame(device, np.array(last.rate_rad_s))
+    return Reported("ok", _in_convention(attitude, device), as_triple(rate), attitude, mounted)
 
 
 def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
     """Turn a vector (3,) from the sensor frame to the reported frame."""
-    for turn in _turns(device):
+    for turn in mounting_turns(device.parameters) + axes_turns(device.icd.conventions):
         vector = Attitude.identity().rotated(turn).to_sensor(vector)
     return vector
 
@@ -80,12 +136,6 @@ def _in_convention(attitude: Attitude, device: Device) -> Quaternion:
             x, y, z, w = -x, -y, -z, -w
         device.reported_quaternion = (x, y, z, w)
     return x, y, z, w
-
-
-def _turns(device: Device) -> list[np.ndarray]:
-    """Return the rotation vectors from the sensor frame to the reported frame: mounting, then axes."""
-    turns, conventions = mounting_turns(device.parameters), device.icd.conventions
-    return turns if conventions.axes == SENSOR_AXES else turns + axes_turns(conventions)
 
 
 @cache

@@ -30,6 +30,7 @@ from starhil.emulator.pipeline.messages import (
     PipelineSetup,
     Quaternion,
     Triple,
+    as_quaternion,
 )
 from starhil.emulator.signals import Signal
 from starid.camera import Camera
@@ -113,7 +114,7 @@ class ErrorModelImager:
     def _solve(self, request: FrameRequest) -> FrameResult:
         random_of_frame = random.Random(self._setup.seed << 40 ^ request.index)  # noqa: S311 (noise)
         settings = request.settings
-        tracked = request.predicted_xyzw is not None
+        tracked = request.predicted is not None
         expected = self._expected_stars(request)
         detected = max(0, round(random_of_frame.gauss(expected, math.sqrt(expected))))
         matched = min(detected, settings.max_stars_matched)
@@ -132,7 +133,7 @@ class ErrorModelImager:
             valid=True,
             reason="ok",
             tracked=tracked,
-            quaternion_xyzw=turned(request.attitude_xyzw, error),
+            quaternion_xyzw=turned(as_quaternion(request.truth.attitude), error),
             sigma_cross_arcsec=cross_rad / ARCSEC,
             sigma_roll_arcsec=roll_rad / ARCSEC,
             detected=detected,
@@ -146,7 +147,7 @@ class ErrorModelImager:
         """Return stars somewhere in the field, each measured with the error of a centroid."""
         focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
         centre_x, centre_y = self._constants["centre_px"]
-        stars = []
+        attitude, stars = as_quaternion(request.truth.attitude), []
         for _ in range(REPORTED_STARS):
             true_x = random_of_frame.uniform(0.0, self._camera.width - 1.0)
             true_y = random_of_frame.uniform(0.0, self._camera.height - 1.0)
@@ -163,7 +164,7 @@ class ErrorModelImager:
                     magnitude=random_of_frame.uniform(2.0, LIMIT_V),
                     snr=50.0,
                     vector=unit_vector(x - centre_x, y - centre_y, focal_px),
-                    icrs=in_icrs(true, request.attitude_xyzw),
+                    icrs=in_icrs(true, attitude),
                 )
             )
         return tuple(sorted(stars, key=lambda star: star.magnitude))
@@ -171,7 +172,7 @@ class ErrorModelImager:
     def _expected_stars(self, request: FrameRequest) -> float:
         """Return the mean number of detected stars in the field."""
         settings = request.settings
-        x, y, z = request.rate_rad_s
+        x, y, z = request.truth.rate_rad_s.tolist()
         focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
         trail_px = (focal_px * math.hypot(x, y) + ROLL_ARM * self._camera.width * abs(z)) * request.exposure_s
         light = request.exposure_s / 0.1 * request.gain * 5.0 / settings.detection_threshold
@@ -189,9 +190,11 @@ class ErrorModelImager:
             return "too_few_stars"
         if self._calibration_error_px(request) > settings.validation_margin:
             return "no_match"
-        if request.predicted_xyzw is not None:
+        if request.predicted is not None:
             focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
-            off_px = focal_px * angle_between(request.predicted_xyzw, request.attitude_xyzw)
+            off_px = focal_px * angle_between(
+                as_quaternion(request.predicted), as_quaternion(request.truth.attitude)
+            )
             if off_px > settings.tracking_margin + settings.search_width:
                 return "prediction_lost"
         return ""

@@ -1,7 +1,4 @@
-"""Requests to the image pipeline, and its results.
-
-They consist of plain values, so that they can be pickled between processes and compared in tests.
-"""
+"""Requests to the image pipeline, and its results, which are pickled between the processes."""
 
 from __future__ import annotations
 
@@ -9,11 +6,30 @@ import struct
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
+import numpy as np
+from numpy.typing import NDArray
+
+from starhil.emulator.truth.source import TruthState
+from starid.attitude import Attitude
+
 Quaternion: TypeAlias = tuple[float, float, float, float]
 Triple: TypeAlias = tuple[float, float, float]
 
 ZERO: Final[Triple] = (0.0, 0.0, 0.0)
 IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+
+
+def as_quaternion(attitude: Attitude) -> Quaternion:
+    """Return the quaternion of an attitude as Python floats, scalar last."""
+    x, y, z, w = attitude.quaternion_xyzw.tolist()
+    return (x, y, z, w)
+
+
+def as_triple(vector: NDArray[np.float64]) -> Triple:
+    """Return a vector (3,) as Python floats."""
+    x, y, z = vector.tolist()
+    return (x, y, z)
+
 
 LENGTH: Final = struct.Struct("<I")
 """Length prefix of each pickled message between the emulator and its worker process."""
@@ -117,13 +133,13 @@ class FrameRequest:
     ----------
     index
         Number of the frame since the start of the run, which together with the seed determines the noise.
-    attitude_xyzw, rate_rad_s
-        Truth at mid-exposure: quaternion ICRS→sensor, body rate in the sensor frame.
+    truth
+        Truth of the sensor at mid-exposure; without a date, only typed bodies are rendered.
     exposure_s, gain
         Exposure in seconds and analog gain.
     solve
         Whether to detect and identify stars; if false, the image is only rendered and kept for download.
-    predicted_xyzw
+    predicted
         Predicted attitude at mid-exposure, for tracking; None: lost in space.
     settings
         Parameters of detection and identification.
@@ -135,33 +151,25 @@ class FrameRequest:
         Particles per second that hit the detector, in addition to the sky's particles.
     upsets
         Bits flipped by radiation in the unit's star catalogue.
-    unix_s
-        True date of mid-exposure, Unix time; None: no date.
-    position_m, velocity_m_s
-        True position and velocity of the sensor relative to the Earth's centre, GCRS; None: at the centre.
     observer_velocity
-        Velocity of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct
+        Velocity (3,) of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct
         aberration; None: no correction.
     preview
         Whether to return the image too, compressed for display.
     """
 
     index: int
-    attitude_xyzw: Quaternion
-    rate_rad_s: Triple
+    truth: TruthState
     exposure_s: float
     gain: float
     solve: bool = True
-    predicted_xyzw: Quaternion | None = None
+    predicted: Attitude | None = None
     settings: SolverSettings = field(default_factory=SolverSettings)
     faults: dict[str, Any] = field(default_factory=dict)
     temperature_c: float | None = None
     particles_s: float = 0.0
     upsets: tuple[CatalogUpset, ...] = ()
-    unix_s: float | None = None
-    position_m: Triple | None = None
-    velocity_m_s: Triple | None = None
-    observer_velocity: Triple | None = None
+    observer_velocity: NDArray[np.float64] | None = None
     preview: bool = False
 
 

@@ -18,8 +18,6 @@ from starhil.emulator.pipeline.binning import mean_over_squares
 from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
 from starhil.emulator.pipeline.image_source import ImageSource, open_images, used_bits
 from starhil.emulator.pipeline.messages import (
-    IDENTITY,
-    ZERO,
     Failure,
     FrameRequest,
     FrameResult,
@@ -30,7 +28,7 @@ from starhil.emulator.pipeline.messages import (
     PipelineSetup,
     Preview,
     SolverSettings,
-    Triple,
+    as_triple,
 )
 from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
 from starhil.emulator.pipeline.preview import make_preview
@@ -40,6 +38,7 @@ from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame, Renderer, frame_without_truth
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starhil.emulator.sky.view import Sky
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.aberration import aberrated
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -148,14 +147,13 @@ class Pipeline:
             p1=p1,
             p2=p2,
         )
-        attitude = IDENTITY
+        attitude = Attitude.identity()
         helper = start_helper() if kernel_cache_was_cold() else None
         if helper is not None:
             gc.disable()  # as in the helper
         request = FrameRequest(
             index=0,
-            attitude_xyzw=attitude,
-            rate_rad_s=ZERO,
+            truth=TruthState(attitude, ZERO_RATE),
             exposure_s=_WARM_UP_EXPOSURE_S,
             gain=self._sensor.gain,
             settings=settings,
@@ -167,7 +165,8 @@ class Pipeline:
                 detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))
             helper.wait()  # kernels it compiled are loaded below; any others are compiled there
         for rate, predicted in itertools.product(_WARM_UP_RATES_RAD_S, (None, attitude)):
-            self._process_frame(replace(request, rate_rad_s=rate, predicted_xyzw=predicted))
+            turning = TruthState(attitude, np.array(rate))
+            self._process_frame(replace(request, truth=turning, predicted=predicted))
         if self._sky.by_date:
             for earth in (_WARM_UP_BODIES.earth, EarthLimb(180.0, 80.0, radius_deg=5.0)):
                 self._renderer.render(Attitude.identity(), objects=replace(_WARM_UP_BODIES, earth=earth))
@@ -228,16 +227,16 @@ class Pipeline:
         if self.images is not None:
             image = self.images.image(request.index)
             return _Exposure(image, used_bits(image), request.index)
-        attitude = Attitude(np.array(request.attitude_xyzw))
-        sky = self._sky.view(
-            request.unix_s, _vector(request.position_m), _vector(request.velocity_m_s), request.faults
-        )
+        truth, orbit = request.truth, request.truth.orbit
+        attitude = Attitude(truth.attitude.quaternion_xyzw)  # read-only again, which pickling does not keep
+        position, velocity = (None, None) if orbit is None else (orbit.position_m, orbit.velocity_m_s)
+        sky = self._sky.view(truth.unix_s, position, velocity, request.faults)
         objects = sky.objects
         if request.particles_s > 0.0:
             objects = replace(objects, cosmic_rays_s=objects.cosmic_rays_s + request.particles_s)
         frame = self._renderer.render(
             attitude,
-            request.rate_rad_s,
+            truth.rate_rad_s,
             request.index,
             exposure_s=request.exposure_s,
             temperature_c=request.temperature_c,
@@ -264,14 +263,13 @@ class Pipeline:
         chosen = slice(0, settings.max_stars_matched if self._setup.algorithm == "geometric" else None)
         xy, flux = found.xy_px[chosen], found.flux[chosen] / request.exposure_s
         sigma = np.sqrt(np.mean(found.xy_sigma_px[chosen] ** 2, axis=1))
-        if request.predicted_xyzw is None:
+        if request.predicted is None:
             solution = identifier.identify(xy, flux, sigma, observer_velocity=request.observer_velocity)
         else:
-            predicted = np.array(request.predicted_xyzw)
             solution = identifier.track(
                 xy,
                 flux,
-                predicted,
+                np.array(request.predicted.quaternion_xyzw),
                 sigma,
                 window_px=tracking_window(settings),
                 observer_velocity=request.observer_velocity,
@@ -315,8 +313,8 @@ class Pipeline:
                     y=float(found.xy_px[row, 1]),
                     magnitude=measured_magnitude(float(found.flux[row]), sensor),
                     snr=float(found.flux[row] / found.flux_sigma[row]),
-                    vector=_triple(direction),
-                    icrs=_triple(icrs),
+                    vector=as_triple(direction),
+                    icrs=as_triple(icrs),
                 )
                 for row, hip, direction, icrs in zip(
                     solution.detection_index, solution.hip, measured, modelled, strict=True
@@ -358,15 +356,6 @@ class Pipeline:
             height, width = image.shape
             return ImageResult(width, height, frame, eight_bits(image, bits).tobytes())
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
-
-
-def _triple(vector: NDArray[np.float64]) -> Triple:
-    x, y, z = vector.tolist()
-    return x, y, z
-
-
-def _vector(values: Triple | None) -> NDArray[np.float64] | None:
-    return None if values is None else np.array(values)
 
 
 def _within_margin(

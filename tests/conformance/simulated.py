@@ -17,7 +17,13 @@ from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest
-from starhil.emulator.pipeline.messages import FrameResult, ImageRequest, ImageResult, MatchedStar
+from starhil.emulator.pipeline.messages import (
+    FrameResult,
+    ImageRequest,
+    ImageResult,
+    MatchedStar,
+    as_quaternion,
+)
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.truth.source import FixedTruth
@@ -148,8 +154,8 @@ class TruthImager:
         if not request.solve:
             return FrameResult(request.index, solved=False)
         return FrameResult(
-            request.index, valid=True, reason="ok", tracked=request.predicted_xyzw is not None,
-            quaternion_xyzw=request.attitude_xyzw, sigma_cross_arcsec=1.5, sigma_roll_arcsec=6.0, detected=40,
+            request.index, valid=True, reason="ok", tracked=request.predicted is not None,
+            quaternion_xyzw=as_quaternion(request.truth.attitude), sigma_cross_arcsec=1.5, sigma_roll_arcsec=6.0, detected=40,
             refused=3, matched=35, stars=STARS, probability_false=1e-12, rms_px=0.1, background_dn=8.2, noise_dn=0.61,
         )  # fmt: skip
 

@@ -76,12 +76,12 @@ class FakePipeline:
         self.last_index = request.index
         if not request.solve:
             return FrameResult(request.index, solved=False)
-        tracked = request.predicted_xyzw is not None
+        tracked = request.predicted is not None
         if self.fail:
             return FrameResult(request.index, reason=self.fail, tracked=tracked, detected=2)
-        attitude = Attitude(np.array(request.attitude_xyzw)).rotated((self.turn_rad, 0.0, 0.0))
+        attitude = request.truth.attitude.rotated((self.turn_rad, 0.0, 0.0))
         if tracked:
-            missed = attitude.error_to(Attitude(np.array(request.predicted_xyzw))).rotation_vector_rad
+            missed = attitude.error_to(request.predicted).rotation_vector_rad
             if np.linalg.norm(missed) > self.window_rad:
                 return FrameResult(request.index, reason="prediction_lost", tracked=True, detected=40)
         x, y, z, w = attitude.quaternion_xyzw.tolist()

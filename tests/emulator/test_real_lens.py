@@ -5,12 +5,12 @@ import pytest
 
 from starhil.emulator.benchmarks.ecss_campaign import REST, Condition, EcssDevice, EcssPlan
 from starhil.emulator.device.device import profile_defaults
-from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady, SolverSettings
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
 from starhil.emulator.profile import CALIBRATION, load_profile
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
 from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 
@@ -31,9 +31,7 @@ def errors_arcsec(pipeline, parameters) -> list[float]:
     for index in range(FIELDS):
         truth = random_attitude(rng)
         exposure_s = parameters["exposure"] / 1000.0
-        request = FrameRequest(
-            index, as_quaternion(truth), (0.0, 0.0, 0.0), exposure_s, 1.0, settings=settings
-        )
+        request = FrameRequest(index, TruthState(truth, ZERO_RATE), exposure_s, 1.0, settings=settings)
         result = pipeline.handle(request)
         assert result.valid, result
         measured = Attitude(np.array(result.quaternion_xyzw))

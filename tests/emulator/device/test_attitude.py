@@ -69,16 +69,13 @@ def test_tracking_predicts_with_the_rate(make_bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(4.5)
     first, second, third, *_ = bench.pipeline.frames
-    assert first.predicted_xyzw is None
-    assert second.predicted_xyzw is None  # one attitude gives no rate
-    predicted = Attitude(np.array(third.predicted_xyzw))
-    assert predicted.error_to(Attitude(np.array(third.attitude_xyzw))).total_arcsec < 0.001
+    assert first.predicted is None
+    assert second.predicted is None  # one attitude gives no rate
+    assert third.predicted.error_to(third.truth.attitude).total_arcsec < 0.001
     bench.command("set_parameter", parameter=28, value=0.0)  # prediction off: the last attitude as it was
     bench.step(1.0)
     last = bench.pipeline.frames[-1]
-    off = (
-        Attitude(np.array(last.predicted_xyzw)).error_to(Attitude(np.array(last.attitude_xyzw))).total_arcsec
-    )
+    off = last.predicted.error_to(last.truth.attitude).total_arcsec
     assert off == pytest.approx(0.5 * 3600.0, rel=1e-6)
 
 
@@ -162,12 +159,12 @@ def test_one_frame_without_stars_in_a_tumble_costs_no_other(make_bench):
     bench.pipeline.window_rad = WINDOW_RAD
     bench.command("set_mode", mode="lost_in_space")
     assert set(reasons(bench, 8)) == {"ok"}
-    assert bench.pipeline.frames[-1].predicted_xyzw is not None
+    assert bench.pipeline.frames[-1].predicted is not None
     bench.pipeline.fail = "too_few_stars"
     assert reasons(bench, 1) == ["too_few_stars"]
     bench.pipeline.fail = ""
     assert set(reasons(bench, 20)) == {"ok"}
-    assert bench.pipeline.frames[-1].predicted_xyzw is not None
+    assert bench.pipeline.frames[-1].predicted is not None
 
 
 def test_a_jump_marks_no_frame_but_that_which_lost_it(bench):

@@ -14,6 +14,7 @@ from starhil.emulator.pipeline.messages import Failure, FrameRequest, SolverSett
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import LINK_PARAMETERS, Profile, load_profile
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_folders import bundled_units
 from starhil.protocol.values import MessageError
@@ -136,8 +137,7 @@ def solve():
     nominal = SolverSettings(
         focal_length=camera.focal_px[0], centroid_x=camera.centre_px[0], centroid_y=camera.centre_px[1]
     )
-    x, y, z, w = ORION.quaternion_xyzw.tolist()
-    request = FrameRequest(0, (x, y, z, w), (0.0, 0.0, 0.0), exposure_s=0.1, gain=1.0, settings=nominal)
+    request = FrameRequest(0, TruthState(ORION, ZERO_RATE), exposure_s=0.1, gain=1.0, settings=nominal)
     assert pipeline.handle(request).valid
     exposure = pipeline._last
     pipeline._expose = lambda _request: exposure

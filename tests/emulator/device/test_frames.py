@@ -3,7 +3,7 @@
 import pytest
 
 from starhil.emulator.device.cycle import MAX_PENDING
-from starhil.emulator.device.quantities import QUANTITIES
+from starhil.emulator.device.quantities import getter_of
 from starhil.emulator.device.snapshot import Snapshot
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
@@ -144,5 +144,5 @@ def test_the_age_of_a_frame_counts_from_the_middle_of_its_exposure(bench):
     bench.step(2.5)
     measured = Snapshot(bench.device).frame
     age_s = (bench.clock.now_ns() - measured.mid_ns) / 1e9
-    assert QUANTITIES["frame.age"](Snapshot(bench.device)) == age_s
+    assert getter_of("frame.age")(Snapshot(bench.device)) == age_s
     assert 0.0 < age_s < 2.5

@@ -34,17 +34,17 @@ def running(make_bench, **profile):
 def test_requests_carry_the_date_and_the_orbit_of_the_run(make_bench):
     bench = running(make_bench, sky={"date": "2026-03-20T12:00:00Z"}, orbit={"kind": "kepler", **ELEMENTS})
     first, second = bench.pipeline.frames[:2]
-    assert first.unix_s == pytest.approx(EQUINOX + 1.05, abs=0.1)
-    assert second.unix_s - first.unix_s == pytest.approx(1.0)
-    moved = np.array(second.position_m) - np.array(first.position_m)
-    assert moved == pytest.approx(np.array(first.velocity_m_s), rel=0.01, abs=10.0)
-    assert np.linalg.norm(first.position_m) == pytest.approx(6.9e6, rel=1e-6)
+    assert first.truth.unix_s == pytest.approx(EQUINOX + 1.05, abs=0.1)
+    assert second.truth.unix_s - first.truth.unix_s == pytest.approx(1.0)
+    moved = second.truth.orbit.position_m - first.truth.orbit.position_m
+    assert moved == pytest.approx(first.truth.orbit.velocity_m_s, rel=0.01, abs=10.0)
+    assert np.linalg.norm(first.truth.orbit.position_m) == pytest.approx(6.9e6, rel=1e-6)
 
 
 def test_without_date_and_orbit_the_date_is_that_of_the_device_and_the_place_the_earths_centre(make_bench):
     frame = running(make_bench).pipeline.frames[0]
-    assert frame.unix_s == pytest.approx(NEW_YEAR, abs=2.0)
-    assert (frame.position_m, frame.velocity_m_s, frame.observer_velocity) == (None, None, None)
+    assert frame.truth.unix_s == pytest.approx(NEW_YEAR, abs=2.0)
+    assert (frame.truth.orbit, frame.observer_velocity) == (None, None)
 
 
 def test_a_device_that_corrects_aberration_takes_the_velocity_of_the_earth_at_its_own_clock(make_bench):
@@ -83,7 +83,7 @@ def test_an_uploaded_orbit_adds_its_velocity(make_bench):
     bench.device.parameters.set(KNOWN)
     bench.step(1.0)
     frame = bench.pipeline.frames[-1]
-    expected = earth_velocity(frame.unix_s) + np.array(frame.velocity_m_s)
+    expected = earth_velocity(frame.truth.unix_s) + frame.truth.orbit.velocity_m_s
     assert frame.observer_velocity == pytest.approx(expected, abs=0.5)
 
 
@@ -112,7 +112,7 @@ def test_a_run_continues_after_its_orbit_has_decayed(make_bench, caplog):
     bench.device.surroundings._orbit = Decays()
     bench.command("set_mode", mode="lost_in_space")
     bench.step(3.5)
-    assert [frame.position_m for frame in bench.pipeline.frames] == [None] * len(bench.pipeline.frames)
+    assert [frame.truth.orbit for frame in bench.pipeline.frames] == [None] * len(bench.pipeline.frames)
     assert len(bench.pipeline.frames) >= 2
     assert caplog.text.count("has decayed; the run continues without an orbit") == 1
 

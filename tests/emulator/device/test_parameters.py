@@ -106,7 +106,7 @@ def test_tracking_flag_keeps_the_device_lost_in_space(bench):
     bench.command("set_mode", mode="lost_in_space")
     bench.step(5.0)
     assert bench.mode == "lost_in_space"
-    assert all(request.predicted_xyzw is None for request in bench.pipeline.frames)
+    assert all(request.predicted is None for request in bench.pipeline.frames)
 
 
 def test_one_parameter_is_set_read_and_refused(bench):

@@ -23,6 +23,7 @@ from starhil.emulator.pipeline.pipeline import Pipeline, make_pipeline
 from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -38,7 +39,7 @@ FIELDS = (
     Attitude.from_radec_roll(187.0, 12.0, -70.0),
     Attitude.from_radec_roll(310.0, 45.0, 160.0),
 )
-NOWHERE = (0.0, 0.0, 0.0, 1.0)
+NOWHERE = TruthState(Attitude.identity(), ZERO_RATE)
 ERROR_ARCSEC = 30.0
 
 
@@ -69,7 +70,7 @@ def request(pipeline: Pipeline, profile: Profile, index: int) -> FrameRequest:
     parameters = Parameters(icd, profile_defaults(profile, icd))
     parameters.adopt_defaults(camera_constants(PipelineReady(pipeline.camera.to_dict(), 0, 0.0)))
     settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
-    return FrameRequest(index, NOWHERE, (0.0, 0.0, 0.0), 0.5, 1.0, settings=settings)
+    return FrameRequest(index, NOWHERE, 0.5, 1.0, settings=settings)
 
 
 def test_the_device_answers_with_the_attitudes_of_the_photographs_in_turn(profile, photographs):

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import FrameRequest, PipelineSetup
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.errors import StaridError
@@ -145,7 +145,7 @@ def test_frames_are_solved_while_another_index_is_built_and_then_the_new_limit_h
     pipeline = Pipeline(setup)
     magnitude = dict(zip(pipeline.catalog.hip.tolist(), pipeline.catalog.v.tolist(), strict=True))
     truth = Attitude.from_radec_roll(83.8, -1.2, 0.0)
-    asked = FrameRequest(0, as_quaternion(truth), (0.0, 0.0, 0.0), 0.1, 1.0)
+    asked = FrameRequest(0, TruthState(truth, ZERO_RATE), 0.1, 1.0)
     bright = replace(asked, settings=replace(asked.settings, limiting_magnitude=4.0))
 
     def solve(request):

@@ -7,20 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starhil.emulator.device.measurement import as_quaternion
 from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
 from starhil.emulator.pipeline.messages import CatalogUpset, FrameRequest, FrameResult
 from starhil.emulator.pipeline.pipeline import Pipeline
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
 from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from starid.catalog import load_catalog
 
 ORION = Attitude.from_radec_roll(83.8, -1.2, 0.0)
 BETELGEUSE = 27989
-REQUEST = FrameRequest(0, as_quaternion(ORION), (0.0, 0.0, 0.0), 0.1, 1.0)
+REQUEST = FrameRequest(0, TruthState(ORION, ZERO_RATE), 0.1, 1.0)
 SIGN_BIT, EXPONENT_BIT = 31, 30
 
 
@@ -85,9 +85,9 @@ def test_the_sun_within_its_exclusion_angle_blinds_the_sensor_unless_the_lens_is
 
 
 def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline):
-    for index, predicted in ((10, None), (11, as_quaternion(ORION)), (12, None), (13, as_quaternion(ORION))):
+    for index, predicted in ((10, None), (11, ORION), (12, None), (13, ORION)):
         for cover in ({"blank": True}, {"blocked_share": 1.0}):
-            request = replace(REQUEST, index=index, predicted_xyzw=predicted, faults=cover)
+            request = replace(REQUEST, index=index, predicted=predicted, faults=cover)
             result = pipeline.handle(request)
             assert (result.valid, result.reason, result.matched) == (False, "too_few_stars", 0), cover
 
@@ -95,7 +95,7 @@ def test_a_covered_lens_leaves_too_few_stars_lost_in_space_and_tracking(pipeline
 def test_the_modelled_direction_of_a_star_is_that_of_the_catalogue_not_the_measured_one(pipeline):
     catalog = load_catalog(epoch=Profile().epoch)
     wanted = {int(hip): vector for hip, vector in zip(catalog.hip, catalog.vectors, strict=True)}
-    moved = replace(REQUEST, index=30, observer_velocity=(20_000.0, -20_000.0, 5_000.0))
+    moved = replace(REQUEST, index=30, observer_velocity=np.array((20_000.0, -20_000.0, 5_000.0)))
     for request in (replace(REQUEST, index=31), moved):
         result = pipeline.handle(request)
         measured = np.array([star.vector for star in result.stars])

@@ -10,6 +10,7 @@ import pytest
 SCRIPT = """
 import sys
 from dataclasses import replace
+import numpy as np
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.pipeline.pipeline import make_pipeline
 from starhil.emulator.profile import load_profile
@@ -34,8 +35,9 @@ exposure_s = profile.parameters["exposure"] / 1000.0
 bright = sys.argv[1] == "ideal"
 for rate in ((0.0, 0.0, 0.0), (0.0, 0.0052, 0.0), (0.01, 0.01, 0.0), (0.0, 0.03, 0.0), (0.0, 0.0, 0.05)):
     for index in range(4):
-        predicted = requests[0].attitude_xyzw if index % 2 else None
-        request = replace(requests[0], index=index, rate_rad_s=rate, predicted_xyzw=predicted, exposure_s=exposure_s)
+        predicted = requests[0].truth.attitude if index % 2 else None
+        truth = replace(requests[0].truth, rate_rad_s=np.array(rate))
+        request = replace(requests[0], index=index, truth=truth, predicted=predicted, exposure_s=exposure_s)
         answer = pipeline.handle(request)
         assert answer.valid or not bright, answer
 print(len(before), sorted(kernels() - before))
