@@ -14,8 +14,8 @@ from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, Request
-from starhil.protocol.serial_interface import HostEnd, Receiver
-from starhil.protocol.serial_stack import build_serial_stack, chosen_dialect, serial_answers
+from starhil.protocol.serial_interface import Receiver
+from starhil.protocol.serial_stack import HostReceiver, build_serial_stack, chosen_dialect, serial_answers
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -150,7 +150,7 @@ class SerialHostLink(HostLink[bytes]):
     """
 
     name = "serial"
-    _receiver: HostEnd
+    _receiver: HostReceiver
 
     def __init__(
         self,

@@ -11,11 +11,11 @@ from collections import deque
 from typing import Final
 
 from starhil.hil_tests.load_figures import SerialLoad
-from starhil.protocol.cubespace_serial import HostReceiver, encode_request
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.image_transfer import MAP_PART_SIZE
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports import SerialTransport, open_serial
 
 REPLY_WITHIN_S: Final = 2.0
@@ -31,7 +31,8 @@ class _SerialPipeline:
     def __init__(self, icd: InterfaceDefinition, dialect: Dialect) -> None:
         stars = icd.telemetry["identified_stars"]
         hole_map = icd.telecommands["set_hole_map_1"]
-        self._receiver = HostReceiver(dialect)
+        self._stack = build_serial_stack(icd)
+        self._receiver = self._stack.host(dialect)
         maps = [(Request.of(hole_map.id, bytes((value,)) * MAP_PART_SIZE), 0) for value in range(1, 8)]
         self._cycle = []
         for count in MAPS_BETWEEN_STARS:
@@ -61,7 +62,7 @@ class _SerialPipeline:
         self._under_way.append((request, size))
         if len(self._under_way) == 1:
             self._receiver.expect(request, size)
-        return encode_request(request)
+        return self._stack.encode_request(request)
 
     def take(self, data: bytes) -> None:
         """Decode message by message, because in dialect b each reply needs its request."""

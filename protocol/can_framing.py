@@ -1,17 +1,20 @@
 """CAN framing of the CubeSpace family: 29-bit CAN IDs and segments that count down, as sans-I/O receivers.
 
-CAN ID: message type[28:24], telecommand or telemetry ID[23:16], source[15:8], destination[7:0]. Up to 8 bytes
-of data fit one frame. Longer data are split into segments of 7 bytes, each followed by a byte that counts the
-remaining segments down to 0; the last segment may be shorter.
+::
 
-The CAN ID is packed by shifts because this is done for every frame: shifts take 3 µs to build and 7 µs to
-parse an ID, a `construct.BitStruct` 78 µs and 15 µs.
+    CAN ID     type [28:24]  row ID [23:16]  source [15:8]  destination [7:0]      `CAN_ID`
+    one frame  up to 8 bytes of data
+    segment    7 bytes of data, fewer in the last one, then the number of remaining segments
+
+A message of up to 8 bytes is one frame, a longer one is segmented. Its type tells the kind of message and whether it
+is a segment (`REQUEST_TYPES`, `REPLY_TYPES`). The CAN ID is packed by shifts because this is done for every frame:
+shifts take 3 µs to build and 7 µs to parse an ID, a `construct.BitStruct` 78 µs and 15 µs.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, Generic, TypeVar
@@ -86,6 +89,37 @@ class MessageType(IntEnum):
     UNSOLICITED_LAST = 12
 
 
+CAN_ID: Final = (("type", 24, 0x1F), ("id", 16, 0xFF), ("source", 8, 0xFF), ("destination", 0, 0xFF))
+"""The parts of a CAN ID: name, lowest bit, highest value."""
+
+REQUEST_TYPES: Final = {
+    RequestKind.TELECOMMAND: (MessageType.TELECOMMAND, MessageType.TELECOMMAND_EXTENDED),
+    RequestKind.TELEMETRY: (MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY_REQUEST),
+}
+"""Kind of request → its type in one frame and in segments."""
+
+REPLY_TYPES: Final = {
+    ReplyKind.ACK: (MessageType.TELECOMMAND_ACK,),
+    ReplyKind.EVENT: (MessageType.EVENT,),
+    ReplyKind.TELEMETRY: (MessageType.TELEMETRY, *(MessageType.TELEMETRY_EXTENDED,) * 3),
+    ReplyKind.BURST: (MessageType.TELEMETRY, *(MessageType.TELEMETRY_EXTENDED,) * 3),
+    ReplyKind.UNSOLICITED: (
+        MessageType.UNSOLICITED_LAST,
+        MessageType.UNSOLICITED_FIRST, MessageType.UNSOLICITED_BODY, MessageType.UNSOLICITED_LAST,
+    ),
+}  # fmt: skip
+"""Kind of reply → its type in one frame and, if it may be longer, in the first, middle and last segment.
+
+Public sources confirm the types, but not the layout of unsolicited messages and of bursts, which is our own choice.
+"""
+
+
+def nack_type(row_id: int) -> MessageType:
+    """Return the type of the refusal of a row."""
+    telemetry = row_id >= FIRST_TELEMETRY_ID
+    return MessageType.TELEMETRY_NACK if telemetry else MessageType.TELECOMMAND_NACK
+
+
 @dataclass(frozen=True, slots=True)
 class CanId:
     """The four parts of a CAN ID."""
@@ -98,20 +132,18 @@ class CanId:
 
     def pack(self) -> int:
         """Return the 29-bit CAN ID."""
-        for name, value, highest in (
-            ("type", self.type, 31),
-            ("id", self.id, 255),
-            ("source", self.source, 255),
-            ("destination", self.destination, 255),
-        ):
+        raw = 0
+        for name, shift, highest in CAN_ID:
+            value: int = getattr(self, name)
             if not 0 <= value <= highest:
                 raise ProtocolError(f"CAN ID: {name} {value} is outside 0 to {highest}")
-        return self.type << 24 | self.id << 16 | self.source << 8 | self.destination
+            raw |= value << shift
+        return raw
 
     @classmethod
     def unpack(cls, raw: int) -> CanId:
         """Return the parts of a 29-bit CAN ID."""
-        return cls(raw >> 24 & 0x1F, raw >> 16 & 0xFF, raw >> 8 & 0xFF, raw & 0xFF)
+        return cls(*[raw >> shift & highest for _, shift, highest in CAN_ID])
 
 
 def segment(data: bytes) -> list[bytes]:
@@ -126,48 +158,32 @@ def segment(data: bytes) -> list[bytes]:
 
 def encode_request_frames(request: Request, source: int, destination: int) -> list[CanFrame]:
     """Return the frames of a request from an OBC at `source` to the device at `destination`."""
-    if request.kind is RequestKind.TELEMETRY:
-        kind = MessageType.TELEMETRY_REQUEST
-    elif len(request.data) > MAX_FRAME_DATA:
-        kind = MessageType.TELECOMMAND_EXTENDED
-    else:
-        kind = MessageType.TELECOMMAND
+    kind = REQUEST_TYPES[request.kind][len(request.data) > MAX_FRAME_DATA]
     can_id = CanId(kind, request.id, source, destination).pack()
     return [CanFrame(can_id, payload) for payload in segment(request.data)]
 
 
 def encode_reply_frames(reply: Reply, source: int) -> list[CanFrame]:
-    """Return the frames of a reply from the device at `source` to `reply.destination`.
-
-    Unsolicited telemetry of up to 8 bytes is one frame of the type `last`; longer telemetry is sent as first,
-    body and last frames, each with the counter. Burst packets are segmented telemetry with the burst's ID.
-    Public sources confirm the three types, but not the layout of these messages or of bursts,
-    which is our own choice.
-    """
+    """Return the frames of a reply from the device at `source` to `reply.destination`."""
     if reply.kind is ReplyKind.ECHO:
         raise ProtocolError("CAN has no echo messages")
     if reply.id is None:
         raise ProtocolError(f"a {reply.kind.value} on CAN needs an ID")
-    long = len(reply.data) > MAX_FRAME_DATA
-    match reply.kind:
-        case ReplyKind.ACK:
-            kinds, payloads = [MessageType.TELECOMMAND_ACK], [b""]
-        case ReplyKind.NACK:
-            telemetry = reply.id >= FIRST_TELEMETRY_ID
-            kinds = [MessageType.TELEMETRY_NACK if telemetry else MessageType.TELECOMMAND_NACK]
-            payloads = [bytes((int(reply.code),))]
-        case ReplyKind.UNSOLICITED:
-            payloads = segment(reply.data)
-            kinds = [MessageType.UNSOLICITED_BODY] * len(payloads)
-            kinds[0], kinds[-1] = MessageType.UNSOLICITED_FIRST, MessageType.UNSOLICITED_LAST
-        case ReplyKind.EVENT:
-            if long:
-                raise ProtocolError(f"event {reply.id} of {len(reply.data)} bytes does not fit one CAN frame")
-            kinds, payloads = [MessageType.EVENT], [reply.data]
-        case _:
-            payloads = segment(reply.data)
-            kind = MessageType.TELEMETRY_EXTENDED if long else MessageType.TELEMETRY
-            kinds = [kind] * len(payloads)
+    if reply.kind is ReplyKind.NACK:
+        types: Sequence[MessageType] = (nack_type(reply.id),)
+        payloads = [bytes((int(reply.code),))]
+    else:
+        types = REPLY_TYPES[reply.kind]
+        payloads = segment(b"" if reply.kind is ReplyKind.ACK else reply.data)
+    single, *segments = types
+    kinds = [single]
+    if len(payloads) > 1:
+        if not segments:
+            raise ProtocolError(
+                f"{reply.kind.value} {reply.id} of {len(reply.data)} bytes does not fit one CAN frame"
+            )
+        first, middle, last = segments
+        kinds = [first, *[middle] * (len(payloads) - 2), last]
     return [
         CanFrame(CanId(kind, reply.id, source, reply.destination).pack(), payload)
         for kind, payload in zip(kinds, payloads, strict=True)
@@ -361,14 +377,14 @@ class CanDeviceReceiver(_Receiver[Request]):
                 )
 
 
-_REPLY_TYPES: Final[dict[int, ReplyKind]] = {
+_SINGLE_FRAMES: Final[dict[int, ReplyKind]] = {
     MessageType.TELECOMMAND_ACK: ReplyKind.ACK,
     MessageType.TELECOMMAND_NACK: ReplyKind.NACK,
     MessageType.TELEMETRY_NACK: ReplyKind.NACK,
     MessageType.TELEMETRY: ReplyKind.TELEMETRY,
     MessageType.EVENT: ReplyKind.EVENT,
 }
-"""Replies that fit one frame."""
+"""Type → kind of the replies of which one frame is all."""
 
 
 class CanHostReceiver(_Receiver[Reply]):
@@ -394,7 +410,7 @@ class CanHostReceiver(_Receiver[Reply]):
 
     def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Reply | LinkFault]:
         match can_id.type:
-            case number if number in _REPLY_TYPES:
+            case number if number in _SINGLE_FRAMES:
                 yield self._single(can_id, frame)
             case MessageType.TELEMETRY_EXTENDED:
                 kind = ReplyKind.BURST if can_id.id == BURST_ID else ReplyKind.TELEMETRY
@@ -408,7 +424,7 @@ class CanHostReceiver(_Receiver[Reply]):
 
     @staticmethod
     def _single(can_id: CanId, frame: CanFrame) -> Reply | LinkFault:
-        kind = _REPLY_TYPES[can_id.type]
+        kind = _SINGLE_FRAMES[can_id.type]
         if kind is not ReplyKind.NACK:
             return Reply(kind, can_id.id, frame.data, source=can_id.source)
         if not frame.data:

@@ -9,17 +9,30 @@ from __future__ import annotations
 
 import binascii
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Generic, TypeVar
+from typing import Final, Generic, TypeVar, assert_never
 
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.link_schema import DelimitedFraming, EscapedFraming, SlipFraming
+from starhil.protocol.link_schema import (
+    CubeSpaceFraming,
+    CustomFraming,
+    DelimitedFraming,
+    EscapedFraming,
+    FixedFraming,
+    FramingModel,
+    LengthFraming,
+    SlipFraming,
+)
 from starhil.protocol.messages import FaultKind, LinkFault, check_receiver_limits
+from starhil.protocol.plugin import guarded
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
+
+CUBESPACE: Final = EscapedFraming(kind="escaped", escape=0x1F, start=0x7F, end=0xFF)
+"""Marks of CubeSpace's requests, and of its replies of generation 1."""
 
 
 class BodySizeError(ProtocolError):
@@ -221,14 +234,26 @@ class Escaped(Framing):
 
     escape start   body, escape doubled   escape end
       10     02    48 10 10 99              10    03
+
+    Parameters
+    ----------
+    starts
+        Bytes that start a message, if there are several; the body then begins with one of them.
+    first_is_id
+        Whether a body begins with an ID. An ID that is the escape byte is ambiguous in practice: some senders double
+        it, others do not. Both forms are read as that ID, unless the bytes are a start or an end.
     """
 
-    def __init__(self, model: EscapedFraming) -> None:
+    def __init__(
+        self, model: EscapedFraming, starts: frozenset[int] = frozenset(), *, first_is_id: bool = False
+    ) -> None:
         if len({model.escape, model.start, model.end}) < 3:
             raise IcdError("link.serial.framing: escape, start and end must differ")
         self.escape = bytes((model.escape,))
-        self.start = bytes((model.escape, model.start))
+        self.start = self.escape if starts else bytes((model.escape, model.start))
         self.end = bytes((model.escape, model.end))
+        self.starts = starts
+        self.first_is_id = first_is_id
 
     def encode(self, body: bytes) -> bytes:
         """Return start, the body with its escape bytes doubled, and end."""
@@ -256,33 +281,18 @@ class EscapedDeframer(Deframer[_Message]):
     """Finds bodies between starts and ends; each run of junk yields one fault.
 
     A run of junk ends at the next start of a message or after a silence of the timeout.
-
-    Parameters
-    ----------
-    starts
-        Bytes that start a message, if there are several; the body then begins with the one that was found.
-    first_is_id
-        Whether a body begins with an ID. An ID that is the escape byte is ambiguous in practice: some senders double
-        it, others do not. Both forms are read as that ID, unless the bytes are a start or an end.
     """
 
-    def __init__(
-        self,
-        receiving: Receiving[_Message],
-        framing: Escaped,
-        starts: frozenset[int] = frozenset(),
-        *,
-        first_is_id: bool = False,
-    ) -> None:
+    def __init__(self, receiving: Receiving[_Message], framing: Escaped) -> None:
         check_receiver_limits(receiving.max_size, receiving.timeout_s)
         self._interpret = receiving.interpret
         self._max_size = receiving.max_size
         self._timeout_s = receiving.timeout_s
-        self._several = bool(starts)
-        self._starts = starts or frozenset(framing.start[1:])
+        self._several = bool(framing.starts)
+        self._starts = framing.starts or frozenset(framing.start[1:])
         self._escape = framing.escape[0]
         self._end = framing.end[1]
-        self._first_is_id = first_is_id
+        self._first_is_id = framing.first_is_id
         self._state = _State.IDLE
         self._start = 0
         self._body = bytearray()
@@ -612,3 +622,50 @@ class _DelimitedDeframer(_Collector[_Message]):
         self._text.clear()
         self._skipping = False
         return size
+
+
+class _PluginFraming(Framing):
+    """A framing of a plugin, whose failures are raised as an IcdError of one line."""
+
+    def __init__(self, name: str, framing: object) -> None:
+        if not isinstance(framing, Framing):
+            raise IcdError(f"framing {name} must be a class derived from starhil.protocol.framings.Framing")
+        self._name = name
+        self._framing = framing
+        self.start, self.end = framing.start, framing.end
+
+    def encode(self, body: bytes) -> bytes:
+        line: object = guarded(f"framing {self._name}", self._framing.encode)(body)
+        if not isinstance(line, bytes):
+            raise IcdError(f"framing {self._name} must encode to bytes, not {type(line).__name__}")
+        return line
+
+    def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
+        made: object = guarded(f"framing {self._name}", self._framing.deframer)(receiving)
+        if not isinstance(made, Deframer):
+            raise IcdError(f"framing {self._name} must make a Deframer, not {type(made).__name__}")
+        return made
+
+
+def build_framing(model: FramingModel, custom: Mapping[str, Callable[[], object]] | None = None) -> Framing:
+    """Return the framing that a definition selects; `custom` holds the plugin's framings by name.
+
+    Raises IcdError.
+    """
+    match model:
+        case EscapedFraming():
+            return Escaped(model)
+        case SlipFraming():
+            return Slip(model)
+        case LengthFraming() | FixedFraming():
+            return Counted(model.start, model.end)
+        case DelimitedFraming():
+            return Delimited(model)
+        case CustomFraming():
+            if custom is None or model.name not in custom:
+                raise IcdError(f"link.serial.framing: the plugin has no framing named {model.name!r}")
+            return _PluginFraming(model.name, custom[model.name]())
+        case CubeSpaceFraming():
+            return Escaped(CUBESPACE, first_is_id=True)
+        case _:
+            assert_never(model)

@@ -1,44 +1,606 @@
-"""The serial link of a unit according to its definition, sans-I/O.
+"""Both ends of the serial link that a unit defines, sans-I/O: bytes in, requests, replies and faults out.
 
-A link is composed of a framing (`framings`), a check (`checks`) and headers (`envelope`) in `composed_stack`. The
-framing `cubespace` has three dialects of replies and so a stack of its own (`cubespace_serial`).
+::
+
+    start   header: fields by role   data of the row   check   end
+            └──────────────── body ─────────────────────────┘
+
+A link is composed of a framing, which marks where a body begins and ends (`framings`), a check (`checks`), a header of
+requests and one or several of replies (`envelope`). In most units all replies have one header, whose roles tell what
+they are. In the dialects of CubeSpace each kind of reply has its own (`cubespace`), and the kind follows from the
+start byte, the row, and the size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final, TypeVar
 
-from starhil.protocol.checks import CheckFunction
+from starhil.protocol import cubespace
+from starhil.protocol.checks import CheckFunction, build_check
 from starhil.protocol.codec import Row
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.conventions import Order
-from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.link_schema import CubeSpaceFraming, MessageClass, SerialLinkModel
-from starhil.protocol.messages import RequestKind
-from starhil.protocol.serial_interface import Dialect, RowShape, SerialStack
+from starhil.protocol.envelope import Envelope, Header, HeaderError
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.framings import (
+    CUBESPACE,
+    BodySizeError,
+    Deframer,
+    Escaped,
+    Framing,
+    Receiving,
+    build_framing,
+)
+from starhil.protocol.link_schema import (
+    CubeSpaceFraming,
+    FixedFraming,
+    HeaderFieldModel,
+    LengthFraming,
+    MessageClass,
+    SerialLinkModel,
+)
+from starhil.protocol.messages import (
+    BURST_ID,
+    DEFAULT_MAX_SIZE,
+    FIRST_TELEMETRY_ID,
+    ErrorCode,
+    FaultKind,
+    LinkFault,
+    Reply,
+    ReplyKind,
+    Request,
+    RequestKind,
+    error_code,
+)
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import IcdError
 
+_Message = TypeVar("_Message")
 
-def build_stack(
-    link: SerialLinkModel,
-    classes: Sequence[MessageClass] = (),
-    rows: Sequence[RowShape] = (),
-    byte_order: Order = "little",
-    *,
-    framings: Mapping[str, Callable[[], object]] | None = None,
-    checks: Mapping[str, CheckFunction] | None = None,
-) -> SerialStack:
-    """Return the serial link of a unit.
+_UNASKED: Final = (ReplyKind.UNSOLICITED, ReplyKind.EVENT, ReplyKind.BURST)
+"""Kinds of messages that are not the reply to the pending request."""
 
-    Raises
-    ------
-    IcdError
-        Parts of the link are incompatible.
+
+@dataclass(frozen=True, slots=True)
+class RowShape:
+    """The properties of a row on which a link depends: kind, sizes and answers."""
+
+    klass: str
+    id: int
+    kind: RequestKind
+    request_size: int = 0
+    """Number of data bytes in the request."""
+    reply_size: int = 0
+    """Number of data bytes in the reply."""
+    answers: tuple[str, ...] = ("reply",)
+    """`echo` and `reply`, in the order in which the device sends them."""
+
+
+@dataclass
+class _Classes:
+    """The classes of a unit by code and by name."""
+
+    classes: Sequence[MessageClass]
+    by_name: dict[str, MessageClass] = field(init=False)
+    requests: dict[int, str] = field(init=False)
+    replies: dict[int, str] = field(init=False)
+    _unsolicited: set[int] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.by_name = {item.name: item for item in self.classes}
+        coded = [item for item in self.classes if item.code is not None]
+        self.requests = {item.code: item.name for item in coded if item.code is not None}
+        self.replies = {}
+        self._unsolicited = set()
+        for item in coded:
+            self.replies[self.reply_code(item.name, unsolicited=False)] = item.name
+            if item.unsolicited is not None:
+                self.replies[item.unsolicited] = item.name
+                self._unsolicited.add(item.unsolicited)
+
+    def unsolicited(self, code: int | None) -> bool:
+        return code in self._unsolicited
+
+    def request_code(self, name: str) -> int:
+        return self._coded(name).code or 0
+
+    def reply_code(self, name: str, *, unsolicited: bool) -> int:
+        item = self._coded(name)
+        reply = item.code if item.reply is None else item.reply
+        return (item.unsolicited if unsolicited and item.unsolicited is not None else reply) or 0
+
+    def _coded(self, name: str) -> MessageClass:
+        item = self.by_name.get(name)
+        if item is None or item.code is None:
+            raise ProtocolError(f"class {name!r} has no code on this link")
+        return item
+
+
+@dataclass(frozen=True)
+class ReplyFormat:
+    """The framing of the replies of a link or of one of its dialects, and the header of each kind of reply."""
+
+    framing: Framing
+    headers: Mapping[ReplyKind, Header]
+
+
+class SerialStack:
+    """The serial link of a unit.
+
+    Parameters
+    ----------
+    link
+        `[link.serial]`.
+    classes
+        Classes of the rows.
+    rows
+        Kind, sizes and answers of the rows.
+    byte_order
+        Byte order of the unit.
+    framings, checks
+        Framings, as classes, and checks defined by the unit's plugin, by name.
+
+    Attributes
+    ----------
+    dialects
+        The dialects of replies; empty if the unit has only one format. A dialect that is not given is the
+        unit's only one, otherwise b.
     """
-    if isinstance(link.framing, CubeSpaceFraming):
-        return CubeSpaceStack(link, rows)
-    return ComposedStack(link, classes, rows, byte_order, framings=framings, checks=checks)
+
+    def __init__(
+        self,
+        link: SerialLinkModel,
+        classes: Sequence[MessageClass] = (),
+        rows: Sequence[RowShape] = (),
+        byte_order: Order = "little",
+        *,
+        framings: Mapping[str, Callable[[], object]] | None = None,
+        checks: Mapping[str, CheckFunction] | None = None,
+    ) -> None:
+        self.baud: Final = link.baud
+        self.link: Final = link
+        self.framing: Final = build_framing(link.framing, framings)
+        self.check: Final = build_check(link.check, byte_order, checks)
+        self.classes: Final = _Classes(classes)
+        self.rows: Final = tuple(rows)
+        self.byte_order: Final = byte_order
+        self.dialects: Final = dialects_of(link)
+        self._silent = {row.id for row in rows if not row.answers}
+        self._rows = {(row.klass, row.id): row for row in rows}
+        self._rows_by_id: dict[int, RowShape] = {}
+        for row in rows:
+            self._rows_by_id.setdefault(row.id, row)
+        self._overhead = {
+            "start": len(self.framing.start),
+            "check": self.check.size,
+            "end": len(self.framing.end),
+        }
+        self.request_header: Final = self._header(
+            "request_header", cubespace.REQUEST_HEADER if self.dialects else link.request_header
+        )
+        self._formats: Final[Mapping[Dialect | None, ReplyFormat]] = (
+            {dialect: self._dialect(dialect) for dialect in self.dialects}
+            if self.dialects
+            else {None: self._one_format()}
+        )
+        self.reply_header: Final = self.format().headers[ReplyKind.NACK]
+        self._check_headers()
+        longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)
+        header = max(
+            head.size(name)
+            for head in (self.request_header, self.reply_header)
+            for name in ("", *self.classes.by_name)
+        )
+        self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest + header + self.check.size)
+
+    def _header(self, name: str, models: Sequence[HeaderFieldModel]) -> Header:
+        codes = self.classes.requests if name == "request_header" else self.classes.replies
+        return Header(models, self.byte_order, codes, self._overhead, f"link.serial.{name}")
+
+    def _one_format(self) -> ReplyFormat:
+        header = self._header("reply_header", self.link.reply_header)
+        return ReplyFormat(self.framing, dict.fromkeys(set(ReplyKind) - {ReplyKind.ECHO}, header))
+
+    def _dialect(self, dialect: Dialect) -> ReplyFormat:
+        headers = {
+            kind: self._header(kind.value, models) for kind, models in cubespace.REPLIES[dialect].items()
+        }
+        constants = (field.const for header in headers.values() for field in header.fields)
+        starts = frozenset(constant for constant in constants if constant is not None)
+        has_id = "id" in headers[ReplyKind.TELEMETRY].roles
+        return ReplyFormat(Escaped(CUBESPACE, starts, first_is_id=has_id), headers)
+
+    def format(self, dialect: Dialect | None = None) -> ReplyFormat:
+        """Return the format of the replies."""
+        return self._formats[self._chosen(dialect)]
+
+    def _chosen(self, dialect: Dialect | None) -> Dialect | None:
+        return dialect if dialect in self.dialects else default_dialect(self.dialects)
+
+    def _check_headers(self) -> None:
+        for where, header in (("request", self.request_header), ("reply", self.reply_header)):
+            for name in {name for item in header.fields for name in item.classes or ()}:
+                if name not in self.classes.by_name:
+                    known = ", ".join(self.classes.by_name) or "none"
+                    raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
+            if isinstance(self.link.framing, LengthFraming) and "length" not in header.roles:
+                raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
+        if "id" not in self.request_header.roles:
+            raise IcdError("link.serial.request_header: needs a field with role id")
+        for role in ("source", "destination"):
+            header, other = (
+                (self.reply_header, "reply") if role == "source" else (self.request_header, "request")
+            )
+            if role in header.roles:
+                raise IcdError(f"link.serial.{other}_header: role {role} belongs to the other direction")
+
+    def row(self, klass: str, row_id: int) -> RowShape | None:
+        """Return the row of a message; the class matters only if the link carries one."""
+        if "class" in self.request_header.roles:
+            return self._rows.get((klass, row_id))
+        return self._rows.get((klass, row_id)) or self._rows_by_id.get(row_id)
+
+    def supports_unsolicited(self, dialect: Dialect | None = None) -> bool:
+        """Return whether this dialect has unsolicited telemetry."""
+        return ReplyKind.UNSOLICITED in self.format(dialect).headers
+
+    def device(self) -> Deframer[Request]:
+        """Return a receiver for the device's end."""
+        return self.framing.deframer(self.receiving(self._request_of, self._request_size))
+
+    def host(self, dialect: Dialect | None = None) -> HostReceiver:
+        """Return a receiver for the OBC's end."""
+        return HostReceiver(self, self.format(dialect))
+
+    def receiving(
+        self,
+        interpret: Callable[[bytes], _Message | LinkFault | None],
+        measure: Callable[[bytes], int | None],
+    ) -> Receiving[_Message]:
+        """Return how a deframer handles bodies: `measure` returns the size of one, `interpret` its message."""
+        return Receiving(interpret, measure, self.max_size, self.link.timeout)
+
+    def encode_request(self, request: Request) -> bytes:
+        """Return a request as bytes on the line."""
+        return self.framing.encode(self.request_body(request))
+
+    def request_body(self, request: Request) -> bytes:
+        """Return header, data and check of a request."""
+        values = {"id": request.id, "sequence": request.sequence}
+        if request.source:
+            values["source"] = request.source
+        if request.flags:
+            values["flags"] = request.flags
+        if "class" in self.request_header.roles:
+            values["class"] = self.classes.request_code(request.klass)
+        return self.close(self.request_header.pack(values, request.klass, len(request.data)), request.data)
+
+    def encode_reply(self, reply: Reply, dialect: Dialect | None = None) -> bytes:
+        """Return a reply as bytes on the line; empty for a refusal that the unit's header cannot express.
+
+        Raises ProtocolError for a kind of reply that the dialect does not have.
+        """
+        form = self.format(dialect)
+        if self.dialects:
+            if reply.kind not in form.headers:
+                raise ProtocolError(_no_such_reply(reply.kind, self._chosen(dialect)))
+            if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) and reply.id in self._silent:
+                return b""
+        elif reply.kind is ReplyKind.ECHO:
+            echo = Request(
+                RequestKind.TELECOMMAND, reply.id or 0, reply.data, reply.destination, reply.klass, reply.sequence,
+                reply.flags,
+            )  # fmt: skip
+            return self.encode_request(echo)
+        refused = reply.kind is ReplyKind.NACK
+        header = form.headers[reply.kind]
+        if refused and not header.roles_in(reply.klass) & {"status", "ack"}:
+            return b""
+        values = {
+            "id": reply.id or 0,
+            "destination": reply.destination,
+            "sequence": reply.sequence,
+            "status": int(reply.code),
+            "ack": int(not refused),
+            "final": int(reply.final),
+        }
+        if reply.flags:
+            values["flags"] = reply.flags
+        for role, nanoseconds in (("ticks", reply.uptime_ns), ("time", reply.time_ns)):
+            if role in header.roles:
+                values[role] = nanoseconds // header.count_ns(role)
+        if "class" in header.roles:
+            values["class"] = self.classes.reply_code(
+                reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
+            )
+        data = b"" if refused or (self.dialects and reply.kind is ReplyKind.ACK) else reply.data
+        return form.framing.encode(self.close(header.pack(values, reply.klass, len(data)), data))
+
+    def close(self, header: bytes, data: bytes) -> bytes:
+        """Return header, data and check of a message."""
+        return header + data + self.check.compute(self._covered(header, data))
+
+    def _covered(self, header: bytes, data: bytes) -> bytes:
+        covers = self.check.covers
+        return (
+            (self.framing.start if "start" in covers else b"")
+            + (header if "header" in covers else b"")
+            + (data if "data" in covers else b"")
+        )
+
+    def open(self, header: Header, body: bytes) -> tuple[Envelope, bytes] | LinkFault:
+        """Return header and data of a body, or its fault."""
+        end = len(body) - self.check.size
+        try:
+            envelope = header.unpack(body[: max(end, 0)])
+        except HeaderError as error:
+            if {"header", "data"} <= self.check.covers and not self._checks(body, 0, end):
+                return self._bad_check(body[end:])
+            return LinkFault(FaultKind.UART_PROTOCOL, str(error))
+        if envelope is None:
+            return LinkFault(
+                FaultKind.UART_PROTOCOL, f"message of {len(body)} bytes is shorter than its header"
+            )
+        if not self._checks(body, envelope.size, end):
+            return self._bad_check(body[end:])
+        address = envelope.values.get("address")
+        own = header.defaults.get("address")
+        if address is not None and address != own:
+            return LinkFault(FaultKind.UART_ADDRESS, f"message to address {address:#04x}, not {own:#04x}")
+        found = end - envelope.size
+        if "length" in header.roles and envelope.values["length"] != header.length(envelope.size, found):
+            text = f"{found} bytes of data, but length {envelope.values['length']}"
+            return LinkFault(FaultKind.UART_PROTOCOL, text)
+        return envelope, body[envelope.size : end]
+
+    def _checks(self, body: bytes, header_size: int, end: int) -> bool:
+        covered = self._covered(body[:header_size], body[header_size:end])
+        return self.check.compute(covered) == body[end:]
+
+    @staticmethod
+    def _bad_check(check: bytes) -> LinkFault:
+        return LinkFault(FaultKind.UART_CHECK, f"check {check.hex().upper()} is wrong")
+
+    def _request_of(self, body: bytes) -> Request | LinkFault:
+        opened = self.open(self.request_header, body)
+        if isinstance(opened, LinkFault):
+            return opened
+        envelope, data = opened
+        values = envelope.values
+        row = self.row(envelope.klass, values["id"])
+        klass = envelope.klass or (row.klass if row is not None else "")
+        return Request(
+            self.kind_of(values["id"], klass) or RequestKind.TELECOMMAND,
+            values["id"],
+            data,
+            values.get("source", 0),
+            klass,
+            values.get("sequence", 0),
+            values.get("flags", 0),
+        )
+
+    def kind_of(self, row_id: int, klass: str = "") -> RequestKind | None:
+        """Return the kind of a row, which need not exist; None if it is unknown."""
+        if self.dialects:
+            return RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
+        item = self.classes.by_name.get(klass)
+        row = self.row(klass, row_id)
+        return item.kind if item is not None else row.kind if row is not None else None
+
+    def _request_size(self, body: bytes) -> int | None:
+        """Return the size of a request that begins with these bytes, or None if more are needed."""
+        framing = self.link.framing
+        if isinstance(framing, FixedFraming) and framing.request_size is not None:
+            return framing.request_size
+        return self.measure(self.request_header, body, self._request_data_size)
+
+    def _request_data_size(self, envelope: Envelope) -> int:
+        row = self.row(envelope.klass, envelope.values["id"])
+        if row is None:
+            raise HeaderError(f"no row with id {envelope.values['id']}")
+        return row.request_size
+
+    def measure(self, header: Header, body: bytes, data_size: Callable[[Envelope], int]) -> int | None:
+        """Return the size of the body that begins with these bytes, or None if more are needed.
+
+        `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.
+        """
+        try:
+            envelope = header.unpack(body)
+            if envelope is None:
+                return None
+            data = header.data_size(envelope) if "length" in header.roles else data_size(envelope)
+        except HeaderError as error:
+            raise BodySizeError(str(error)) from None
+        return envelope.size + data + self.check.size
+
+
+class HostReceiver:
+    """The OBC's end: bytes in, replies and faults out.
+
+    Call `expect` before each request: some units' replies can be interpreted only with it. An echo of the request is
+    verified and consumed. For a telecommand without another answer it is reported as the ACK.
+    """
+
+    def __init__(self, stack: SerialStack, replies: ReplyFormat) -> None:
+        self._stack = stack
+        self._headers = replies.headers
+        self._deframer: Deframer[Reply] = replies.framing.deframer(
+            stack.receiving(self._reply_of, self._size)
+        )
+        self._pending: Request | None = None
+        self._reply_size: int | None = None
+        self._echo: bytes | None = None
+        self._only_echo = False
+
+    @property
+    def busy(self) -> bool:
+        """Whether a message is incomplete, so that `flush` may become due."""
+        return self._deframer.busy
+
+    def feed(self, data: bytes, now: float) -> list[Reply | LinkFault]:
+        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
+        return self._deframer.feed(data, now)
+
+    def flush(self, now: float) -> list[LinkFault]:
+        """Abandon an incomplete message after a silence of the timeout."""
+        return self._deframer.flush(now)
+
+    def expect(self, request: Request, reply_size: int) -> None:
+        """Set the next request, and the data size of its telemetry in bytes (0 for a telecommand)."""
+        row = self._stack.row(request.klass, request.id)
+        answers = row.answers if row is not None else ("reply",)
+        self._pending = request
+        self._reply_size = reply_size
+        self._echo = self._stack.request_body(request) if "echo" in answers else None
+        self._only_echo = "reply" not in answers
+
+    def _size(self, body: bytes) -> int | None:
+        """Return the size of the echo or reply that begins with these bytes, or None if more are needed."""
+        if self._echo is not None:
+            return len(self._echo)
+        return self._stack.measure(self._stack.reply_header, body, self._data_size)
+
+    def _data_size(self, envelope: Envelope) -> int:
+        values = envelope.values
+        if values.get("status", 0) or not values.get("ack", 1):
+            return 0
+        row = self._stack.row(envelope.klass, values["id"]) if "id" in values else None
+        if row is not None:
+            return row.reply_size
+        if self._pending is None or self._reply_size is None:
+            raise HeaderError("reply without a request")
+        return self._reply_size
+
+    def _reply_of(self, body: bytes) -> Reply | LinkFault | None:
+        if self._echo is not None:
+            return self._check_echo(body)
+        told = self._kind_in_dialect(body) if self._stack.dialects else ReplyKind.TELEMETRY
+        if isinstance(told, LinkFault):
+            return told
+        opened = self._stack.open(self._headers[told], body)
+        if isinstance(opened, LinkFault):
+            return opened
+        envelope, data = opened
+        values = envelope.values
+        pending = self._pending
+        row_id = values.get("id", None if pending is None else pending.id)
+        if row_id is None:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
+        klass = envelope.klass
+        if not klass and pending is not None and pending.id == row_id:
+            klass = pending.klass
+        kind = self._kind(told, envelope, klass, row_id)
+        if values.get("final", 1) and kind not in _UNASKED:
+            self._pending = None
+        return Reply(
+            kind,
+            row_id,
+            data,
+            error_code(values.get("status", 0)) if kind is ReplyKind.NACK else ErrorCode.OK,
+            source=values.get("address", 0),
+            destination=values.get("destination", 0),
+            klass=klass,
+            sequence=values.get("sequence", 0),
+            flags=values.get("flags", 0),
+            final=bool(values.get("final", 1)),
+            uptime_ns=self._nanoseconds("ticks", values),
+            time_ns=self._nanoseconds("time", values),
+        )
+
+    def _check_echo(self, body: bytes) -> Reply | LinkFault | None:
+        expected, self._echo = self._echo, None
+        pending = self._pending
+        if body != expected or pending is None:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"echo {body.hex().upper()} differs from the request")
+        if not self._only_echo:
+            return None
+        self._pending = None
+        return Reply(ReplyKind.ACK, pending.id, klass=pending.klass)
+
+    def _kind(self, told: ReplyKind, envelope: Envelope, klass: str, row_id: int) -> ReplyKind:
+        """Return the kind of a reply; `told` is the one that the dialect told, if the link has any."""
+        values, stack = envelope.values, self._stack
+        if values.get("status", 0) or not values.get("ack", 1):
+            return ReplyKind.NACK
+        if stack.dialects:
+            return told
+        if stack.classes.unsolicited(values.get("class")):
+            return ReplyKind.UNSOLICITED
+        telecommand = stack.kind_of(row_id, klass) is RequestKind.TELECOMMAND
+        return ReplyKind.ACK if telecommand else ReplyKind.TELEMETRY
+
+    def _kind_in_dialect(self, body: bytes) -> ReplyKind | LinkFault:
+        """Return the kind of a reply by its start byte, row and size; an ACK may be a NACK by its code."""
+        headers, pending = self._headers, self._pending
+        if self._is_burst(body):
+            return ReplyKind.BURST
+        kinds = [
+            kind for kind, header in headers.items() if kind is not ReplyKind.BURST and _begins(header, body)
+        ]
+        if not kinds:
+            text = f"message {body[1]} with the start byte of a request"
+            return LinkFault(FaultKind.UART_PROTOCOL, text)
+        roles = [field.role for field in headers[kinds[0]].fields]  # the others have the ID in the same place
+        if "id" in roles:
+            row_id = body[roles.index("id")]
+        elif pending is not None:
+            row_id = pending.id
+        else:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
+        if ReplyKind.ACK not in kinds:
+            (kind,) = kinds  # the start byte tells it
+        elif self._stack.kind_of(row_id) is RequestKind.TELECOMMAND:
+            kind = ReplyKind.ACK
+        else:
+            known = pending is not None and pending.id == row_id
+            coded = ReplyKind.NACK in kinds and len(body) == headers[ReplyKind.NACK].size("")
+            refused = coded and known and self._reply_size != 1
+            kind = ReplyKind.NACK if refused else ReplyKind.TELEMETRY
+        codes = len(body) - headers[kind].size("") + 1
+        if "status" in headers[kind].roles and codes != 1:
+            name = "ACK of telecommand" if kind is ReplyKind.ACK else "NACK of"
+            return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
+        return kind
+
+    def _is_burst(self, body: bytes) -> bool:
+        header = self._headers[ReplyKind.BURST]
+        if len(body) != header.size("") + cubespace.BURST_SIZE or not _begins(header, body):
+            return False
+        if body[header.size("") - 1] != BURST_ID:
+            return False
+        if "id" in self._headers[ReplyKind.TELEMETRY].roles or self._pending is None:
+            return True
+        return self._pending.kind is RequestKind.TELECOMMAND or self._reply_size != len(body)
+
+    def _nanoseconds(self, role: str, values: Mapping[str, int]) -> int:
+        return values[role] * self._stack.reply_header.count_ns(role) if role in values else 0
+
+
+def _begins(header: Header, body: bytes) -> bool:
+    """Return whether a body has the constant, if any, with which a header begins."""
+    constant = header.fields[0].const if header.fields else None
+    return constant in (None, body[0])
+
+
+def _no_such_reply(kind: ReplyKind, dialect: Dialect | None) -> str:
+    others = [other for other, replies in cubespace.REPLIES.items() if kind in replies]
+    remedy = f"; use dialect {' or '.join(others)}" if others else ""
+    return f"serial dialect {dialect} has no {kind.value} messages{remedy}"
+
+
+def dialects_of(link: SerialLinkModel | None) -> tuple[Dialect, ...]:
+    """Return the dialects of replies of a link."""
+    if link is None or not isinstance(link.framing, CubeSpaceFraming):
+        return ()
+    return tuple(Dialect) if link.framing.dialect is None else (Dialect(link.framing.dialect),)
+
+
+def default_dialect(dialects: Sequence[Dialect]) -> Dialect | None:
+    """Return the dialect that is used if none is selected."""
+    return dialects[0] if len(dialects) == 1 else Dialect.B if dialects else None
 
 
 def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | None:
@@ -56,14 +618,12 @@ def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | No
     IcdError
         The unit does not have this dialect.
     """
-    framing = None if icd.link.serial is None else icd.link.serial.framing
-    if not isinstance(framing, CubeSpaceFraming):
-        if wanted is not None:
-            raise IcdError(f"unit {icd.name} has no reply dialects; do not select one")
-        return None
-    if framing.dialect is not None and wanted not in (None, framing.dialect):
-        raise IcdError(f"unit {icd.name} has only dialect {framing.dialect}; do not select another")
-    return Dialect(framing.dialect or wanted or Dialect.B)
+    dialects = dialects_of(icd.link.serial)
+    if not dialects and wanted is not None:
+        raise IcdError(f"unit {icd.name} has no reply dialects; do not select one")
+    if len(dialects) == 1 and wanted not in (None, dialects[0]):
+        raise IcdError(f"unit {icd.name} has only dialect {dialects[0]}; do not select another")
+    return default_dialect(dialects) if wanted is None else Dialect(wanted)
 
 
 def serial_answers(icd: InterfaceDefinition, row: Row) -> tuple[str, ...]:
@@ -95,7 +655,7 @@ def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
         )
         for row in icd.rows
     ]
-    return build_stack(
+    return SerialStack(
         link,
         icd.classes,
         shapes,

@@ -9,8 +9,6 @@ from pathlib import Path
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.codec import Row
-from starhil.protocol.composed_stack import ComposedStack
-from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import read_definition
@@ -18,8 +16,7 @@ from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
-from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import build_serial_stack, serial_answers
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect, serial_answers
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
@@ -60,9 +57,9 @@ def _on_serial(
     icd: InterfaceDefinition, stack: SerialStack, row: Row, values: Mapping[str, Value]
 ) -> Exchange:
     request, replies = _messages(icd, row, values, serial_answers(icd, row))
-    if isinstance(stack, ComposedStack):
-        _check_framing(stack, row, request)
-    link = "serial, dialect b" if isinstance(stack, CubeSpaceStack) else "serial"
+    _check_framing(stack, row, request)
+    dialect = chosen_dialect(icd, None)
+    link = "serial" if dialect is None else f"serial, dialect {dialect}"
     answers = tuple(_hex(data) for reply in replies if (data := stack.encode_reply(reply)))
     return Exchange(row, link, (_hex(stack.encode_request(request)),), answers, values)
 
@@ -129,7 +126,7 @@ def _reply(
     return Reply(ReplyKind.TELEMETRY, named.id, data, klass=named.klass)
 
 
-def _check_framing(stack: ComposedStack, row: Row, request: Request) -> None:
+def _check_framing(stack: SerialStack, row: Row, request: Request) -> None:
     """Raise IcdError if the device's end does not receive the request that the OBC's end sends."""
     framing = stack.link.framing
     name = f"framing {framing.name if isinstance(framing, CustomFraming) else framing.kind}"

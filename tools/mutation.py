@@ -30,7 +30,9 @@ import pytest
 
 ROOT = Path(__file__).parent.parent
 OUT = ROOT / "out" / "mutation"
-CODECS = "checks codec framings composed_stack envelope cubespace_serial can_framing flow socketcand candump image_transfer values"
+CODECS = (
+    "checks codec framings serial_stack envelope can_framing flow socketcand candump image_transfer values"
+)
 GROUPS = {
     "emulator/device": [
         "tests/emulator/device",

@@ -28,8 +28,8 @@ from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect, HostEnd
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
 
 KEPT_ITEMS: Final = 20_000
 """Number of items kept for export."""
@@ -155,7 +155,7 @@ class Decoder:
         self._dialect = dialect
         self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
         self._to_device = self._stack.device() if self._stack is not None else None
-        self._from_device: tuple[Dialect | None, HostEnd] | None = None
+        self._from_device: tuple[Dialect | None, HostReceiver] | None = None
         self._can: dict[tuple[bool, int], CanDeviceReceiver | CanHostReceiver] = {}
 
     def line(self, entry: WireItem) -> dict[str, Any]:

@@ -8,7 +8,6 @@ from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
-from starhil.protocol.cubespace_serial import CubeSpaceStack
 from starhil.protocol.messages import Reply, Request
 from starhil.protocol.serial_interface import Dialect, Receiver
 from starhil.protocol.serial_stack import build_serial_stack
@@ -68,9 +67,9 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
     @property
     def dialect(self) -> Dialect | None:
         """The current dialect of replies; None for a unit without dialects."""
-        if not isinstance(self._stack, CubeSpaceStack):
-            return None
-        return self._stack.dialect or Dialect(str(self._device.parameters["serial_dialect"]))
+        if len(self._stack.dialects) < 2:
+            return next(iter(self._stack.dialects), None)
+        return Dialect(str(self._device.parameters["serial_dialect"]))
 
     def _reply_style(self) -> Dialect | None:
         return self.dialect

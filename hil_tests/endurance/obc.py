@@ -20,7 +20,6 @@ from starhil.hil_tests.errors import BenchError
 from starhil.protocol.can_framing import CanFrame, CanId
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.codec import Row
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import FixedFraming
@@ -98,7 +97,7 @@ class Obc:
     def _dialect(self) -> Dialect | None:
         only = chosen_dialect(self._icd, None)
         known = self._oracle.values.get("serial_dialect")
-        if only is None or known is None or getattr(self._stack, "dialect", None) is not None:
+        if only is None or known is None or self._stack is None or len(self._stack.dialects) < 2:
             return only
         return Dialect(str(known[0]))
 
@@ -319,7 +318,7 @@ class Obc:
         self._oracle.read(other, reply.data)
 
     def _same_code(self, link: str, nack: Reply, verdict: ErrorCode) -> bool:
-        composed = self._stack if link == "serial" and isinstance(self._stack, ComposedStack) else None
+        composed = self._stack if link == "serial" else None
         if composed is not None and "status" not in composed.reply_header.roles:
             return True  # a refusal has no code
         if link == "canopen":
@@ -327,7 +326,7 @@ class Obc:
         return int(nack.code) == int(self._icd.error_number(verdict))
 
     def _can_refuse(self, link: str, klass: str) -> bool:
-        if link != "serial" or not isinstance(self._stack, ComposedStack):
+        if link != "serial" or self._stack is None:
             return True
         return bool(self._stack.reply_header.roles_in(klass) & {"status", "ack"})
 

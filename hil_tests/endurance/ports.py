@@ -12,7 +12,8 @@ from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, row_transfer
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect, SerialStack
+from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import SerialStack
 
 HOST: Final = 1
 """CAN address of the OBC."""

@@ -1,16 +1,20 @@
-"""The object dictionary of a device, built from communication profile and interface definition."""
+"""The object dictionary of a device, built from communication profile and interface definition.
+
+`placements` derives from the definition, as data, what each entry of an application object reads and what a write to it
+does. `DeviceDictionary` connects this to the device.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, NoReturn
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, abort_of
+from starhil.protocol.canopen.application import Application, StandInApplication, abort_of
 from starhil.protocol.canopen.communication import (
     MappedPdo,
     add_communication,
@@ -18,17 +22,11 @@ from starhil.protocol.canopen.communication import (
     set_limits,
     variable,
 )
-from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Writer, decode, encode, type_size
-from starhil.protocol.canopen_schema import (
-    CanopenModel,
-    PackedField,
-    PdoModel,
-    PlacedMember,
-    PlacedObject,
-)
+from starhil.protocol.canopen.dictionary import Deferred, Dictionary, decode, encode, type_size
+from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.values import IcdError, MessageError, Parameter, Value, to_f32
+from starhil.protocol.values import IcdError, MessageError, Parameter, to_f32
 
 DATA_TYPES: Final[dict[str, int]] = {
     "u8": datatypes.UNSIGNED8,
@@ -65,6 +63,201 @@ class Reading:
     packed: PackedField | None = None
 
 
+@dataclass(frozen=True)
+class Placement:
+    """An entry of an application object: at most one of `reading`, `parameter` and `image` tells what it reads."""
+
+    variable: ODVariable
+    names: Sequence[str] = ()
+    """Names in its object by which a PDO maps it."""
+    reading: Reading | None = None
+    parameter: Parameter | None = None
+    """Parameter that is read and set."""
+    image: tuple[str, str] | None = None
+    """Name of an image, and its attribute; a write to the entry `take` takes it."""
+    telecommand: Row | None = None
+    """Telecommand that a write executes."""
+    part: Slot | None = None
+    """Slot of the telecommand that is written; None for all of it."""
+
+    @property
+    def key(self) -> Key:
+        """Index and sub-index."""
+        return self.variable.index, self.variable.subindex
+
+
+# --- from the definition to entries ---
+
+
+def placements(icd: InterfaceDefinition, placed: PlacedObject) -> Iterator[Placement]:
+    """Yield the entries of an application object. Raises IcdError for an object that does not fit the rows."""
+    index = placed.index
+    if placed.requests:
+        for row in icd.rows:
+            yield _request(row, (index, row.id))
+    elif placed.telemetry is not None:
+        yield from _record(icd, placed, icd.telemetry[placed.telemetry])
+    elif placed.parameters:
+        for number, parameter in sorted(icd.parameters_by_id.items()):
+            yield _parameter(parameter.name, (index, number), parameter)
+    elif placed.image is not None:
+        yield from _image(index, placed.image)
+    elif placed.packed:
+        for subindex, model in enumerate(placed.packed, 1):
+            yield _packed(icd, model, (index, subindex))
+    elif placed.members:
+        subindex = 0
+        for member in placed.members:
+            subindex = subindex + 1 if member.subindex is None else member.subindex
+            yield _member(icd, member, (index, subindex))
+    else:
+        yield _value(icd, placed.name, (index, 0), placed.value, placed.telecommand, placed.type)
+
+
+def _request(row: Row, key: Key) -> Placement:
+    if row.kind == "telecommand":
+        return _command(row.name, key, row)
+    item = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
+    item.description = row.doc
+    return Placement(item, (row.name,), Reading(row))
+
+
+def _record(icd: InterfaceDefinition, placed: PlacedObject, row: Row) -> Iterator[Placement]:
+    """Yield an entry for each slot of a telemetry row; a write changes one value of the telecommand that it includes."""
+    command = None if placed.telecommand is None else icd.telecommands[placed.telecommand]
+    reported = {field.telecommand for field in row.named_fields.values()}
+    if command is not None and (reported != {command.name} or row.size != command.size):
+        raise IcdError(
+            f"canopen.toml: {placed.index:04X}h: telemetry {row.name} must include {command.name} alone"
+        )
+    for subindex, (slot, fields) in enumerate(_slots(row), 1):
+        names = [field.name for field in fields]
+        item = variable(
+            " ".join(names),
+            placed.index,
+            subindex,
+            DATA_TYPES[slot.type],
+            "ro" if command is None else "rw",
+            mappable=slot.type != "bytes",
+        )
+        _describe(item, fields)
+        yield Placement(item, names, Reading(row, slot, fields), telecommand=command, part=slot)
+
+
+def _value(
+    icd: InterfaceDefinition,
+    name: str,
+    key: Key,
+    value: str | None,
+    telecommand: str | None,
+    type_: str | None = None,
+) -> Placement:
+    """Return the entry that reads a field, executes a telecommand when written, or both."""
+    written = None if telecommand is None else _command(name, key, icd.telecommands[telecommand], type_)
+    if value is None and written is not None:
+        return written
+    row, slot, fields = _slot_of(icd, str(value))
+    data_type = datatypes.VISIBLE_STRING if fields[0].kind == "text" else DATA_TYPES[slot.type]
+    reading = Reading(row, slot, fields)
+    if written is None:
+        item = variable(name, *key, data_type, "ro", mappable=slot.type != "bytes")
+        _describe(item, fields)
+        return Placement(item, (name,), reading)
+    if written.variable.data_type != data_type:
+        raise IcdError(f"canopen.toml: {key[0]:04X}h: {value} and {telecommand} differ in type")
+    written.variable.access_type = "rw"
+    return replace(written, names=(name,), reading=reading)
+
+
+def _member(icd: InterfaceDefinition, model: PlacedMember, key: Key) -> Placement:
+    if model.domain is not None:
+        return Placement(variable(model.name, *key, datatypes.DOMAIN, model.domain), (model.name,))
+    if model.parameter is not None:
+        return _parameter(model.name, key, icd.parameters[model.parameter])
+    return replace(_value(icd, model.name, key, model.value, model.telecommand), names=(model.name,))
+
+
+def _parameter(name: str, key: Key, parameter: Parameter) -> Placement:
+    default = parameter.to_number(parameter.default)
+    whole = parameter.type not in {"f32", "f64"}
+    item = variable(
+        name, *key, DATA_TYPES[parameter.type], "rw", int(default) if whole else default, mappable=True
+    )
+    set_limits(item, *_representable_limits(parameter.type, parameter.minimum, parameter.maximum))
+    item.unit = parameter.unit
+    item.description = parameter.doc
+    if parameter.enum is not None:
+        item.value_descriptions = dict(parameter.enum.names)
+    return Placement(item, (name,), parameter=parameter)
+
+
+def _image(index: int, name: str) -> Iterator[Placement]:
+    parts = (
+        ("pixels", "pixels", datatypes.DOMAIN),
+        ("width", "width", datatypes.UNSIGNED16),
+        ("height", "height", datatypes.UNSIGNED16),
+        ("frame counter", "frame", datatypes.UNSIGNED32),
+    )
+    for subindex, (label, attribute, data_type) in enumerate(parts, 1):
+        item = variable(label, index, subindex, data_type, "ro")
+        if attribute == "pixels":
+            item.description = "8 bits a pixel, row by row from the top"
+        yield Placement(item, image=(name, attribute))
+    if name == "frame":
+        item = variable("take", index, len(parts) + 1, datatypes.UNSIGNED8, "wo", limits=(1, 1))
+        item.description = "write 1 to take the frame; the answer comes when it can be read"
+        yield Placement(item, image=(name, "take"))
+
+
+def _packed(icd: InterfaceDefinition, model: PackedField, key: Key) -> Placement:
+    row, slot, fields = _slot_of(icd, model.source)
+    name = model.name or model.source.partition(".")[2]
+    item = variable(name, *key, DATA_TYPES[model.type], "ro", mappable=True)
+    _describe(item, fields)
+    item.min = item.max = None
+    item.factor = model.scale
+    return Placement(item, (name,), Reading(row, slot, fields, model))
+
+
+def _command(name: str, key: Key, row: Row, type_: str | None = None) -> Placement:
+    """Return the entry whose write executes a telecommand.
+
+    The client writes the only field, all bytes (as a number if a type is given), or 1 if the telecommand has no data.
+    """
+    text = type_ is None and [field.kind for field in row.fields] == ["text"]
+    scalar = text or (type_ is None and len(row.slots) == 1 and row.slots[0].type != "bytes")
+    if type_ is not None:
+        if type_size(DATA_TYPES[type_]) != row.size:
+            raise IcdError(
+                f"canopen.toml: {key[0]:04X}h: {row.name} has {row.size} bytes, not the size of {type_}"
+            )
+        item = variable(name, *key, DATA_TYPES[type_], "wo", mappable=True)
+    elif row.size == 0:
+        item = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
+    elif text:
+        item = variable(name, *key, datatypes.VISIBLE_STRING, "wo")
+    elif scalar:
+        slot, fields = _slots(row)[0]
+        item = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
+        _describe(item, fields)
+    else:
+        item = variable(name, *key, datatypes.OCTET_STRING, "wo")
+    item.description = row.doc
+    return Placement(item, telecommand=row, part=row.slots[0] if scalar else None)
+
+
+def _slot_of(icd: InterfaceDefinition, reference: str) -> tuple[Row, Slot, list[Field]]:
+    row_name, _, field_name = reference.partition(".")
+    row = icd.telemetry[row_name]
+    if field_name not in row.named_fields:
+        raise IcdError(f"canopen.toml: telemetry {row_name} has no field {field_name!r}")
+    slot = row.named_fields[field_name].slot
+    return row, slot, [field for field in row.named_fields.values() if field.slot.index == slot.index]
+
+
+# --- entries of a running device ---
+
+
 class DeviceDictionary(Dictionary):
     """Object dictionary of a device, built from its interface definition.
 
@@ -96,27 +289,69 @@ class DeviceDictionary(Dictionary):
         self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
         self.parameters: dict[str, Key] = {}
-        self._readers: dict[Key, Callable[[], bytes]] = {}
-        self._writers: dict[Key, Writer] = {}
-        self._sizes: dict[Key, int] = {}
         self._names: dict[str, Key] = {}
         self._placed: dict[tuple[str, str, int | None], Key] = {}
         """Kind, name and slot of a row → key of its entry; the slot is None for the whole row."""
         self._cache: dict[str, bytes] = {}
         self._cached_at = -1
         objects = ObjectDictionary()  # type: ignore[no-untyped-call]
-        for placed in layout.object:
-            self._add_object(objects, placed)
+        entries = [item for placed in layout.object for item in self._place(objects, placed)]
         rpdos = [self._mapped(objects, model) for model in layout.rpdo]
         tpdos = [self._mapped(objects, model) for model in layout.tpdo]
         add_communication(objects, layout, rpdos, tpdos)
         super().__init__(objects)
-        for key, reader in self._readers.items():
-            self.entries[key].reader = reader
-        for key, writer in self._writers.items():
-            self.entries[key].writer = writer
-        for key, size in self._sizes.items():
-            self.entries[key].maximum_size = size
+        for item in entries:
+            self._connect(item)
+
+    def _place(self, objects: ObjectDictionary, placed: PlacedObject) -> list[Placement]:
+        """Add an object, and index its entries."""
+        if placed.index in objects.indices:
+            raise IcdError(f"canopen.toml: index {placed.index:04X}h is used twice")
+        items = list(placements(self.icd, placed))
+        for item in items:
+            for name in item.names:
+                self._names[f"{placed.index:04x}.{name.lower()}"] = item.key
+            self._index(item)
+        if items[0].key == (placed.index, 0):
+            self._names[f"{placed.index:04x}"] = items[0].key
+            objects.add_object(items[0].variable)
+        else:
+            add_record(objects, placed.name, [item.variable for item in items])
+        return items
+
+    def _index(self, item: Placement) -> None:
+        row, reading = item.telecommand, item.reading
+        if row is not None:
+            self._placed[row.kind, row.name, None if item.part is None else item.part.index] = item.key
+        if reading is not None:
+            self.readings[item.key] = reading
+            self.sources.setdefault(reading.row.name, set()).add(item.key)
+            if reading.packed is None:
+                slot = None if reading.slot is None else reading.slot.index
+                self._placed[reading.row.kind, reading.row.name, slot] = item.key
+        if item.parameter is not None:
+            self.parameters[item.parameter.name] = item.key
+
+    def _connect(self, item: Placement) -> None:
+        """Give an entry the functions that read and write the device."""
+        entry = self.entries[item.key]
+        if item.telecommand is not None:
+            entry.writer = partial(self._execute, item, item.telecommand)
+            if entry.size is None:
+                entry.maximum_size = item.telecommand.size
+        if item.reading is not None:
+            entry.reader = partial(self._read, item, item.reading)
+        elif item.parameter is not None:
+            entry.reader = partial(self._read_parameter, item, item.parameter)
+            entry.writer = partial(self._write_parameter, item, item.parameter)
+        elif item.image is not None:
+            name, attribute = item.image
+            if attribute == "take":
+                entry.writer = lambda _data: self.application.take_image(name)
+            else:
+                entry.reader = partial(self._read_image, item, name, attribute)
+        elif item.telecommand is None:
+            entry.reader = entry.writer = _no_data
 
     def row_bytes(self, row: Row) -> bytes:
         """Return the bytes of a telemetry row, read from the application once per sampling instant."""
@@ -138,10 +373,7 @@ class DeviceDictionary(Dictionary):
     def entries_of(self, row: Row) -> list[tuple[Key, Slot | None]]:
         """Return the entries that hold a row: one per slot, or one for the whole row, with None for its slot.
 
-        Raises
-        ------
-        IcdError
-            No entry holds the row, or some slot of it.
+        Raises IcdError if no entry holds the row, or some slot of it.
         """
         whole = self._placed.get((row.kind, row.name, None))
         if whole is not None:
@@ -152,251 +384,6 @@ class DeviceDictionary(Dictionary):
             raise IcdError(f"unit {self.icd.name}: no entry of its object dictionary holds {row.name}")
         return list(held)
 
-    def _add_object(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        if placed.index in objects.indices:
-            raise IcdError(f"canopen.toml: index {placed.index:04X}h is used twice")
-        if placed.requests:
-            self._place_requests(objects, placed)
-        elif placed.telemetry is not None:
-            self._place_telemetry(objects, placed, self.icd.telemetry[placed.telemetry])
-        elif placed.parameters:
-            self._place_parameters(objects, placed)
-        elif placed.image is not None:
-            self._place_image(objects, placed, placed.image)
-        elif placed.packed:
-            self._place_packed(objects, placed)
-        elif placed.members:
-            self._place_members(objects, placed)
-        else:
-            key = (placed.index, 0)
-            member = self._value_variable(placed.name, key, placed.value, placed.telecommand, placed.type)
-            objects.add_object(member)
-            self._names[f"{placed.index:04x}"] = key
-
-    def _place_requests(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        members: list[ODVariable] = []
-        for row in self.icd.rows:
-            key = (placed.index, row.id)
-            if row.kind == "telemetry":
-                member = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
-                self._bind_reader(key, Reading(row), row.name, partial(self.row_bytes, row))
-                self._placed[row.kind, row.name, None] = key
-            else:
-                member = self._telecommand_variable(row.name, key, row)
-            member.description = row.doc
-            members.append(member)
-        add_record(objects, placed.name, members)
-
-    def _place_telemetry(self, objects: ObjectDictionary, placed: PlacedObject, row: Row) -> None:
-        members: list[ODVariable] = []
-        for slot, fields in _slots(row):
-            key = (placed.index, len(members) + 1)
-            name = " ".join(field.name for field in fields)
-            member = variable(name, *key, DATA_TYPES[slot.type], "ro", mappable=slot.type != "bytes")
-            _describe(member, fields)
-            for field in fields:
-                self._bind_reader(
-                    key, Reading(row, slot, fields), field.name, partial(self._read_slot, row, slot)
-                )
-            self._placed[row.kind, row.name, slot.index] = key
-            if placed.telecommand is not None:
-                member.access_type = "rw"
-                command = self._setter_of(placed, row)
-                self._writers[key] = partial(self._execute_field, command, row, slot)
-                self._placed[command.kind, command.name, slot.index] = key
-            members.append(member)
-        add_record(objects, placed.name, members)
-
-    def _setter_of(self, placed: PlacedObject, row: Row) -> Row:
-        """Return the telecommand that sets a record, whose telemetry row must include it alone."""
-        command = self.icd.telecommands[str(placed.telecommand)]
-        reported = {field.telecommand for field in row.named_fields.values()}
-        if reported != {command.name} or row.size != command.size:
-            raise IcdError(
-                f"canopen.toml: {placed.index:04X}h: telemetry {row.name} must include {command.name} alone"
-            )
-        return command
-
-    def _execute_field(self, command: Row, row: Row, slot: Slot, payload: bytes) -> Deferred | None:
-        """Execute a telecommand with the values reported by its telemetry row and one changed value."""
-        data = bytearray(self.row_bytes(row))
-        data[span_of(slot)] = in_order(slot, payload)
-        return self._execute(command, bytes(data))
-
-    def _value_variable(
-        self, name: str, key: Key, value: str | None, telecommand: str | None, type_: str | None = None
-    ) -> ODVariable:
-        """Return the variable that reads a field, executes a telecommand when written, or both."""
-        if telecommand is not None:
-            member = self._telecommand_variable(name, key, self.icd.telecommands[telecommand], type_)
-        if value is not None:
-            row, slot, fields = self._slot_of(value)
-            if telecommand is None:
-                member = variable(name, *key, _data_type(slot, fields), "ro", mappable=slot.type != "bytes")
-                _describe(member, fields)
-            elif member.data_type != _data_type(slot, fields):
-                raise IcdError(f"canopen.toml: {key[0]:04X}h: {value} and {telecommand} differ in type")
-            else:
-                member.access_type = "rw"
-            read = partial(self._read_slot, row, slot)
-            text = fields[0].kind == "text"
-            self._bind_reader(
-                key, Reading(row, slot, fields), name, (lambda: read().rstrip(b"\0")) if text else read
-            )
-            self._placed[row.kind, row.name, slot.index] = key
-        return member
-
-    def _place_members(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        members: list[ODVariable] = []
-        subindex = 0
-        for model in placed.members:
-            subindex = subindex + 1 if model.subindex is None else model.subindex
-            members.append(self._member_variable(model, (placed.index, subindex)))
-            self._names[f"{placed.index:04x}.{model.name.lower()}"] = (placed.index, subindex)
-        add_record(objects, placed.name, members)
-
-    def _member_variable(self, model: PlacedMember, key: Key) -> ODVariable:
-        if model.domain is not None:
-            self._readers[key] = self._writers[key] = _no_data
-            return variable(model.name, *key, datatypes.DOMAIN, model.domain)
-        if model.parameter is None:
-            return self._value_variable(model.name, key, model.value, model.telecommand)
-        return self._parameter_variable(model.name, key, self.icd.parameters[model.parameter])
-
-    def _place_parameters(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        members: list[ODVariable] = []
-        for number, parameter in sorted(self.icd.parameters_by_id.items()):
-            key = (placed.index, number)
-            self._names[f"{placed.index:04x}.{parameter.name}"] = key
-            members.append(self._parameter_variable(parameter.name, key, parameter))
-        add_record(objects, placed.name, members)
-
-    def _parameter_variable(self, name: str, key: Key, parameter: Parameter) -> ODVariable:
-        """Return the variable that reads and sets a parameter."""
-        default = parameter.to_number(parameter.default)
-        if parameter.type not in {"f32", "f64"}:
-            default = int(default)
-        data_type = DATA_TYPES[parameter.type]
-        member = variable(name, *key, data_type, "rw", default, mappable=True)
-        set_limits(member, *_representable_limits(parameter.type, parameter.minimum, parameter.maximum))
-        member.unit = parameter.unit
-        member.description = parameter.doc
-        if parameter.enum is not None:
-            member.value_descriptions = dict(parameter.enum.names)
-        self.parameters[parameter.name] = key
-        self._readers[key] = lambda: encode(
-            data_type, parameter.to_number(self.application.parameter(parameter.name))
-        )
-        self._writers[key] = partial(self._write_parameter, parameter, data_type)
-        return member
-
-    def _write_parameter(self, parameter: Parameter, data_type: int, data: bytes) -> None:
-        try:
-            value = parameter.check(decode(data_type, data))
-        except MessageError as error:
-            raise abort_of(error) from None
-        self.application.set_parameter(parameter.name, value)
-
-    def _place_image(self, objects: ObjectDictionary, placed: PlacedObject, name: str) -> None:
-        index = placed.index
-        readers: list[tuple[str, int, Callable[[GreyImage], bytes]]] = [
-            ("pixels", datatypes.DOMAIN, lambda image: image.pixels),
-            ("width", datatypes.UNSIGNED16, lambda image: image.width.to_bytes(2, "little")),
-            ("height", datatypes.UNSIGNED16, lambda image: image.height.to_bytes(2, "little")),
-            ("frame counter", datatypes.UNSIGNED32, lambda image: image.frame.to_bytes(4, "little")),
-        ]
-        members: list[ODVariable] = []
-        for name_in_record, data_type, extract in readers:
-            member = variable(name_in_record, index, len(members) + 1, data_type, "ro")
-            self._readers[index, member.subindex] = partial(self._read_image, name, extract)
-            members.append(member)
-        members[0].description = "8 bits a pixel, row by row from the top"
-        if name == "frame":
-            member = variable("take", index, len(members) + 1, datatypes.UNSIGNED8, "wo", limits=(1, 1))
-            member.description = "write 1 to take the frame; the answer comes when it can be read"
-            self._writers[index, member.subindex] = lambda _data: self.application.take_image(name)
-            members.append(member)
-        add_record(objects, placed.name, members)
-
-    def _read_image(self, name: str, extract: Callable[[GreyImage], bytes]) -> bytes:
-        return extract(self.application.image(name))
-
-    def _place_packed(self, objects: ObjectDictionary, placed: PlacedObject) -> None:
-        members: list[ODVariable] = []
-        for model in placed.packed:
-            key = (placed.index, len(members) + 1)
-            row, slot, fields = self._slot_of(model.source)
-            name = model.name or model.source.partition(".")[2]
-            member = variable(name, *key, DATA_TYPES[model.type], "ro", mappable=True)
-            _describe(member, fields)
-            member.min = member.max = None
-            member.factor = model.scale
-            packer = _Packer(self, row, slot, fields, model)
-            self._bind_reader(key, Reading(row, slot, fields, model), name, packer)
-            members.append(member)
-        add_record(objects, placed.name, members)
-
-    def _telecommand_variable(self, name: str, key: Key, row: Row, type_: str | None = None) -> ODVariable:
-        """Return the variable whose write executes a telecommand.
-
-        The client writes the only field, all bytes (as a number if a type is given), or 1 if the telecommand
-        has no data.
-        """
-        text = type_ is None and [field.kind for field in row.fields] == ["text"]
-        scalar = text or (type_ is None and len(row.slots) == 1 and row.slots[0].type != "bytes")
-        self._placed[row.kind, row.name, row.slots[0].index if scalar else None] = key
-        if type_ is not None:
-            if type_size(DATA_TYPES[type_]) != row.size:
-                raise IcdError(
-                    f"canopen.toml: {key[0]:04X}h: {row.name} has {row.size} bytes, not the size of {type_}"
-                )
-            member = variable(name, *key, DATA_TYPES[type_], "wo", mappable=True)
-            self._writers[key] = partial(self._execute, row)
-        elif row.size == 0:
-            member = variable(name, *key, datatypes.UNSIGNED8, "wo", limits=(1, 1))
-            self._writers[key] = lambda _data: self._execute(row, b"")
-        elif text:
-            member = variable(name, *key, datatypes.VISIBLE_STRING, "wo")
-            self._sizes[key] = row.size
-            self._writers[key] = lambda payload: self._execute(row, payload.ljust(row.size, b"\0"))
-        elif scalar:
-            slot, fields = _slots(row)[0]
-            member = variable(name, *key, DATA_TYPES[slot.type], "wo", mappable=True)
-            _describe(member, fields)
-            self._writers[key] = lambda data: self._execute(row, in_order(slot, data))
-        else:
-            member = variable(name, *key, datatypes.OCTET_STRING, "wo")
-            self._sizes[key] = row.size
-            self._writers[key] = partial(self._execute, row)
-        member.description = row.doc
-        return member
-
-    def _execute(self, row: Row, payload: bytes) -> Deferred | None:
-        if len(payload) < row.size:
-            raise SdoAbortError(AbortCode.LENGTH_LOW, f"{row.name}: {len(payload)} bytes, {row.size} needed")
-        try:
-            row.decode(payload)
-        except MessageError as error:
-            raise abort_of(error) from None
-        return self.application.telecommand(row, payload)
-
-    def _read_slot(self, row: Row, slot: Slot) -> bytes:
-        return in_order(slot, self.row_bytes(row)[span_of(slot)])
-
-    def _bind_reader(self, key: Key, reading: Reading, name: str, reader: Callable[[], bytes]) -> None:
-        self.readings[key] = reading
-        self._readers[key] = reader
-        self.sources.setdefault(reading.row.name, set()).add(key)
-        self._names[f"{key[0]:04x}.{name}"] = key
-
-    def _slot_of(self, reference: str) -> tuple[Row, Slot, list[Field]]:
-        row_name, _, field_name = reference.partition(".")
-        row = self.icd.telemetry[row_name]
-        if field_name not in row.named_fields:
-            raise IcdError(f"canopen.toml: telemetry {row_name} has no field {field_name!r}")
-        slot = row.named_fields[field_name].slot
-        return row, slot, [field for field in row.named_fields.values() if field.slot.index == slot.index]
-
     def _mapped(self, objects: ObjectDictionary, model: PdoModel) -> MappedPdo:
         mapping = []
         for name in model.objects:
@@ -406,43 +393,67 @@ class DeviceDictionary(Dictionary):
             mapping.append(index << 16 | subindex << 8 | (type_size(member.data_type) or 0) * 8)
         return model, mapping
 
+    def _read(self, item: Placement, reading: Reading) -> bytes:
+        data = self.row_bytes(reading.row)
+        if reading.slot is None:
+            return data
+        if reading.packed is not None:
+            return _pack(reading, reading.packed, reading.slot, data)
+        value = in_order(reading.slot, data[span_of(reading.slot)])
+        return value.rstrip(b"\0") if item.variable.data_type == datatypes.VISIBLE_STRING else value
 
-class _Packer:
-    """Reads a field of a telemetry row as a narrower integer."""
-
-    def __init__(
-        self, dictionary: DeviceDictionary, row: Row, slot: Slot, fields: list[Field], model: PackedField
-    ) -> None:
-        self._dictionary = dictionary
-        self._row = row
-        self._slot = slot
-        self._field = fields[0] if fields[0].width == 0 else None
-        self._model = model
-        data_type = DATA_TYPES[model.type]
-        self._data_type = data_type
-        bits = (type_size(data_type) or 0) * 8
-        self._bits = bits
-        signed = model.type.startswith("i")
-        self._limits = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
-
-    def __call__(self) -> bytes:
-        data = self._dictionary.row_bytes(self._row)
-        if self._field is None:
-            raw = int.from_bytes(data[span_of(self._slot)], self._slot.order)
+    def _execute(self, item: Placement, row: Row, data: bytes) -> Deferred | None:
+        """Execute a telecommand with the written data; in a record, its other values are those reported."""
+        if row.size == 0:
+            payload = b""
+        elif item.part is None:
+            payload = data
+        elif item.reading is not None and len(row.slots) > 1:
+            changed = bytearray(self.row_bytes(item.reading.row))
+            changed[span_of(item.part)] = in_order(item.part, data)
+            payload = bytes(changed)
         else:
-            value = self._row.decode(data)[self._field.name]
-            number = value if isinstance(value, int | float) else self._raw(value)
-            raw = round(number / self._model.scale)
-        if self._model.wrap:
-            raw &= (1 << self._bits) - 1
-        low, high = self._limits
-        return encode(self._data_type, min(max(raw, low), high))
+            payload = in_order(item.part, data).ljust(row.size if item.part.type == "bytes" else 0, b"\0")
+        if len(payload) < row.size:
+            raise SdoAbortError(AbortCode.LENGTH_LOW, f"{row.name}: {len(payload)} bytes, {row.size} needed")
+        try:
+            row.decode(payload)
+        except MessageError as error:
+            raise abort_of(error) from None
+        return self.application.telecommand(row, payload)
 
-    def _raw(self, value: Value) -> int:
-        enum = None if self._field is None else self._field.enum
-        if enum is None or not isinstance(value, str):
-            raise SdoAbortError(AbortCode.GENERAL, f"{self._model.source}: {value!r} is not a number")
-        return enum.values[value]
+    def _read_parameter(self, item: Placement, parameter: Parameter) -> bytes:
+        value = parameter.to_number(self.application.parameter(parameter.name))
+        return encode(item.variable.data_type or 0, value)
+
+    def _write_parameter(self, item: Placement, parameter: Parameter, data: bytes) -> None:
+        try:
+            value = parameter.check(decode(item.variable.data_type or 0, data))
+        except MessageError as error:
+            raise abort_of(error) from None
+        self.application.set_parameter(parameter.name, value)
+
+    def _read_image(self, item: Placement, name: str, attribute: str) -> bytes:
+        return encode(item.variable.data_type or 0, getattr(self.application.image(name), attribute))
+
+
+def _pack(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> bytes:
+    """Return a field of a telemetry row as a narrower integer."""
+    field = reading.fields[0]
+    if field.width:
+        raw = int.from_bytes(data[span_of(slot)], slot.order)
+    else:
+        value = reading.row.decode(data)[field.name]
+        if isinstance(value, str) and field.enum is not None:
+            value = field.enum.values[value]
+        if not isinstance(value, int | float):
+            raise SdoAbortError(AbortCode.GENERAL, f"{packed.source}: {value!r} is not a number")
+        raw = round(value / packed.scale)
+    bits = int(packed.type[1:])
+    if packed.wrap:
+        raw &= (1 << bits) - 1
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if packed.type[0] == "i" else (0, (1 << bits) - 1)
+    return encode(DATA_TYPES[packed.type], min(max(raw, low), high))
 
 
 def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:
@@ -463,10 +474,6 @@ def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:
         if fields:
             slots.append((slot, fields))
     return slots
-
-
-def _data_type(slot: Slot, fields: list[Field]) -> int:
-    return datatypes.VISIBLE_STRING if fields[0].kind == "text" else DATA_TYPES[slot.type]
 
 
 def _no_data(_data: bytes = b"") -> NoReturn:

@@ -11,11 +11,18 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from starhil.protocol.can_framing import MAX_FRAME_DATA, CanId, MessageType
+from starhil.protocol.can_framing import (
+    MAX_FRAME_DATA,
+    REPLY_TYPES,
+    REQUEST_TYPES,
+    CanId,
+    MessageType,
+    nack_type,
+)
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
-from starhil.protocol.messages import ErrorCode
+from starhil.protocol.messages import ErrorCode, ReplyKind, RequestKind
 from starhil.protocol.quoting import Scope, dbc_string
 from starhil.protocol.values import EnumDefinition, IcdError
 
@@ -94,24 +101,18 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
         Field(name="error", kind="enum", slot=Slot(0, "u8", 0, 1), enum=_error_codes(icd), doc="Error code."),
     )
     long = row.size > MAX_FRAME_DATA
-    if row.kind == "telemetry":
-        request_type, reply_type = MessageType.TELEMETRY_REQUEST, MessageType.TELEMETRY
-        if long:
-            reply_type = MessageType.TELEMETRY_EXTENDED
-        yield _Message(
-            _id(request_type, *to_device), f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}"
-        )
-        yield _Message(_id(reply_type, *to_host), f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
-        nack_type = MessageType.TELEMETRY_NACK
+    telemetry = row.kind == "telemetry"
+    request = REQUEST_TYPES[RequestKind(row.kind)][long]
+    reply = REPLY_TYPES[ReplyKind.TELEMETRY if telemetry else ReplyKind.ACK][long and telemetry]
+    asked, answered = _id(request, *to_device), _id(reply, *to_host)
+    if telemetry:
+        yield _Message(asked, f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
+        yield _Message(answered, f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
     else:
-        request_type = MessageType.TELECOMMAND_EXTENDED if long else MessageType.TELECOMMAND
-        yield _Message(_id(request_type, *to_device), f"TC_{row.name}", row.size, "OBC", signals, row.doc)
-        reply_type = MessageType.TELECOMMAND_ACK
-        yield _Message(
-            _id(reply_type, *to_host), f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}."
-        )
-        nack_type = MessageType.TELECOMMAND_NACK
-    yield _Message(_id(nack_type, *to_host), f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
+        yield _Message(asked, f"TC_{row.name}", row.size, "OBC", signals, row.doc)
+        yield _Message(answered, f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}.")
+    refused = _id(nack_type(row.id), *to_host)
+    yield _Message(refused, f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
 
 
 def _error_codes(icd: InterfaceDefinition) -> EnumDefinition:

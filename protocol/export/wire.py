@@ -10,12 +10,11 @@ from pydantic import BaseModel
 from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
 from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
-from starhil.protocol.cubespace_serial import encode_reply, encode_request
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
-from starhil.protocol.serial_stack import serial_answers
+from starhil.protocol.serial_stack import SerialStack, serial_answers
 from starhil.protocol.values import Section
 
 _TELEMETRY: Final = 0x80
@@ -57,7 +56,8 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
         found.append(_errors(icd))
     if icd.link.serial is not None:
         cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
-        found.append(_serial(icd) if cubespace else _composed(icd.link.serial, icd.conventions.byte_order))
+        serial = icd.link.serial
+        found.append(_serial(icd, serial) if cubespace else _composed(serial, icd.conventions.byte_order))
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
@@ -195,7 +195,8 @@ def _fixed_value(const: int | None, default: int | None) -> str:
     return "" if default is None else f"default {default:X}h"
 
 
-def _serial(icd: InterfaceDefinition) -> Section:
+def _serial(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
+    stack = SerialStack(link)
     data = bytes((_DATA,))
     refusal = ErrorCode.INVALID_PARAMETER
     kinds = (
@@ -205,7 +206,7 @@ def _serial(icd: InterfaceDefinition) -> Section:
         Reply(ReplyKind.UNSOLICITED, _TELEMETRY, data),
         Reply(ReplyKind.EVENT, _TELEMETRY, data),
     )
-    request = _format_message(encode_request(Request.of(_TELECOMMAND, data)))
+    request = _format_message(stack.encode_request(Request.of(_TELECOMMAND, data)))
     text = (
         f"A request is {request}, with every byte 1F of the data doubled; 8 data bits, no parity, 1 stop bit. "
         "The parameter serial_dialect selects the format of the replies; the code is a number of the enumeration error_code."
@@ -223,14 +224,16 @@ def _serial(icd: InterfaceDefinition) -> Section:
         heading="Serial line",
         paragraphs=(text, choice, silence) if silent else (text, choice),
         columns=("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
-        rows=tuple((dialect.value, *(_reply(reply, dialect) for reply in kinds)) for dialect in Dialect),
+        rows=tuple(
+            (dialect.value, *(_reply(stack, reply, dialect) for reply in kinds)) for dialect in Dialect
+        ),
     )
 
 
-def _reply(reply: Reply, dialect: Dialect) -> str:
-    if reply.kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT) and not dialect.supports_unsolicited:
+def _reply(stack: SerialStack, reply: Reply, dialect: Dialect) -> str:
+    if reply.kind not in stack.format(dialect).headers:
         return "none"
-    return _format_message(encode_reply(reply, dialect))
+    return _format_message(stack.encode_reply(reply, dialect))
 
 
 def _format_message(message: bytes) -> str:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-from starhil.protocol.cubespace_serial import DeviceReceiver
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import SerialStack
 from tests.conformance.mutant_seams import (
     enter,
     events,
@@ -85,24 +85,30 @@ enter(
 )
 
 
+def _receiving_with(unit: SimulatedUnit, **limits: float) -> None:
+    """Receive with other limits, which are keys of [link.serial]."""
+    link = unit.link._stack.link.model_copy(update=limits)
+    unit.link._receiver = SerialStack(link).device()
+
+
 @mutant("incomplete messages never time out", "serial", "framing.half")
 def never_given_up(unit: SimulatedUnit) -> None:
-    unit.link._receiver = DeviceReceiver(timeout_s=1e9)
+    _receiving_with(unit, timeout=1e9)
 
 
 @mutant("messages time out after 50 ms", "serial", "framing.pause")
 def given_up_early(unit: SimulatedUnit) -> None:
-    unit.link._receiver = DeviceReceiver(timeout_s=0.05)
+    _receiving_with(unit, timeout=0.05)
 
 
 @mutant("long messages are not taken", "serial", "framing.longest")
 def short_buffer(unit: SimulatedUnit) -> None:
-    unit.link._receiver = DeviceReceiver(max_size=100)
+    _receiving_with(unit, max_size=100)
 
 
 @mutant("messages of any length are taken", "serial", "framing.overlong")
 def endless_buffer(unit: SimulatedUnit) -> None:
-    unit.link._receiver = DeviceReceiver(max_size=1 << 20)
+    _receiving_with(unit, max_size=1 << 20)
 
 
 @mutant("stuffed bytes stay doubled in requests", "serial", "stuffing.taken-out")

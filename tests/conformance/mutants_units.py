@@ -8,8 +8,8 @@ from typing import Any
 
 from starhil.emulator.device.device import Device
 from starhil.protocol.codec import Row
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.serial_stack import SerialStack
 from tests.conformance.mutant_seams import Damage, handling, incoming, only_acknowledged, outgoing
 from tests.conformance.simulated import SimulatedUnit
 
@@ -26,13 +26,12 @@ class UnitMutant:
     damage: Damage
 
 
-def stack_of(unit: SimulatedUnit) -> ComposedStack:
-    stack = unit.link._stack
-    assert isinstance(stack, ComposedStack)
+def stack_of(unit: SimulatedUnit) -> SerialStack:
+    stack: SerialStack = unit.link._stack
     return stack
 
 
-def bodies(change: Callable[[bytes, ComposedStack], bytes]) -> Damage:
+def bodies(change: Callable[[bytes, SerialStack], bytes]) -> Damage:
     """Change the bodies of the frames that the device sends."""
 
     def damage(unit: SimulatedUnit) -> None:
@@ -43,7 +42,7 @@ def bodies(change: Callable[[bytes, ComposedStack], bytes]) -> Damage:
     return damage
 
 
-def raw_frames(change: Callable[[bytes, ComposedStack], bytes]) -> Damage:
+def raw_frames(change: Callable[[bytes, SerialStack], bytes]) -> Damage:
     """Change the bytes that the device sends, knowing its link."""
 
     def damage(unit: SimulatedUnit) -> None:
@@ -145,7 +144,7 @@ def takes_any_length(unit: SimulatedUnit) -> None:
     unit.link._receiver = unit.link._new_receiver()
 
 
-def unescaped(data: bytes, stack: ComposedStack) -> bytes:
+def unescaped(data: bytes, stack: SerialStack) -> bytes:
     """Send the body as it is between the marks of a SLIP frame."""
     framing: Any = stack.framing
     body = framing.decode(data.strip(framing.end))

@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starhil.protocol.cubespace_serial import HostReceiver, encode_request
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_interface import Dialect
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
+from tests.protocol.composed_links import CUBESPACE
 
 pytestmark = pytest.mark.process
 
@@ -68,9 +68,9 @@ class Emulator:
     def ask(self, identifier: int, data: bytes = b""):
         """Send a request in dialect a; return raw bytes and the reply."""
         request = Request.of(identifier, data)
-        host = HostReceiver(Dialect.A)
+        host = CUBESPACE.host(Dialect.A)
         host.expect(request, ICD.row_by_id(identifier).size if identifier >= 128 else 0)
-        os.write(self.fd, encode_request(request))
+        os.write(self.fd, CUBESPACE.encode_request(request))
         raw, replies = b"", []
         while not replies:
             assert select.select([self.fd], [], [], REPLY_WITHIN_S)[0], "no reply"

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from starhil.protocol.cubespace_serial import encode_request
 from starhil.protocol.messages import Request
+from tests.protocol.composed_links import CUBESPACE
 
 STEP_S = 30.0
 PEER_BYTES_S = 300_000.0
@@ -80,7 +80,7 @@ def test_a_request_is_answered_in_the_middle_of_a_long_step(run):
         peer = Peer(emulation.ready_fields["serial"])
         stepping = asyncio.create_task(emulation.stepper.step(STEP_S))
         asked = emulation.device.counters.telemetry
-        os.write(peer.fd, encode_request(Request.of(128)))
+        os.write(peer.fd, CUBESPACE.encode_request(Request.of(128)))
         while emulation.device.counters.telemetry == asked:
             assert not stepping.done()
             await asyncio.sleep(0)
@@ -114,7 +114,7 @@ def test_wire_delays_use_simulation_time(run):
     async def scenario(emulation, _line):
         peer = Peer(emulation.ready_fields["serial"])
         emulation.serial.wire.settings = type(emulation.serial.wire.settings)(delay_s=5.0)
-        os.write(peer.fd, encode_request(Request.of(128)))
+        os.write(peer.fd, CUBESPACE.encode_request(Request.of(128)))
         while emulation.device.counters.telemetry == 0:
             await asyncio.sleep(0.01)
         await emulation.stepper.step(4.9)

@@ -14,12 +14,12 @@ from starhil.hil_tests.jitter import unsolicited_jitter
 from starhil.hil_tests.load_figures import CanLoad, SerialLoad, Spread
 from starhil.hil_tests.serial_load import load_serial
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
-from starhil.protocol.cubespace_serial import DeviceReceiver, encode_reply
 from starhil.protocol.hub import CanHub
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
+from tests.protocol.composed_links import CUBESPACE
 
 ICD = load_unit()
 RATE = 300.0
@@ -123,7 +123,7 @@ def test_a_silent_device_on_can_is_found() -> None:
 def measure_serial(answer: Answer, dialect: Dialect) -> SerialLoad:
     async def main() -> SerialLoad:
         transport: SerialTransport = open_serial("pty", BAUD)
-        receiver = DeviceReceiver()
+        receiver = CUBESPACE.device()
         number = 0
 
         def take(data: bytes) -> None:
@@ -131,7 +131,7 @@ def measure_serial(answer: Answer, dialect: Dialect) -> SerialLoad:
             for event in receiver.feed(data, 0.0):
                 if isinstance(event, Request):
                     for reply in answer(event, number):
-                        transport.send(encode_reply(reply, dialect))
+                        transport.send(CUBESPACE.encode_reply(reply, dialect))
                     number += 1
 
         await transport.start(take)

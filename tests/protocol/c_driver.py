@@ -15,12 +15,10 @@ from typing import Any, Self
 import pytest
 
 from starhil.protocol.codec import Field, Row
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c import files, prefix_of
 from starhil.protocol.quoting import c_member
-from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack
 from starhil.protocol.values import Value
 
 FLAGS = [
@@ -313,7 +311,7 @@ class CDriver:
         stack = stack or build_serial_stack(icd)
         for name, text in files(icd, stack).items():
             (folder / name).write_text(text)
-        (folder / "driver.c").write_text(driver_source(icd, composed=isinstance(stack, ComposedStack)))
+        (folder / "driver.c").write_text(driver_source(icd, composed=not stack.dialects))
         self._program = folder / "driver"
         sources = [folder / "driver.c", folder / f"{prefix_of(icd)}.c"]
         done = subprocess.run(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.link_schema import MessageClass, SerialLinkModel
 from starhil.protocol.messages import (
     ErrorCode,
@@ -15,8 +14,7 @@ from starhil.protocol.messages import (
     Request,
     RequestKind,
 )
-from starhil.protocol.serial_interface import RowShape
-from starhil.protocol.serial_stack import build_stack
+from starhil.protocol.serial_stack import RowShape, SerialStack
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 
@@ -26,11 +24,11 @@ def stack_of(
     classes: tuple[MessageClass, ...] = (),
     rows: tuple[RowShape, ...] = (),
     order: Any = "little",
-) -> ComposedStack:
-    stack = build_stack(SerialLinkModel.model_validate(link), classes, rows, order)
-    assert isinstance(stack, ComposedStack)
-    return stack
+) -> SerialStack:
+    return SerialStack(SerialLinkModel.model_validate(link), classes, rows, order)
 
+
+CUBESPACE = stack_of({"framing": {"kind": "cubespace"}})
 
 SAGITTA = stack_of(
     {
@@ -221,7 +219,7 @@ def faults(events: list[Any]) -> list[FaultKind]:
     return [event.kind for event in events]
 
 
-def counted(includes: list[str], covers: list[str], start: list[int]) -> ComposedStack:
+def counted(includes: list[str], covers: list[str], start: list[int]) -> SerialStack:
     header = [{"role": "length", "type": "u8", "includes": includes}, {"role": "id", "type": "u8"}]
     return stack_of(
         {

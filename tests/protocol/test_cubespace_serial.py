@@ -8,25 +8,30 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from starhil.protocol.cubespace_serial import (
-    BURST_SIZE,
-    DeviceReceiver,
-    HostReceiver,
-    encode_reply,
-    encode_request,
-)
+from starhil.protocol.cubespace import BURST_SIZE
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.transports.paced import PacingSchedule
+from tests.protocol.composed_links import CUBESPACE, stack_of
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 GOOD = Request(TC, 2, b"\x1f\x00\xff\x7f\x1f\x1f")
 requests = st.builds(Request.of, st.integers(0, 255), st.binary(max_size=60))
 
 
+def limited(**limits: float) -> SerialStack:
+    return stack_of({"framing": {"kind": "cubespace"}} | limits)
+
+
+def with_single_id(line: bytes) -> bytes:
+    """The request as some flight software sends it, which does not double an ID of 0x1F."""
+    return line[:2] + line[3:] if line[2:4] == b"\x1f\x1f" else line
+
+
 def device_feed(text: str) -> list[Request | LinkFault]:
-    return DeviceReceiver().feed(bytes.fromhex(text), 0.0)
+    return CUBESPACE.device().feed(bytes.fromhex(text), 0.0)
 
 
 def kinds(events: list[Request | LinkFault]) -> list[FaultKind | int]:
@@ -45,7 +50,7 @@ PUBLISHED_REQUESTS = [
 
 @pytest.mark.parametrize(("request_", "text"), PUBLISHED_REQUESTS)
 def test_requests_are_framed_and_read_as_published(request_: Request, text: str) -> None:
-    assert encode_request(request_).hex(" ").upper() == text
+    assert CUBESPACE.encode_request(request_).hex(" ").upper() == text
     assert device_feed(text) == [request_]
 
 
@@ -64,8 +69,8 @@ def test_the_escape_byte_as_id_is_read_both_ways(text: str, data: bytes) -> None
 
 def test_an_id_that_is_the_escape_byte_goes_out_in_either_form() -> None:
     request = Request(TC, 0x1F, b"\x05")
-    assert encode_request(request, stuff_id=True).hex() == "1f7f1f1f051fff"
-    assert encode_request(request, stuff_id=False).hex() == "1f7f1f051fff"
+    assert CUBESPACE.encode_request(request).hex() == "1f7f1f1f051fff"
+    assert with_single_id(CUBESPACE.encode_request(request)).hex() == "1f7f1f051fff"
 
 
 FAULTS = [
@@ -85,13 +90,13 @@ FAULTS = [
 
 @pytest.mark.parametrize(("text", "expected"), FAULTS)
 def test_bytes_against_the_framing_make_one_fault_each(text: str, expected: list[FaultKind | int]) -> None:
-    receiver = DeviceReceiver()
+    receiver = CUBESPACE.device()
     assert kinds(receiver.feed(bytes.fromhex(text), 0.0)) == expected
-    assert receiver.feed(encode_request(GOOD), 1.0)[-1] == GOOD
+    assert receiver.feed(CUBESPACE.encode_request(GOOD), 1.0)[-1] == GOOD
 
 
 def test_an_incomplete_message_is_abandoned_after_the_timeout() -> None:
-    receiver = DeviceReceiver(timeout_s=0.5)
+    receiver = limited(timeout=0.5).device()
     assert receiver.feed(b"\x1f\x7f\x02\x05", 10.0) == []
     assert receiver.busy
     assert receiver.flush(10.49) == []
@@ -101,16 +106,16 @@ def test_an_incomplete_message_is_abandoned_after_the_timeout() -> None:
 
 
 def test_bytes_after_the_timeout_start_a_new_frame() -> None:
-    receiver = DeviceReceiver(timeout_s=0.5)
+    receiver = limited(timeout=0.5).device()
     receiver.feed(b"\x1f\x7f\x02\x05", 0.0)
-    assert kinds(receiver.feed(encode_request(GOOD), 1.0)) == [FaultKind.UART_INCOMPLETE, GOOD.id]
+    assert kinds(receiver.feed(CUBESPACE.encode_request(GOOD), 1.0)) == [FaultKind.UART_INCOMPLETE, GOOD.id]
 
 
 def test_an_endless_message_keeps_within_bounds_and_counts_once() -> None:
-    receiver = DeviceReceiver(max_size=64)
+    receiver = limited(max_size=64).device()
     events = receiver.feed(b"\x1f\x7f\x02" + bytes(100_000), 0.0)
     assert kinds(events) == [FaultKind.UART_OVERLONG]
-    assert receiver.feed(encode_request(GOOD), 0.0) == [GOOD]
+    assert receiver.feed(CUBESPACE.encode_request(GOOD), 0.0) == [GOOD]
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
@@ -123,9 +128,11 @@ def test_requests_are_decoded_from_a_stream_cut_anywhere(
         return request.id != 0x1F or (bool(request.data) and request.data[0] not in (0x1F, 0x7F, 0xFF))
 
     stream = b"".join(
-        encode_request(request, stuff_id=doubled or not unambiguous(request)) for request in asked
+        line if doubled or not unambiguous(request) else with_single_id(line)
+        for request in asked
+        for line in [CUBESPACE.encode_request(request)]
     )
-    receiver = DeviceReceiver()
+    receiver = CUBESPACE.device()
     events: list[Request | LinkFault] = []
     position = number = 0
     while position < len(stream):
@@ -138,8 +145,8 @@ def test_requests_are_decoded_from_a_stream_cut_anywhere(
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(st.binary(max_size=400), st.integers(1, 50))
 def test_events_do_not_depend_on_how_noise_is_cut(noise: bytes, size: int) -> None:
-    whole = DeviceReceiver(max_size=32).feed(noise, 0.0)
-    receiver = DeviceReceiver(max_size=32)
+    whole = limited(max_size=32).device().feed(noise, 0.0)
+    receiver = limited(max_size=32).device()
     pieces = [
         event
         for start in range(0, len(noise), size)
@@ -150,7 +157,7 @@ def test_events_do_not_depend_on_how_noise_is_cut(noise: bytes, size: int) -> No
 
 def test_the_receiver_survives_ten_thousand_random_byte_strings() -> None:
     random_bytes = random.Random(20260101)
-    receiver = DeviceReceiver()
+    receiver = CUBESPACE.device()
     for number in range(10_000):
         noise = random_bytes.randbytes(random_bytes.randrange(1, 40))
         if number % 3 == 0:  # noise that resembles the protocol
@@ -159,7 +166,7 @@ def test_the_receiver_survives_ten_thousand_random_byte_strings() -> None:
             if isinstance(event, Request):
                 assert (event.kind is TLM) == (event.id >= 128)
         # after the time-out the next good command is read, alone and whole
-        answer = receiver.feed(encode_request(GOOD), number + 0.6)
+        answer = receiver.feed(CUBESPACE.encode_request(GOOD), number + 0.6)
         assert answer[-1] == GOOD
         assert [event for event in answer if isinstance(event, Request)] == [GOOD]
 
@@ -194,8 +201,8 @@ PUBLISHED_REPLIES = [
 
 @pytest.mark.parametrize(("dialect", "reply", "text"), PUBLISHED_REPLIES)
 def test_replies_are_framed_and_read_in_each_dialect(dialect: Dialect, reply: Reply, text: str) -> None:
-    assert encode_reply(reply, dialect).hex(" ").upper() == text
-    receiver = HostReceiver(dialect)
+    assert CUBESPACE.encode_reply(reply, dialect).hex(" ").upper() == text
+    receiver = CUBESPACE.host(dialect)
     assert reply.id is not None
     if reply.kind not in (ReplyKind.EVENT, ReplyKind.UNSOLICITED):
         receiver.expect(Request.of(reply.id), 6 if reply.id >= 128 else 0)
@@ -204,49 +211,53 @@ def test_replies_are_framed_and_read_in_each_dialect(dialect: Dialect, reply: Re
 
 @pytest.mark.parametrize("dialect", Dialect)
 def test_burst_packets_have_one_form_in_all_dialects(dialect: Dialect) -> None:
-    text = encode_reply(BURST, dialect)
+    text = CUBESPACE.encode_reply(BURST, dialect)
     assert text[:3] == b"\x1f\x7f\x77"
-    receiver = HostReceiver(dialect)
+    receiver = CUBESPACE.host(dialect)
     receiver.expect(Request.of(119, b"\x14\x01"), 0)
-    assert receiver.feed(encode_reply(Reply(ReplyKind.ACK, 119), dialect), 0.0) == [Reply(ReplyKind.ACK, 119)]
+    assert receiver.feed(CUBESPACE.encode_reply(Reply(ReplyKind.ACK, 119), dialect), 0.0) == [
+        Reply(ReplyKind.ACK, 119)
+    ]
     assert receiver.feed(text * 3, 0.0) == [BURST] * 3
 
 
 @pytest.mark.parametrize("dialect", [Dialect.A, Dialect.B])
 @pytest.mark.parametrize("reply", [EVENT, UNSOLICITED])
 def test_generation_1_has_nothing_unsolicited(dialect: Dialect, reply: Reply) -> None:
-    assert not dialect.supports_unsolicited
+    assert not CUBESPACE.supports_unsolicited(dialect)
     with pytest.raises(ProtocolError, match="use dialect c"):
-        encode_reply(reply, dialect)
+        CUBESPACE.encode_reply(reply, dialect)
 
 
 @pytest.mark.parametrize("dialect", Dialect)
 def test_no_dialect_has_echoes(dialect: Dialect) -> None:
     with pytest.raises(ProtocolError, match=f"serial dialect {dialect} has no echo messages"):
-        encode_reply(Reply(ReplyKind.ECHO, 2), dialect)
+        CUBESPACE.encode_reply(Reply(ReplyKind.ECHO, 2), dialect)
 
 
 def test_unknown_error_codes_stay_numbers() -> None:
-    receiver = HostReceiver(Dialect.A)
+    receiver = CUBESPACE.host(Dialect.A)
     assert receiver.feed(bytes.fromhex("1F7F02631FFF"), 0.0) == [Reply(ReplyKind.NACK, 2, code=99)]
 
 
 def test_in_dialect_b_a_reply_to_nothing_is_a_fault() -> None:
-    receiver = HostReceiver(Dialect.B)
-    events = receiver.feed(encode_reply(TELEMETRY, Dialect.B) + encode_reply(ACK, Dialect.B), 0.0)
+    receiver = CUBESPACE.host(Dialect.B)
+    events = receiver.feed(
+        CUBESPACE.encode_reply(TELEMETRY, Dialect.B) + CUBESPACE.encode_reply(ACK, Dialect.B), 0.0
+    )
     assert [event.kind for event in events] == [FaultKind.UART_PROTOCOL] * 2
 
 
 def test_in_dialect_b_one_expectation_takes_one_reply() -> None:
-    receiver = HostReceiver(Dialect.B)
+    receiver = CUBESPACE.host(Dialect.B)
     receiver.expect(Request.of(230), 6)
-    events = receiver.feed(encode_reply(TELEMETRY, Dialect.B) * 2, 0.0)
+    events = receiver.feed(CUBESPACE.encode_reply(TELEMETRY, Dialect.B) * 2, 0.0)
     assert events[0] == TELEMETRY
     assert isinstance(events[1], LinkFault)
 
 
 def test_a_telecommand_answered_by_more_than_a_code_is_a_fault() -> None:
-    receiver = HostReceiver(Dialect.A)
+    receiver = CUBESPACE.host(Dialect.A)
     (event,) = receiver.feed(bytes.fromhex("1F7F0200001FFF"), 0.0)
     assert isinstance(event, LinkFault)
     assert "must be 1" in event.detail
@@ -258,21 +269,21 @@ reply_data = st.binary(min_size=2, max_size=80).filter(lambda data: len(data) !=
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.sampled_from(Dialect), st.integers(128, 255), reply_data)
 def test_telemetry_comes_back_in_each_dialect(dialect: Dialect, identifier: int, data: bytes) -> None:
-    receiver = HostReceiver(dialect)
+    receiver = CUBESPACE.host(dialect)
     receiver.expect(Request.of(identifier), len(data))
     reply = Reply(ReplyKind.TELEMETRY, identifier, data)
-    assert receiver.feed(encode_reply(reply, dialect), 0.0) == [reply]
+    assert receiver.feed(CUBESPACE.encode_reply(reply, dialect), 0.0) == [reply]
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(st.sampled_from(Dialect), st.lists(st.binary(max_size=40), max_size=8))
 def test_the_host_survives_any_bytes(dialect: Dialect, noise: list[bytes]) -> None:
-    receiver = HostReceiver(dialect, max_size=64)
+    receiver = limited(max_size=64).host(dialect)
     for piece in noise:
         receiver.feed(piece, 0.0)
     receiver.feed(b"", 10.0)
     receiver.expect(Request.of(230), 6)
-    events = receiver.feed(encode_reply(TELEMETRY, dialect), 10.0)
+    events = receiver.feed(CUBESPACE.encode_reply(TELEMETRY, dialect), 10.0)
     assert events[-1] == TELEMETRY
 
 

@@ -11,7 +11,6 @@ import pytest
 
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Row
-from starhil.protocol.cubespace_serial import HostReceiver, encode_reply, encode_request
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
@@ -19,6 +18,7 @@ from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError
 from tests.emulator.units.clients import Emulated, with_unit
 from tests.protocol.c_driver import CDriver, c_words, hex_or_none
+from tests.protocol.composed_links import CUBESPACE
 from tests.protocol.test_export import by_name, packets
 
 ICD = load_unit()
@@ -91,13 +91,13 @@ def test_a_value_beyond_its_limits_is_refused_by_its_position(c: CDriver, row: R
 def test_requests_are_framed_as_ours(c: CDriver, row: Row) -> None:
     samples = [data for _, data in packets(row)] if row.kind == "telecommand" else [b""]
     for data in [*samples, b"\x1f" * row.size]:
-        framed = encode_request(Request.of(row.id, data))
+        framed = CUBESPACE.encode_request(Request.of(row.id, data))
         assert c("frame", row.id, hex_or_none(data)) == ["0", framed.hex()]
 
 
 def events(dialect: Dialect, pending: int | None, data: bytes) -> list[str]:
     """What our receiver of the OBC's side makes of bytes, as the program prints it."""
-    receiver = HostReceiver(dialect)
+    receiver = CUBESPACE.host(dialect)
     if pending is not None:
         row = ICD.telemetry_by_id.get(pending)
         receiver.expect(Request.of(pending), row.size if row is not None else 0)
@@ -138,7 +138,7 @@ def test_the_receiver_of_the_c_reads_streams_as_ours(c: CDriver, dialect: Dialec
                 code=rng.randrange(1, 11) if kind is ReplyKind.NACK else 0,
             )
             try:
-                stream += encode_reply(reply, dialect)
+                stream += CUBESPACE.encode_reply(reply, dialect)
             except ProtocolError:
                 continue
         damaged = bytearray(stream + rng.randbytes(rng.randrange(3)))

@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.definition import Names
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export.cosmos_plugin.composed import link_text
@@ -18,7 +17,7 @@ from starhil.protocol.export.packets import row_key
 from starhil.protocol.icd import load_unit
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_stack import build_stack
+from starhil.protocol.serial_stack import SerialStack
 from tests.protocol.c_driver import CDriver, hex_or_none
 from tests.protocol.composed_links import REPLIES, REQUESTS, STACKS
 
@@ -31,11 +30,11 @@ def python_link(name: str) -> Any:
     return namespace["Link"]()
 
 
-def key_of(stack: ComposedStack, message: Request | Reply) -> int:
+def key_of(stack: SerialStack, message: Request | Reply) -> int:
     return row_key(stack.classes.classes, message.klass, message.id or 0)
 
 
-def expected(stack: ComposedStack, reply: Reply) -> tuple[str, int, bytes]:
+def expected(stack: SerialStack, reply: Reply) -> tuple[str, int, bytes]:
     """What the link has to make of a reply."""
     key = key_of(stack, reply)
     if reply.kind is ReplyKind.ACK:
@@ -132,7 +131,7 @@ def c_events(driver: CDriver, pending: int | None, data: bytes) -> list[list[str
     return [words[start : start + 4] for start in range(0, len(words), 4)]
 
 
-def our_events(stack: ComposedStack, data: bytes) -> list[list[str]]:
+def our_events(stack: SerialStack, data: bytes) -> list[list[str]]:
     """Messages from our end of the link, in the same form."""
     return [
         [
@@ -195,8 +194,7 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
 def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     model = SerialLinkModel.model_validate({**link, "request_header": [{"role": "id", "type": "u8"}]})
     custom: Any = {"mine": lambda: STACKS["nsp"].framing}
-    stack = build_stack(model, framings=custom, checks={"mine": lambda _data: b""})
-    assert isinstance(stack, ComposedStack)
+    stack = SerialStack(model, framings=custom, checks={"mine": lambda _data: b""})
     assert isinstance(model.framing, CustomFraming) or isinstance(model.check, CustomCheck)
     with pytest.raises(ProtocolError, match="'mine' is Python code in the unit's plugin"):
         link_text(stack)

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
-from starhil.protocol.cubespace_serial import DeviceReceiver, encode_reply
 from starhil.protocol.export.cosmos_plugin import answer_id
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import serial_answers
+from tests.protocol.composed_links import CUBESPACE
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import packets
 
@@ -38,7 +38,7 @@ def read(link: Any, data: bytes, piece: int = 7) -> list[bytes]:
 
 @pytest.mark.parametrize("dialect", Dialect)
 def test_every_row_goes_out_and_its_reply_becomes_its_packet(tmp_path: Path, dialect: Dialect) -> None:
-    link, device = protocol(tmp_path, dialect), DeviceReceiver()
+    link, device = protocol(tmp_path, dialect), CUBESPACE.device()
     for row in ICD.rows:
         for _, data in packets(row):
             payload = data if row.kind == "telecommand" else b""
@@ -50,11 +50,13 @@ def test_every_row_goes_out_and_its_reply_becomes_its_packet(tmp_path: Path, dia
             accepted = Reply(ReplyKind.ACK, row.id)
             reply = accepted if row.kind == "telecommand" else Reply(ReplyKind.TELEMETRY, row.id, data)
             packet = bytes((ANSWER, row.id, 0)) if row.kind == "telecommand" else bytes((row.id,)) + data
-            assert read(link, encode_reply(reply, dialect)) == [packet]
+            assert read(link, CUBESPACE.encode_reply(reply, dialect)) == [packet]
             if row.kind == "telecommand" or row.size != 1 or dialect is Dialect.C:
                 link.write_data(bytes((row.id,)) + payload)
                 refusal = Reply(ReplyKind.NACK, row.id, code=ErrorCode.BUSY)
-                assert read(link, encode_reply(refusal, dialect)) == [bytes((ANSWER, row.id, ErrorCode.BUSY))]
+                assert read(link, CUBESPACE.encode_reply(refusal, dialect)) == [
+                    bytes((ANSWER, row.id, ErrorCode.BUSY))
+                ]
 
 
 @pytest.mark.parametrize("dialect", Dialect)
@@ -65,13 +67,13 @@ def test_noise_between_replies_costs_no_reply_after_it(tmp_path: Path, dialect: 
         data = rng.randbytes(row.size)
         link.write_data(bytes((row.id,)))
         noise = rng.randbytes(rng.randrange(20)).replace(b"\x1f", b"\x00")
-        reply = encode_reply(Reply(ReplyKind.TELEMETRY, row.id, data), dialect)
+        reply = CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, row.id, data), dialect)
         assert read(link, noise + reply, rng.randrange(1, 9)) == [bytes((row.id,)) + data]
 
 
 def test_half_a_reply_is_dropped_after_silence(tmp_path: Path) -> None:
     link = protocol(tmp_path, Dialect.A)
-    reply = encode_reply(Reply(ReplyKind.TELEMETRY, 230, bytes(6)), Dialect.A)
+    reply = CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, 230, bytes(6)), Dialect.A)
     link.write_data(b"\xe6")
     assert read(link, reply[:5]) == []
     link.last_received -= 1.0
@@ -82,9 +84,9 @@ def test_half_a_reply_is_dropped_after_silence(tmp_path: Path) -> None:
 def test_unsolicited_telemetry_and_bursts_are_packets_of_their_own(tmp_path: Path) -> None:
     link = protocol(tmp_path, Dialect.C)
     link.write_data(b"\xe6")
-    unsolicited = encode_reply(Reply(ReplyKind.UNSOLICITED, 229, bytes(6)), Dialect.C)
-    burst = encode_reply(Reply(ReplyKind.BURST, 119, bytes(22)), Dialect.C)
-    reply = encode_reply(Reply(ReplyKind.TELEMETRY, 230, bytes(6)), Dialect.C)
+    unsolicited = CUBESPACE.encode_reply(Reply(ReplyKind.UNSOLICITED, 229, bytes(6)), Dialect.C)
+    burst = CUBESPACE.encode_reply(Reply(ReplyKind.BURST, 119, bytes(22)), Dialect.C)
+    reply = CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, 230, bytes(6)), Dialect.C)
     found = read(link, unsolicited + burst + reply)
     assert found == [b"\xe5" + bytes(6), b"\x77" + bytes(22), b"\xe6" + bytes(6)]
 
@@ -94,7 +96,7 @@ def test_a_command_waits_for_the_previous_reply_up_to_a_limit(tmp_path: Path) ->
     link.write_data(b"\xe6")
     assert not link.answered.is_set()
     link.write_data(b"\x80")  # after the time-out
-    assert read(link, encode_reply(Reply(ReplyKind.TELEMETRY, 128, bytes(8)), Dialect.B)) == [
+    assert read(link, CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, 128, bytes(8)), Dialect.B)) == [
         b"\x80" + bytes(8)
     ]
     assert link.answered.is_set()

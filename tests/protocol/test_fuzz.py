@@ -21,17 +21,18 @@ from starhil.protocol.can_framing import (
     encode_request_frames,
 )
 from starhil.protocol.candump import format_candump, parse_candump
-from starhil.protocol.cubespace_serial import DeviceReceiver, HostReceiver, encode_reply, encode_request
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
+from tests.protocol.composed_links import CUBESPACE, stack_of
 
 INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "100000"))
 SEED = 20260103
 MAX_SIZE = 80
+LIMITED = stack_of({"framing": {"kind": "cubespace"}, "max_size": MAX_SIZE})
 ICD = load_unit()
 
 SPECIAL = bytes((0x1F, 0x7F, 0xFF, 0x07, 0x0F, 0x2F, 0x4F, 0x00, 0x77, 0x3C, 0x3E, 0x20))
@@ -81,7 +82,7 @@ GOOD = Request.of(2, b"\x1f\x1f\x00\x01\x02\x03")
 
 
 def test_serial_device_receiver() -> None:
-    receiver = DeviceReceiver(max_size=MAX_SIZE)
+    receiver = LIMITED.device()
 
     def target(number: int, data: bytes) -> None:
         for event in receiver.feed(data, number * 0.01):
@@ -90,14 +91,14 @@ def test_serial_device_receiver() -> None:
                 assert len(event.data) < MAX_SIZE
         assert len(receiver._body) <= MAX_SIZE
         if number % 100 == 0:
-            assert receiver.feed(encode_request(GOOD), number * 0.01 + 0.5)[-1] == GOOD
+            assert receiver.feed(CUBESPACE.encode_request(GOOD), number * 0.01 + 0.5)[-1] == GOOD
 
-    fuzz([encode_request(request) for request in REQUESTS], target)
+    fuzz([CUBESPACE.encode_request(request) for request in REQUESTS], target)
 
 
 @pytest.mark.parametrize("dialect", Dialect)
 def test_serial_host_receiver(dialect: Dialect) -> None:
-    receiver = HostReceiver(dialect, max_size=MAX_SIZE)
+    receiver = LIMITED.host(dialect)
     good = Reply(ReplyKind.TELEMETRY, 230, b"\x1f\x1f\x00\x01\x02\x03")
     expected = Request.of(230)
 
@@ -109,9 +110,9 @@ def test_serial_host_receiver(dialect: Dialect) -> None:
         if number % 100 == 0:
             receiver.flush(number * 0.01 + 0.5)
             receiver.expect(expected, 6)
-            assert receiver.feed(encode_reply(good, dialect), number * 0.01 + 0.5)[-1] == good
+            assert receiver.feed(CUBESPACE.encode_reply(good, dialect), number * 0.01 + 0.5)[-1] == good
 
-    fuzz([encode_reply(reply, dialect) for reply in REPLIES], target)
+    fuzz([CUBESPACE.encode_reply(reply, dialect) for reply in REPLIES], target)
 
 
 def _frames_of(data: bytes, seeds: list[CanFrame], number: int) -> CanFrame:
@@ -214,7 +215,9 @@ class SerialReceiverMachine(RuleBasedStateMachine):
 
     def __init__(self) -> None:
         super().__init__()
-        self.receiver = DeviceReceiver(max_size=MAX_SIZE, timeout_s=1.0)
+        self.receiver = stack_of(
+            {"framing": {"kind": "cubespace"}, "max_size": MAX_SIZE, "timeout": 1.0}
+        ).device()
         self.now = 0.0
         self.in_junk = False
         self.half = False
@@ -232,7 +235,7 @@ class SerialReceiverMachine(RuleBasedStateMachine):
             self.wanted.append(FaultKind.UART_INCOMPLETE)
         self.wanted.append(request)
         self.half = self.in_junk = False
-        self._feed(encode_request(request))
+        self._feed(CUBESPACE.encode_request(request))
 
     @rule(noise=st.binary(min_size=1, max_size=20).map(lambda data: data.replace(b"\x1f", b"\x20")))
     def noise(self, noise: bytes) -> None:

@@ -11,14 +11,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.c.composed import link_parts
 from starhil.protocol.export.c.rows import RowCode
 from starhil.protocol.export.packets import key_of
 from starhil.protocol.quoting import Scope, c_comment, identifier
-from starhil.protocol.serial_interface import SerialStack
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack
 
 _FUNCTION: Final = re.compile(r"^static .*?\b(\w+)\(", re.MULTILINE)
 
@@ -34,7 +32,7 @@ def render_folder(icd: InterfaceDefinition) -> Mapping[str, str]:
 def files(icd: InterfaceDefinition, stack: SerialStack) -> Mapping[str, str]:
     """Return header and source of a definition with a serial link."""
     prefix = prefix_of(icd)
-    if isinstance(stack, ComposedStack):
+    if not stack.dialects:
         link_header, helpers, link = link_parts(stack)
         key_type = "uint32_t"
     else:

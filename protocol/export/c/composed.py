@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Final
 
 from starhil.protocol.checks import reversed_bits
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header, HeaderField
 from starhil.protocol.export.packets import row_key
 from starhil.protocol.link_schema import (
@@ -21,14 +20,14 @@ from starhil.protocol.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.messages import RequestKind
-from starhil.protocol.serial_interface import RowShape
+from starhil.protocol.serial_stack import RowShape, SerialStack
 from starhil.protocol.values import IcdError
 
 _MARKS: Final = 8
 """Maximum size of the start and end marks of a message, in bytes, apart from those in a definition."""
 
 
-def link_parts(stack: ComposedStack) -> tuple[str, str, str]:
+def link_parts(stack: SerialStack) -> tuple[str, str, str]:
     """Return the declarations of the link, its helper functions, and its source.
 
     Raises IcdError for a part of the link that is Python code or not supported.
@@ -67,7 +66,7 @@ def link_parts(stack: ComposedStack) -> tuple[str, str, str]:
 class _Writer:
     """Writes the functions that depend on headers, rows and check."""
 
-    def __init__(self, stack: ComposedStack) -> None:
+    def __init__(self, stack: SerialStack) -> None:
         self._stack = stack
         self._classes = stack.classes.by_name
         self._keys = {row_key(stack.classes.classes, row.klass, row.id): row for row in stack.rows}
@@ -266,7 +265,7 @@ class _Writer:
         )
 
 
-def _length(name: str, stack: ComposedStack, header: Header) -> str:
+def _length(name: str, stack: SerialStack, header: Header) -> str:
     sizes = {"start": str(len(stack.framing.start)), "header": "header", "data": "size", "check": str(stack.check.size), "end": str(len(stack.framing.end))}  # fmt: skip
     fields = [field for field in header.fields if field.role == "length"]
     terms = " + ".join(sizes[part] for part in sorted(fields[0].includes)) if fields else "0u"

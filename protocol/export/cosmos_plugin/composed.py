@@ -8,7 +8,6 @@ from pathlib import Path
 from pprint import pformat
 from typing import Any
 
-from starhil.protocol.composed_stack import ComposedStack
 from starhil.protocol.envelope import Header
 from starhil.protocol.export.packets import CLASS_SHIFT, row_key
 from starhil.protocol.link_schema import (
@@ -24,10 +23,11 @@ from starhil.protocol.link_schema import (
     XxHashCheck,
 )
 from starhil.protocol.messages import RequestKind
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import IcdError
 
 
-def link_text(stack: ComposedStack) -> str:
+def link_text(stack: SerialStack) -> str:
     """Return the code of a link: constants, check, framing and the class Link.
 
     Raises IcdError for a framing or check from a plugin.
@@ -55,7 +55,7 @@ def link_text(stack: ComposedStack) -> str:
     return "\n\n".join((head, *(text.strip("\n") + "\n" for text in functions)))
 
 
-def _framing(stack: ComposedStack) -> dict[str, Any]:
+def _framing(stack: SerialStack) -> dict[str, Any]:
     constants: dict[str, Any] = {"START": stack.framing.start, "END": stack.framing.end}
     match stack.link.framing:
         case SlipFraming() as model:
@@ -73,7 +73,7 @@ def _framing(stack: ComposedStack) -> dict[str, Any]:
     return constants
 
 
-def _check(stack: ComposedStack) -> dict[str, Any]:
+def _check(stack: SerialStack) -> dict[str, Any]:
     model = stack.link.check
     constants: dict[str, Any] = {"CHECK_SIZE": stack.check.size, "CHECK_COVERS": sorted(stack.check.covers)}
     if not isinstance(model, NoCheck):
@@ -97,7 +97,7 @@ def _check(stack: ComposedStack) -> dict[str, Any]:
     return constants
 
 
-def _headers(stack: ComposedStack) -> dict[str, Any]:
+def _headers(stack: SerialStack) -> dict[str, Any]:
     classes = stack.classes.classes
     codes = {item.name: item.code or 0 for item in classes}
     coded = [item for item in classes if item.code is not None]
@@ -129,7 +129,7 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
         }
 
 
-def _rows(stack: ComposedStack) -> Iterator[tuple[int, dict[str, Any]]]:
+def _rows(stack: SerialStack) -> Iterator[tuple[int, dict[str, Any]]]:
     for row in stack.rows:
         yield (
             row_key(stack.classes.classes, row.klass, row.id),

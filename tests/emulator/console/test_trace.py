@@ -4,10 +4,10 @@ import pytest
 
 from starhil.emulator.console.trace import Decoder, WireItem, canopen_text
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
-from starhil.protocol.cubespace_serial import encode_reply, encode_request
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
+from tests.protocol.composed_links import CUBESPACE
 
 ICD = load_unit()
 MODE = ICD.telecommands["set_mode"]
@@ -33,11 +33,11 @@ def test_serial_requests_and_replies_are_named_in_every_dialect(dialect):
     request, command = Request.of(STATUS.id), Request.of(MODE.id, MODE.encode({"mode": "standby"}))
     found = lines(
         [
-            (False, encode_request(request)),
-            (True, encode_reply(Reply(ReplyKind.TELEMETRY, STATUS.id, data), dialect)),
-            (False, encode_request(command)[:3]),
-            (False, encode_request(command)[3:]),
-            (True, encode_reply(Reply(ReplyKind.NACK, MODE.id, code=ErrorCode.SEQUENCE), dialect)),
+            (False, CUBESPACE.encode_request(request)),
+            (True, CUBESPACE.encode_reply(Reply(ReplyKind.TELEMETRY, STATUS.id, data), dialect)),
+            (False, CUBESPACE.encode_request(command)[:3]),
+            (False, CUBESPACE.encode_request(command)[3:]),
+            (True, CUBESPACE.encode_reply(Reply(ReplyKind.NACK, MODE.id, code=ErrorCode.SEQUENCE), dialect)),
         ],
         dialect,
     )

@@ -18,11 +18,11 @@ from starhil.protocol.can_framing import (
     MessageType,
     encode_request_frames,
 )
-from starhil.protocol.cubespace_serial import HostReceiver, encode_request
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
+from tests.protocol.composed_links import CUBESPACE
 
 SEED = 20260101
 JUNK = 10_000
@@ -46,10 +46,10 @@ class Linked:
     def over_serial(self, identifier, data=b"", dialect=None) -> list[Reply | LinkFault]:
         request = Request.of(identifier, data)
         row = self.bench.icd.row_by_id(identifier)
-        host = HostReceiver(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
+        host = CUBESPACE.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
         host.expect(request, row.size if row and identifier >= 128 else 0)
         self.uart.take()
-        self.uart.arrive(encode_request(request))
+        self.uart.arrive(CUBESPACE.encode_request(request))
         return host.feed(b"".join(self.uart.take()), 0.0)
 
     def over_can(self, identifier, data=b"", source=1, destination=4) -> list[Reply | LinkFault]:
@@ -92,8 +92,8 @@ def test_replies_keep_the_order_of_the_requests_while_a_save_is_pending(bench):
         linked = await Linked(bench).start()
         waiting = []
         bench.device._background = lambda _work, done: waiting.append(done)
-        save = encode_request(Request.of(bench.icd.telecommands["save_parameters"].id))
-        linked.uart.arrive(save + encode_request(Request.of(128)) + save)
+        save = CUBESPACE.encode_request(Request.of(bench.icd.telecommands["save_parameters"].id))
+        linked.uart.arrive(save + CUBESPACE.encode_request(Request.of(128)) + save)
         assert linked.uart.take() == []
         waiting.pop()(None)
         assert [len(body) for body in bodies_in(b"".join(linked.uart.take()))] == [1, 8]
@@ -138,7 +138,7 @@ def test_the_answer_to_a_change_of_the_bit_rate_goes_out_at_the_old_one(bench):
         number = bench.icd.parameters["serial_baud"].id
         for baud in (57600, 57600, 115200):
             value = bench.icd.telecommands["set_parameter"].encode({"parameter": number, "value": baud})
-            linked.uart.arrive(encode_request(Request.of(98, value)))
+            linked.uart.arrive(CUBESPACE.encode_request(Request.of(98, value)))
             await asyncio.sleep(0)
         acknowledge = b"\x1f\x7f\x00\x1f\xff"
         assert linked.uart.take() == [acknowledge, 57600, acknowledge, acknowledge, 115200]
@@ -205,7 +205,7 @@ def test_unsolicited_telemetry_goes_to_can_and_to_dialect_c_only(bench):
         assert linked.uart.take() == []
         bench.device.parameters.set({"serial_dialect": "c"})
         bench.step(0.5)
-        host = HostReceiver(Dialect.C)
+        host = CUBESPACE.host(Dialect.C)
         (event,) = host.feed(b"".join(linked.uart.take()), 0.0)
         assert (event.kind, event.id) == (ReplyKind.UNSOLICITED, 230)
 
@@ -349,11 +349,11 @@ def test_an_incomplete_message_is_abandoned_and_counted(bench, monkeypatch):
 def test_wire_faults_damage_outgoing_bytes(bench, settings, expected):
     async def scenario():
         linked = await Linked(bench).start()
-        linked.uart.arrive(encode_request(Request.of(128)))
+        linked.uart.arrive(CUBESPACE.encode_request(Request.of(128)))
         (good,) = linked.uart.take()
         bench.device.clock.set_ns(bench.device.clock.now_ns())
         linked.serial.wire.settings = settings
-        linked.uart.arrive(encode_request(Request.of(128)))
+        linked.uart.arrive(CUBESPACE.encode_request(Request.of(128)))
         sent = linked.uart.take()
         assert len(sent) == expected
         if settings.corrupt:
@@ -421,11 +421,11 @@ def test_the_same_commands_give_the_same_bytes(make_bench):
                 (96, b"\x02"),
                 (104, b"\xa0\x00\x00\x80\x40"),
             ):
-                linked.uart.arrive(encode_request(Request.of(identifier, data)))
+                linked.uart.arrive(CUBESPACE.encode_request(Request.of(identifier, data)))
             for _ in range(30):
                 bench.step(0.137)
                 for row in bench.icd.telemetry.values():
-                    linked.uart.arrive(encode_request(Request.of(row.id)))
+                    linked.uart.arrive(CUBESPACE.encode_request(Request.of(row.id)))
                     for frame in encode_request_frames(Request.of(row.id), 1, 4):
                         linked.bus.arrive(frame)
                 out.extend(b"".join(linked.uart.take()))
