@@ -111,6 +111,29 @@ def boresight(q: Quaternion) -> tuple[float, float, float]:
     )
 
 
+def to_radec_roll(q: Quaternion) -> tuple[float, float, float]:
+    """Return right ascension and declination of the boresight and the roll, in degrees, RA and roll from 0 to 360.
+
+    Roll follows from the rows of the matrix in `from_radec_roll`: −y·n is its cosine, −x·n its sine.
+    """
+    along = boresight(q)
+    ra, dec = math.atan2(along[1], along[0]), math.asin(min(1.0, max(-1.0, along[2])))
+    north = (-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec))
+    row_x = (
+        1.0 - 2.0 * (q.y * q.y + q.z * q.z),
+        2.0 * (q.x * q.y - q.w * q.z),
+        2.0 * (q.x * q.z + q.w * q.y),
+    )
+    row_y = (
+        2.0 * (q.x * q.y + q.w * q.z),
+        1.0 - 2.0 * (q.x * q.x + q.z * q.z),
+        2.0 * (q.y * q.z - q.w * q.x),
+    )
+    sine, cosine = (-math.fsum(a * b for a, b in zip(row, north, strict=True)) for row in (row_x, row_y))
+    roll = math.degrees(math.atan2(sine, cosine))
+    return math.degrees(ra) % 360.0, math.degrees(dec), roll % 360.0
+
+
 def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
     """Compare two attitudes; a quaternion and its negative are the same attitude."""
     # rotation from the true into the measured sensor frame: measured * conjugate(truth)

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
-import math
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Any, Final, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationInfo,
+    model_validator,
+)
 
 from starhil.hil_tests.attitude import (
     AttitudeError,
@@ -14,11 +23,11 @@ from starhil.hil_tests.attitude import (
     attitude_error,
     from_radec_roll,
     from_vector_part,
+    to_radec_roll,
     unit,
     wrapped_difference,
 )
-from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
-from starhil.hil_tests.script_reader import TableReader
+from starhil.hil_tests.errors import BenchError, near_matches
 from starhil.protocol.values import Value
 
 RELATIVE_ROUNDING: Final = 1e-6
@@ -26,6 +35,9 @@ RELATIVE_ROUNDING: Final = 1e-6
 
 WHOLE_DIGITS: Final = 1e4
 """Numbers from this one on are shown with six decimals, to keep the fraction of a Unix time."""
+
+LARGE_ARCSEC: Final = 3600.0
+"""Attitude errors from here on are given in degrees, with both attitudes."""
 
 CLOCK_VARIABLES: Final = ("now", "now_s", "now_ms")
 """Predefined variables: Unix time of the OBC in seconds, its whole seconds, and its milliseconds."""
@@ -41,19 +53,28 @@ class Variable:
 Operand = Value | Variable
 
 
-def operand(value: Any, reader: TableReader, key: str, known: frozenset[str]) -> Operand:
+class Keys(BaseModel):
+    """A table of a session script: no unknown keys, and no conversion between numbers, flags and texts."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, populate_by_name=True)
+
+
+def read_operand(value: Any, info: ValidationInfo) -> Operand:
     """Read a plain value or a `$name`, which an earlier step must have captured."""
     if isinstance(value, str) and value.startswith("$"):
-        name = value[1:]
-        if name not in known and name not in CLOCK_VARIABLES:
-            every = [*known, *CLOCK_VARIABLES]
-            reader.fail(
-                f"'{key}': nothing was captured as '${name}' before this step{near_matches(name, every)}"
+        every = [*(info.context or {}).get("captured", ()), *CLOCK_VARIABLES]
+        if value[1:] not in every:
+            raise ValueError(
+                f"nothing was captured as '{value}' before this step{near_matches(value[1:], every)}"
             )
-        return Variable(name)
+        return Variable(value[1:])
     if not isinstance(value, bool | int | float | str):
-        reader.fail(f"'{key}' must be a number, true, false or a text, not {value!r}")
+        raise ValueError(f"must be a number, true, false or a text, not {value!r}")  # noqa: TRY004 -- for pydantic
     return value
+
+
+ReadOperand = Annotated[Operand, PlainValidator(read_operand)]
+NonNegative = Annotated[float, Field(ge=0.0)]
 
 
 def resolve(value: Operand, variables: Mapping[str, Value]) -> Value:
@@ -76,43 +97,42 @@ def show(value: Value) -> str:
     return str(value)
 
 
-@dataclass(frozen=True)
-class Expectation:
-    """Conditions on one field; all that are given must hold.
+class Conditions(Keys):
+    """Conditions on one field, of which all that are given must hold; a plain value stands for `{ value = … }`.
 
-    Attributes
-    ----------
-    equals : operand
-        The expected value; `plus` is added to a number.
-    within : float
-        Largest absolute difference from `equals`, in the unit of the field.
-    angle : bool
-        Whether to compare modulo 360 degrees.
-    minimum, maximum, above : operand
-        Bounds, the last one exclusive.
-    one_of : tuple of operands
-        Allowed values.
-    differs_from : operand
-        A value that is not allowed.
+    `value` is compared with `plus` added and `within` as tolerance, `angle_deg` also modulo 360 degrees; `above` is
+    exclusive, `min` and `max` are not.
     """
 
-    field: str
-    equals: Operand | None = None
-    within: float | None = None
+    value: ReadOperand | None = None
+    angle_deg: ReadOperand | None = None
+    within: NonNegative | None = None
     plus: float = 0.0
-    angle: bool = False
-    minimum: Operand | None = None
-    maximum: Operand | None = None
-    above: Operand | None = None
-    one_of: tuple[Operand, ...] = ()
-    differs_from: Operand | None = None
+    minimum: ReadOperand | None = Field(None, alias="min")
+    maximum: ReadOperand | None = Field(None, alias="max")
+    above: ReadOperand | None = None
+    one_of: list[ReadOperand] = Field(default_factory=list)
+    differs_from: ReadOperand | None = Field(None, alias="not")
 
-    def mismatch(self, value: Value, variables: Mapping[str, Value]) -> str | None:
-        """Return a description of the mismatch, or None if the value meets the conditions."""
+    @model_validator(mode="after")
+    def _can_be_checked(self) -> Self:
+        if not self.model_fields_set:
+            raise ValueError("is empty: give value, min, max, above, one_of, not or angle_deg")
+        if self.equals is None and {"within", "plus"} & self.model_fields_set:
+            raise ValueError("'within' and 'plus' need 'value' or 'angle_deg' as well")
+        return self
+
+    @property
+    def equals(self) -> Operand | None:
+        """The expected value or angle."""
+        return self.value if self.angle_deg is None else self.angle_deg
+
+    def mismatch(self, field: str, value: Value, variables: Mapping[str, Value]) -> str | None:
+        """Return a description of the mismatch of a field, or None if its value meets the conditions."""
         for check in (self._equality, self._bounds, self._choices):
             text = check(value, variables)
             if text is not None:
-                return f"{self.field} is {show(value)}, expected {text}"
+                return f"{field} is {show(value)}, expected {text}"
         return None
 
     def _equality(self, value: Value, variables: Mapping[str, Value]) -> str | None:
@@ -129,7 +149,8 @@ class Expectation:
         tolerance = RELATIVE_ROUNDING * abs(wanted) if self.within is None else self.within
         if isinstance(value, int) and self.within is None:
             tolerance = 0.0
-        distance = wrapped_difference(float(value), wanted) if self.angle else abs(float(value) - wanted)
+        angle = self.angle_deg is not None
+        distance = wrapped_difference(float(value), wanted) if angle else abs(float(value) - wanted)
         if distance <= tolerance:
             return None
         text = show(wanted if self.plus else expected)
@@ -165,54 +186,65 @@ def _is_number(value: Value) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def read_expectation(field: str, value: Any, reader: TableReader, known: frozenset[str]) -> Expectation:
-    """Read the expectation for one field: a plain value, or a table of conditions."""
-    if not isinstance(value, dict):
-        return Expectation(field, equals=operand(value, reader, field, known))
-    table = TableReader(value, f"{reader.location}: {field}")
-
-    def part(key: str) -> Operand | None:
-        return operand(table.value(key), table, key, known) if table.has(key) else None
-
-    angle = table.has("angle_deg")
-    equals = part("angle_deg") if angle else part("value")
-    one_of = table.value("one_of", [])
-    if not isinstance(one_of, list):
-        table.fail("'one_of' must be a list")
-    expectation = Expectation(
-        field,
-        equals=equals,
-        within=table.optional_number("within", minimum=0.0),
-        plus=table.number("plus", 0.0),
-        angle=angle,
-        minimum=part("min"),
-        maximum=part("max"),
-        above=part("above"),
-        one_of=tuple(operand(item, table, "one_of", known) for item in one_of),
-        differs_from=part("not"),
-    )
-    table.reject_unknown_keys()
-    if not value:
-        table.fail("is empty: give value, min, max, above, one_of, not or angle_deg")
-    if equals is None and ("within" in value or "plus" in value):
-        table.fail("'within' and 'plus' need 'value' or 'angle_deg' as well")
-    return expectation
+ReadConditions = Annotated[
+    Conditions, BeforeValidator(lambda given: given if isinstance(given, dict) else {"value": given})
+]
 
 
 # --- attitudes ---
 
 
-@dataclass(frozen=True)
-class AttitudeCheck:
-    """Largest allowed attitude errors in arcseconds; None: not checked.
+def _four_numbers(value: Any) -> list[float]:
+    numbers = value if isinstance(value, list) else []
+    if len(numbers) != 4 or not all(type(number) in (int, float) for number in numbers):
+        raise ValueError("must be a list of 4 numbers")
+    return numbers
 
-    `truth` is the attitude given in the step; None: the script's.
-    """
 
-    cross_arcsec: float | None
-    roll_arcsec: float | None
-    total_arcsec: float | None
-    truth: Quaternion | None
+class StatedAttitude(Keys):
+    """An attitude as `ra_deg, dec_deg, roll_deg` or `quaternion_xyzw`, or none."""
+
+    ra_deg: float | None = None
+    dec_deg: float | None = None
+    roll_deg: float | None = None
+    quaternion_xyzw: Annotated[list[float], PlainValidator(_four_numbers)] | None = None
+
+    @model_validator(mode="after")
+    def _is_an_attitude(self) -> Self:
+        self.attitude  # noqa: B018 -- raises
+        return self
+
+    @property
+    def attitude(self) -> Quaternion | None:
+        """The attitude; None if the table has none."""
+        if self.quaternion_xyzw is not None:
+            try:
+                return unit(self.quaternion_xyzw)
+            except BenchError as error:
+                raise ValueError(f"'quaternion_xyzw': {error}") from None
+        angles = {name: getattr(self, name) for name in ("ra_deg", "dec_deg", "roll_deg")}
+        missing = [name for name, angle in angles.items() if angle is None]
+        if len(missing) == len(angles):
+            return None
+        if missing:
+            raise ValueError(f"'{missing[0]}' must be a number, but is missing")
+        if abs(angles["dec_deg"]) > 90.0:
+            raise ValueError(f"'dec_deg' must lie within -90 and 90, not {angles['dec_deg']:g}")
+        return from_radec_roll(*angles.values())
+
+
+class AttitudeCheck(StatedAttitude):
+    """Largest attitude errors, and the true attitude if it is not the script's."""
+
+    within_arcsec: NonNegative | None = None
+    roll_within_arcsec: NonNegative | None = None
+    total_within_arcsec: NonNegative | None = None
+
+    @model_validator(mode="after")
+    def _has_a_limit(self) -> Self:
+        if {self.within_arcsec, self.roll_within_arcsec, self.total_within_arcsec} == {None}:
+            raise ValueError("needs a tolerance: within_arcsec, roll_within_arcsec or total_within_arcsec")
+        return self
 
     def judge(
         self, values: Mapping[str, Value], truth: Quaternion
@@ -224,13 +256,27 @@ class AttitudeCheck:
             return None, str(refusal)
         error = attitude_error(measured, truth)
         for word, limit, found in (
-            ("cross-boresight", self.cross_arcsec, error.cross_boresight_arcsec),
-            ("roll", self.roll_arcsec, error.roll_arcsec),
-            ("total", self.total_arcsec, error.total_arcsec),
+            ("cross-boresight", self.within_arcsec, error.cross_boresight_arcsec),
+            ("roll", self.roll_within_arcsec, error.roll_arcsec),
+            ("total", self.total_within_arcsec, error.total_arcsec),
         ):
             if limit is not None and not found <= limit:
-                return error, f"{word} error {found:.1f} arcsec, expected at most {limit:g} arcsec"
+                problem = f"{word} error {show_angle(found)}, expected at most {limit:g} arcsec"
+                if found > LARGE_ARCSEC:
+                    problem += f"; measured {describe(measured)}, true {describe(truth)}"
+                return error, problem
         return error, None
+
+
+def show_angle(arcsec: float) -> str:
+    """Format an error: in arcseconds, or in degrees if it is large."""
+    return f"{arcsec:.1f} arcsec" if arcsec <= LARGE_ARCSEC else f"{arcsec / 3600.0:.3f} deg"
+
+
+def describe(attitude: Quaternion) -> str:
+    """Format an attitude."""
+    ra_deg, dec_deg, roll_deg = to_radec_roll(attitude)
+    return f"RA {ra_deg:.4f}, Dec {dec_deg:.4f}, roll {roll_deg:.4f} deg"
 
 
 def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
@@ -247,35 +293,3 @@ def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
     if "q_w" in values:
         return unit([*parts, float(values["q_w"])])
     return from_vector_part(*parts)
-
-
-def read_stated_attitude(reader: TableReader) -> Quaternion | None:
-    """Read `ra_deg, dec_deg, roll_deg` or `quaternion_xyzw`; None if the table has neither."""
-    if reader.has("quaternion_xyzw"):
-        try:
-            return unit(reader.numbers("quaternion_xyzw", 4))
-        except ScriptError:
-            raise
-        except BenchError as error:
-            reader.fail(f"'quaternion_xyzw': {error}")
-    if any([reader.has("ra_deg"), reader.has("dec_deg"), reader.has("roll_deg")]):
-        dec = reader.number("dec_deg")
-        if abs(dec) > 90.0:
-            reader.fail(f"'dec_deg' must lie within -90 and 90, not {dec:g}")
-        return from_radec_roll(reader.number("ra_deg"), dec, reader.number("roll_deg"))
-    return None
-
-
-def read_attitude_check(reader: TableReader) -> AttitudeCheck:
-    """Read the table `attitude` of a step: tolerances and, optionally, the true attitude."""
-    check = AttitudeCheck(
-        reader.optional_number("within_arcsec", minimum=0.0),
-        reader.optional_number("roll_within_arcsec", minimum=0.0),
-        reader.optional_number("total_within_arcsec", minimum=0.0),
-        read_stated_attitude(reader),
-    )
-    reader.reject_unknown_keys()
-    limits = (check.cross_arcsec, check.roll_arcsec, check.total_arcsec)
-    if all(limit is None or math.isinf(limit) for limit in limits):
-        reader.fail("needs a tolerance: within_arcsec, roll_within_arcsec or total_within_arcsec")
-    return check

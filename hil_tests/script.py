@@ -1,10 +1,9 @@
 """Session scripts: TOML files of telecommands, reads and expectations, validated before the run.
 
-    title = "First light"
+    default_name = "First light"
 
     [emulator]                      # used by `starhil session --start`
     profile = "default"
-    set = ["truth.ra_deg=83.8"]
 
     [truth]                         # the true attitude, or a file that the emulator writes
     ra_deg = 83.8
@@ -26,52 +25,38 @@
     within_s = 20                   # ask again until the expectations hold
     attitude = { within_arcsec = 30, roll_within_arcsec = 120 }
 
-Every step has exactly one of the keys in `ACTIONS`. Rows, fields, parameters and enumeration names are those
-of the interface definition; the error for an unknown name gives file, step and near matches.
+Every step has exactly one of the keys in `ACTIONS`, each with a class below: the keys of the class are the keys of the
+step, and a validated step is what the session runs. Rows, fields, parameters and enumeration names are those of the
+interface definition. All errors of a file are reported, one a line, with file, step, key and near matches.
 """
 
 from __future__ import annotations
 
+import re
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
+
+from pydantic import AfterValidator, Field, PlainValidator, ValidationError, ValidationInfo, model_validator
+from pydantic_core import ErrorDetails
 
 from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
 from starhil.hil_tests.expect import (
     AttitudeCheck,
-    Expectation,
+    Conditions,
+    Keys,
+    NonNegative,
     Operand,
+    ReadConditions,
+    ReadOperand,
+    StatedAttitude,
     Variable,
-    operand,
-    read_attitude_check,
-    read_expectation,
-    read_stated_attitude,
     show,
 )
 from starhil.hil_tests.raw_traffic import parse_frame, pattern
-from starhil.hil_tests.script_model import (
-    LINKS,
-    SIGNALS,
-    Action,
-    Command,
-    DownloadImage,
-    EmulatorRequest,
-    GetParameter,
-    Listen,
-    Read,
-    Restart,
-    Sample,
-    Script,
-    Send,
-    SetParameter,
-    Step,
-    Truth,
-    Wait,
-)
-from starhil.hil_tests.script_reader import TableReader
-from starhil.protocol.codec import Field, Row
+from starhil.protocol.codec import Field as RowField
+from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.user_file import read_user_text
@@ -79,8 +64,400 @@ from starhil.protocol.values import Parameter, Value
 
 LISTED: Final = "; `starhil icd list` lists all"
 """Hint if no known name is similar."""
-
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
+
+
+# --- values of keys ---
+
+
+def _icd(info: ValidationInfo) -> InterfaceDefinition:
+    found: InterfaceDefinition = (info.context or {})["icd"]
+    return found
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("must be a text")  # noqa: TRY004 -- for pydantic
+    return value
+
+
+def _texts(value: Any) -> tuple[str, ...]:
+    """Return a list of texts; a single text is a list of one."""
+    values = [value] if isinstance(value, str) else value
+    if not isinstance(values, list) or not all(isinstance(item, str) for item in values):
+        raise ValueError("must be a text or a list of texts")
+    return tuple(values)
+
+
+def _telemetry(value: Any, info: ValidationInfo) -> Row:
+    return _row(
+        _text(value),
+        "telemetry row",
+        _icd(info).telemetry,
+        _icd(info).telecommands,
+        "a telecommand: use command",
+    )
+
+
+def _telecommand(value: Any, info: ValidationInfo) -> Row:
+    return _row(
+        _text(value), "telecommand", _icd(info).telecommands, _icd(info).telemetry, "telemetry: use read"
+    )
+
+
+def _row(name: str, kind: str, rows: Mapping[str, Row], others: Mapping[str, Row], remedy: str) -> Row:
+    if name not in rows:
+        hint = f"; it is {remedy}" if name in others else near_matches(name, rows) or LISTED
+        raise ValueError(f"unknown {kind} '{name}'{hint}")
+    return rows[name]
+
+
+def _parameter(value: Any, info: ValidationInfo) -> Parameter:
+    known = _icd(info).parameters
+    if _text(value) not in known:
+        raise ValueError(f"unknown parameter '{value}'{near_matches(value, known) or LISTED}")
+    return known[value]
+
+
+def _one_of(names: Iterable[str], value: Any) -> str:
+    if _text(value) not in (known := sorted(names)):
+        raise ValueError(f"must be one of {', '.join(known)}, not '{value}'{near_matches(value, known)}")
+    return str(value)
+
+
+def _error_code(value: Any, info: ValidationInfo) -> str:
+    return _one_of(_icd(info).enums["error_code"].values, value)
+
+
+def _image_size(value: Any, info: ValidationInfo) -> str:
+    return _one_of(_icd(info).enums["image_size"].values, value)
+
+
+def _hex_bytes(value: Any) -> bytes:
+    try:
+        return bytes.fromhex(_text(value))
+    except ValueError:
+        raise ValueError(f'must be bytes in hexadecimal, such as "1F 7F 80 1F FF", not {value!r}') from None
+
+
+def _file_name(name: str) -> str:
+    if name in {"", ".."} or Path(name).name != name or "\0" in name:
+        raise ValueError("must be a plain file name; the file is written to the log folder")
+    return name
+
+
+def _fraction(value: float) -> float:
+    if not 0.0 <= value <= 1.0:
+        raise ValueError("must be a fraction of the samples, from 0 to 1")
+    return value
+
+
+Telemetry = Annotated[Row, PlainValidator(_telemetry)]
+Refusal = Annotated[str, PlainValidator(_error_code)]
+FileName = Annotated[str, AfterValidator(_file_name)]
+Texts = Annotated[tuple[str, ...], PlainValidator(_texts)]
+Positive = Annotated[float, Field(ge=0.001)]
+Count = Annotated[int, Field(ge=1)]
+Link = Literal["serial", "can", "both"]
+
+
+# --- steps ---
+
+
+class Step(Keys):
+    """One step: its action, given by the class; its expectations; how often it is tried."""
+
+    default_name: ClassVar[str] = ""
+    """The name of a step that has none, in which `self` is the step."""
+
+    name: str = ""
+    expect: dict[str, ReadConditions] = Field(default_factory=dict)
+    attitude: AttitudeCheck | None = None
+    capture: dict[str, str] = Field(default_factory=dict)
+    """Variable → field."""
+    link: Link | None = None
+    repeat: Count = 1
+    every_s: NonNegative = 0.2
+    within_s: NonNegative | None = None
+    """Repeat until the expectations hold, for at most this long."""
+    timeout_s: Positive | None = None
+    retries: Annotated[int, Field(ge=0)] = 0
+    max_latency_s: NonNegative | None = None
+    _number: int = 0
+
+    @property
+    def number(self) -> int:
+        """Place in the script, from 1 on."""
+        return self._number
+
+    @property
+    def reading(self) -> Row | None:
+        """The row that the step reads; None if it reads no telemetry."""
+        return None
+
+    @model_validator(mode="after")
+    def _fits_its_row(self, info: ValidationInfo) -> Self:
+        problems = [*self._problems(info)]
+        if problems:
+            raise ValueError("\n".join(problems))
+        self._number = (info.context or {})["number"]
+        self.name = self.name or self.default_name.format(self=self)
+        return self
+
+    def _problems(self, info: ValidationInfo) -> Iterator[str]:
+        row = self.reading
+        if row is None:
+            yield from (
+                f"'{key}' needs a step that reads telemetry"
+                for key in ("expect", "capture")
+                if getattr(self, key)
+            )
+        if self.attitude is not None:
+            if row is None or not row.named_fields.keys() >= ATTITUDE_FIELDS:
+                yield "'attitude' needs a step that reads a row with a quaternion (attitude, quaternion)"
+            elif self.attitude.attitude is None and not (info.context or {})["has_truth"]:
+                yield "'attitude' has no truth to compare with: give one here or in a table [truth]"
+        if row is not None:
+            yield from _unknown_fields("capture", row, self.capture.values())
+            yield from _unknown_fields("expect", row, self.expect)
+            for name in self.expect.keys() & row.named_fields.keys():
+                yield from (
+                    f"expect: {text}" for text in _impossible(row.named_fields[name], self.expect[name])
+                )
+
+
+class Command(Step):
+    """Send a telecommand."""
+
+    default_name = "command {self.row.name}"
+    row: Annotated[Row, PlainValidator(_telecommand)] = Field(alias="command")
+    values: dict[str, ReadOperand] = Field({}, alias="with")
+    raw: Annotated[bytes, PlainValidator(_hex_bytes)] | None = Field(None, alias="with_hex")
+    """Data as bytes instead of `values`, for malformed telecommands."""
+    refused: Refusal | None = None
+    """Name of the expected error code; None if the telecommand must be accepted."""
+
+    def _problems(self, info: ValidationInfo) -> Iterator[str]:
+        yield from super()._problems(info)
+        if self.values and self.raw is not None:
+            yield "give the parameters as a table 'with' or as bytes 'with_hex', not both"
+        unknown = [*_unknown_fields("with", self.row, self.values)]
+        yield from unknown
+        if (
+            self.raw is None
+            and not unknown
+            and not any(isinstance(v, Variable) for v in self.values.values())
+        ):
+            try:
+                self.row.encode(static_values(self.values), check=self.refused is None)
+            except ProtocolError as error:
+                yield str(error)
+
+
+class ReadingStep(Step):
+    """A step that reads a telemetry row."""
+
+    row: Telemetry
+
+    @property
+    def reading(self) -> Row | None:
+        """The row that the step reads."""
+        return self.row
+
+
+class Read(ReadingStep):
+    """Read a telemetry row."""
+
+    default_name = "read {self.row.name}"
+    row: Telemetry = Field(alias="read")
+    refused: Refusal | None = None
+
+
+class Listen(ReadingStep):
+    """Wait for unsolicited telemetry of a row, `count` times."""
+
+    default_name = "listen for {self.row.name}"
+    row: Telemetry = Field(alias="listen")
+    count: Count = 1
+
+
+class Sample(ReadingStep):
+    """Read a telemetry row repeatedly into a CSV file."""
+
+    default_name = "sample {self.row.name}"
+    row: Telemetry = Field(alias="sample")
+    every_s: NonNegative
+    for_s: NonNegative
+    file: FileName = ""
+    at_least: Annotated[float, AfterValidator(_fraction)] = 1.0
+    """Fraction of the samples for which the expectations must hold, 0 to 1."""
+    min_samples: Count = 1
+
+    @model_validator(mode="before")
+    @classmethod
+    def _from_table(cls, table: dict[str, Any]) -> dict[str, Any]:
+        """Take the keys from a table `sample` too."""
+        inner = table["sample"]
+        if not isinstance(inner, dict):
+            return table
+        return {**table, **{"sample" if key == "telemetry" else key: value for key, value in inner.items()}}
+
+    @model_validator(mode="after")
+    def _named_for_its_row(self) -> Self:
+        self.file = self.file or f"{self.row.name}.csv"
+        return self
+
+
+class SetParameter(Step):
+    """Set a parameter by name and read it back."""
+
+    default_name = "set parameter {self.parameter.name}"
+    parameter: Annotated[Parameter, PlainValidator(_parameter)] = Field(alias="set_parameter")
+    value: ReadOperand
+    refused: Refusal | None = None
+
+    def _problems(self, info: ValidationInfo) -> Iterator[str]:
+        yield from super()._problems(info)
+        if self.refused is not None:
+            if isinstance(self.value, str):
+                yield "'value' must be a number if a refusal is expected"
+        elif not isinstance(self.value, Variable):
+            try:
+                self.parameter.check(self.value)
+            except ProtocolError as error:
+                yield str(error)
+
+
+class GetParameter(Step):
+    """Read a parameter by name; expectations refer to the fields of the row `parameter`."""
+
+    default_name = "get parameter {self.parameter.name}"
+    parameter: Annotated[Parameter, PlainValidator(_parameter)] = Field(alias="get_parameter")
+    _row: Row | None = None
+
+    @property
+    def reading(self) -> Row | None:
+        """The row that the step reads."""
+        return self._row
+
+    def _problems(self, info: ValidationInfo) -> Iterator[str]:
+        self._row = _icd(info).telemetry["parameter"]
+        yield from super()._problems(info)
+
+
+class DownloadImage(Step):
+    """Save an image in the unit, download it and write it as a PNG file."""
+
+    default_name = "download image {self.file}"
+    file: FileName = Field(alias="download_image")
+    size: Annotated[str, PlainValidator(_image_size)] = "size_128"
+    method: Literal["frames", "burst"] = "frames"
+    """`frames` of 128 bytes, or `burst` packets with hole maps."""
+
+
+class Send(Step):
+    """Send raw bytes in hexadecimal (serial) or CAN frames in the format of `cansend`, and check the answer.
+
+    The format determines the link. Without `answer`, anything may be answered.
+    """
+
+    default_name = "send raw data"
+    data: Texts = Field(alias="send")
+    answer: Texts | None = None
+    listen_s: NonNegative = 0.3
+
+    @model_validator(mode="after")
+    def _has_one_format(self) -> Self:
+        try:
+            for text in self.data:
+                if "#" in text:
+                    parse_frame(text)
+                else:
+                    bytes.fromhex(text)
+            for text in self.answer or ():
+                pattern(text)
+        except (BenchError, ValueError) as error:
+            raise ValueError(f"'send' or 'answer': {error}") from None
+        frames = {"#" in text for text in self.data}
+        if len(frames) != 1:
+            raise ValueError(
+                "'send' takes bytes in hexadecimal or CAN frames in the format of cansend, not both"
+            )
+        self.link = "can" if frames == {True} else "serial"
+        return self
+
+
+class Wait(Step):
+    """Do nothing for a while."""
+
+    default_name = "wait {self.seconds:g} s"
+    seconds: NonNegative = Field(alias="wait_s")
+
+
+class Restart(Step):
+    """End the emulator that the session started, by a signal, and start it again."""
+
+    default_name = "restart the emulator ({self.signal})"
+    signal: Literal["term", "kill"] = Field(alias="restart")
+
+
+ACTIONS: Final[Mapping[str, type[Step]]] = {
+    "command": Command,
+    "read": Read,
+    "listen": Listen,
+    "sample": Sample,
+    "set_parameter": SetParameter,
+    "get_parameter": GetParameter,
+    "download_image": DownloadImage,
+    "send": Send,
+    "wait_s": Wait,
+    "restart": Restart,
+}
+"""Key of an action → its class."""
+
+
+# --- the script ---
+
+
+class Truth(StatedAttitude):
+    """The true attitude, or a file of true attitudes over time that the emulator writes."""
+
+    file: FileName | None = None
+
+    @model_validator(mode="after")
+    def _one_form(self) -> Self:
+        if self.attitude is not None and self.file is not None:
+            raise ValueError("give an attitude or a file, not both")
+        return self
+
+
+class EmulatorRequest(Keys):
+    """How `--start` starts the emulator for this script."""
+
+    profile: str | None = None
+    settings: Texts = Field((), alias="set")
+    seed: Annotated[int, Field(ge=0)] | None = None
+
+
+class Defaults(Keys):
+    """Defaults for all steps."""
+
+    timeout_s: Positive = 1.0
+    retries: Annotated[int, Field(ge=0)] = 0
+    keep_going: bool = False
+    link: Link | None = None
+
+
+class Script(Keys):
+    """A validated session script."""
+
+    title: str = ""
+    doc: str = ""
+    truth: Truth = Truth()
+    emulator: EmulatorRequest = EmulatorRequest()
+    defaults: Defaults = Defaults()
+    steps: Any = Field((), alias="step")
+    """Tables; in a validated script a list of `Step`."""
 
 
 def load_script(path: Path, icd: InterfaceDefinition) -> Script:
@@ -89,350 +466,161 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     Raises
     ------
     ScriptError
-        The file cannot be read, is not TOML, or does not match the interface definition; the text gives file,
-        step and near matches.
+        The file cannot be read, is not TOML, or does not match the interface definition; one line for each error.
     """
     try:
-        table = tomllib.loads(read_user_text(path))
+        document = tomllib.loads(read_user_text(path))
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "not a text file"
         raise ScriptError(f"{path}: cannot be read: {reason}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScriptError(f"{path}: not valid TOML: {error}") from None
-    return _Checker(path, icd).script(table)
+    script, problems = _checked(Script, {"title": path.stem.replace("_", " "), **document}, path.name)
+    tables = document.get("step", [])
+    if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
+        problems.append(f"{path.name}: 'step' must be an array of tables: write [[step]] before each")
+        tables = []
+    elif not tables:
+        problems.append(f"{path.name}: has no steps: write [[step]] and one of the actions below it")
+    captured: set[str] = set()
+    context = {"icd": icd, "captured": captured, "has_truth": bool(document.get("truth"))}
+    steps = []
+    for number, table in enumerate(tables, 1):
+        step, found = _step(f"{path.name}: step {number}", table, {**context, "number": number})
+        steps.append(step)
+        problems += found
+        names = table.get("capture")
+        captured.update(names if isinstance(names, dict) else ())  # also of a step with an error
+    if problems or script is None:
+        raise ScriptError("\n".join(problems))
+    return script.model_copy(update={"steps": steps})
 
 
-class _Checker:
-    """Validates the tables of one file, with the variables that earlier steps captured."""
-
-    def __init__(self, path: Path, icd: InterfaceDefinition) -> None:
-        self._path = path
-        self._icd = icd
-        self._captured: set[str] = set()
-        self._has_truth = False
-
-    def script(self, table: dict[str, Any]) -> Script:
-        """Check the whole file."""
-        reader = TableReader(table, self._path.name)
-        title = reader.text("title", self._path.stem.replace("_", " "))
-        doc = reader.text("doc", "")
-        truth = self._truth(reader.sub("truth"))
-        self._has_truth = truth.attitude is not None or truth.file is not None
-        emulator = self._emulator(reader.sub("emulator"))
-        defaults = reader.sub("defaults")
-        timeout_s = defaults.number("timeout_s", 1.0, minimum=0.001)
-        retries = defaults.count("retries", 0, minimum=0)
-        keep_going = defaults.flag("keep_going", default=False)
-        link = self._link(defaults)
-        defaults.reject_unknown_keys()
-        tables = reader.sub_tables("step")
-        reader.reject_unknown_keys()
-        if not tables:
-            reader.fail("has no steps: write [[step]] and one of the actions below it")
-        steps = tuple(self._step(number, item) for number, item in enumerate(tables, start=1))
-        return Script(self._path, title, doc, truth, emulator, timeout_s, retries, keep_going, link, steps)
-
-    def _truth(self, reader: TableReader) -> Truth:
-        attitude = read_stated_attitude(reader)
-        file = self._file_name(reader, "file") if reader.has("file") else None
-        reader.reject_unknown_keys()
-        if attitude is not None and file is not None:
-            reader.fail("give an attitude or a file, not both")
-        return Truth(attitude, file)
-
-    def _emulator(self, reader: TableReader) -> EmulatorRequest:
-        request = EmulatorRequest(
-            reader.text("profile") if reader.has("profile") else None,
-            reader.texts("set"),
-            reader.count("seed", 1, minimum=0) if reader.has("seed") else None,
-        )
-        reader.reject_unknown_keys()
-        return request
-
-    def _step(self, number: int, table: dict[str, Any]) -> Step:
-        reader = TableReader(table, f"{self._path.name}: step {number}")
-        present = [key for key in ACTIONS if key in table]
-        if len(present) != 1:
-            unknown = [key for key in table if key not in STEP_KEYS]
-            hint = f"; '{unknown[0]}' is unknown{near_matches(unknown[0], STEP_KEYS)}" if unknown else ""
-            found = "has none" if not present else f"has {' and '.join(present)}"
-            reader.fail(f"needs exactly one action of {', '.join(ACTIONS)}; {found}{hint}")
-        verb = present[0]
-        action, default_name = ACTIONS[verb](self, reader)
-        name = reader.text("name", default_name)
-        row = self._answer_row(action)
-        expect = self._expectations(reader, row)
-        attitude = self._attitude(reader, row)
-        capture = self._captures(reader, row)
-        step = Step(
-            number=number,
-            name=name,
-            action=action,
-            expect=expect,
-            attitude=attitude,
-            capture=capture,
-            link=action.link if isinstance(action, Send) else self._link(reader),
-            repeat=reader.count("repeat", 1),
-            every_s=action.every_s
-            if isinstance(action, Sample)
-            else reader.number("every_s", 0.2, minimum=0.0),
-            within_s=reader.optional_number("within_s", minimum=0.0),
-            timeout_s=reader.optional_number("timeout_s", minimum=0.001),
-            retries=reader.count("retries", 0, minimum=0),
-            max_latency_s=reader.optional_number("max_latency_s", minimum=0.0),
-        )
-        reader.reject_unknown_keys()
-        self._captured.update(capture)
-        return step
-
-    # --- parts of a step ---
-
-    @staticmethod
-    def _link(reader: TableReader) -> str | None:
-        return reader.choice("link", LINKS) if reader.has("link") else None
-
-    def _answer_row(self, action: Action) -> Row | None:
-        """Return the row of the answer to an action, or None if it has no values."""
-        if isinstance(action, Read | Listen | Sample):
-            return action.row
-        if isinstance(action, GetParameter):
-            return self._icd.telemetry["parameter"]
-        return None
-
-    def _expectations(self, reader: TableReader, row: Row | None) -> tuple[Expectation, ...]:
-        table = reader.value("expect", {})
-        if not isinstance(table, dict):
-            reader.fail("'expect' must be a table, such as { valid = true }")
-        if table and row is None:
-            reader.fail("'expect' needs a step that reads telemetry")
-        known = frozenset(self._captured)
-        place = TableReader(table, f"{reader.location}: expect")
-        expectations = []
-        for name, value in table.items():
-            self._check_field(place, row, name)
-            expectation = read_expectation(name, value, place, known)
-            expectations.append(self._check_kind(place, row, expectation))
-        return tuple(expectations)
-
-    def _attitude(self, reader: TableReader, row: Row | None) -> AttitudeCheck | None:
-        if not reader.has("attitude"):
-            return None
-        if row is None or not row.named_fields.keys() >= ATTITUDE_FIELDS:
-            reader.fail("'attitude' needs a step that reads a row with a quaternion (attitude, quaternion)")
-        check = read_attitude_check(reader.sub("attitude"))
-        if check.truth is None and not self._has_truth:
-            reader.fail("'attitude' has no truth to compare with: give one here or in a table [truth]")
-        return check
-
-    def _captures(self, reader: TableReader, row: Row | None) -> dict[str, str]:
-        table = reader.value("capture", {})
-        if not isinstance(table, dict) or not all(isinstance(v, str) for v in table.values()):
-            reader.fail("'capture' must be a table such as { variable = \"field\" }")
-        if table and row is None:
-            reader.fail("'capture' needs a step that reads telemetry")
-        for name in table.values():
-            self._check_field(TableReader(table, f"{reader.location}: capture"), row, name)
-        return dict(table)
-
-    def _check_field(self, reader: TableReader, row: Row | None, name: str) -> None:
-        if row is not None and name not in row.named_fields:
-            known = f"; its fields: {', '.join(row.named_fields)}" if row.named_fields else "; it has none"
-            reader.fail(
-                f"row '{row.name}' has no field '{name}'{near_matches(name, row.named_fields) or known}"
-            )
-
-    def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> Expectation:
-        """Reject an expectation that can never hold: wrong type, or unknown name of an enumeration.
-
-        For a field of bytes, hexadecimal text is converted.
-        """
-        if row is None:
-            return expectation
-        item = row.named_fields[expectation.field]
-        if item.kind == "bytes":
-            return _in_bytes(reader, item, expectation)
-        for value in (expectation.equals, expectation.differs_from, *expectation.one_of):
-            if value is None or isinstance(value, Variable):
-                continue
-            if item.enum is not None:
-                if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
-                    known = f"; one of: {', '.join(item.enum.values)}"
-                    near = near_matches(show(value), item.enum.values) or known
-                    reader.fail(f"'{item.name}' is never '{show(value)}'{near}")
-            elif (item.kind == "flag") != isinstance(value, bool):
-                kind = "true or false" if item.kind == "flag" else "not true or false"
-                reader.fail(f"'{item.name}' is {kind}, not {value!r}")
-            elif item.kind in ("integer", "float", "bits") and isinstance(value, str):
-                reader.fail(f"'{item.name}' is a number, not {value!r}")
-        return expectation
-
-    def _row(self, reader: TableReader, key: str, *, telecommand: bool) -> Row:
-        name = reader.text(key)
-        rows = self._icd.telecommands if telecommand else self._icd.telemetry
-        if name not in rows:
-            other = self._icd.telemetry if telecommand else self._icd.telecommands
-            kind = "telecommand" if telecommand else "telemetry row"
-            remedy = "; it is telemetry: use read" if telecommand else "; it is a telecommand: use command"
-            reader.fail(
-                f"unknown {kind} '{name}'{remedy if name in other else near_matches(name, rows) or LISTED}"
-            )
-        return rows[name]
-
-    def _parameter(self, reader: TableReader, key: str) -> Parameter:
-        name = reader.text(key)
-        if name not in self._icd.parameters:
-            reader.fail(f"unknown parameter '{name}'{near_matches(name, self._icd.parameters) or LISTED}")
-        return self._icd.parameters[name]
-
-    def _refusal_code(self, reader: TableReader) -> str | None:
-        if not reader.has("refused"):
-            return None
-        return reader.choice("refused", self._icd.enums["error_code"].values)
-
-    # --- the actions, one reader each ---
-
-    def command(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a telecommand and check its parameters."""
-        row = self._row(reader, "command", telecommand=True)
-        refused = self._refusal_code(reader)
-        raw = reader.hex_bytes("with_hex") if reader.has("with_hex") else None
-        given = reader.value("with", {})
-        if not isinstance(given, dict) or (given and raw is not None):
-            reader.fail("give the parameters as a table 'with' or as bytes 'with_hex', not both")
-        place = TableReader(given, f"{reader.location}: with")
-        for name in given:
-            self._check_field(place, row, name)
-        known = frozenset(self._captured)
-        values = {name: operand(value, place, name, known) for name, value in given.items()}
-        if raw is None and not any(isinstance(value, Variable) for value in values.values()):
-            try:
-                row.encode(static_values(values), check=refused is None)
-            except ProtocolError as error:
-                reader.fail(str(error))
-        return Command(row, values, raw, refused), f"command {row.name}"
-
-    def read(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a request for telemetry."""
-        row = self._row(reader, "read", telecommand=False)
-        return Read(row, self._refusal_code(reader)), f"read {row.name}"
-
-    def listen(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a wait for unsolicited telemetry."""
-        row = self._row(reader, "listen", telecommand=False)
-        return Listen(row, reader.count("count", 1)), f"listen for {row.name}"
-
-    def sample(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a series of samples, from a table or from the keys of the step."""
-        place = reader
-        if isinstance(reader.value("sample"), dict):
-            place = reader.sub("sample")
-            row = self._row(place, "telemetry", telecommand=False)
-        else:
-            row = self._row(place, "sample", telecommand=False)
-        at_least = place.number("at_least", 1.0, minimum=0.0)
-        if at_least > 1.0:
-            place.fail("'at_least' is a fraction of the samples, from 0 to 1")
-        action = Sample(
-            row,
-            place.number("every_s", minimum=0.0),
-            place.number("for_s", minimum=0.0),
-            self._file_name(place, "file", f"{row.name}.csv"),
-            at_least,
-            place.count("min_samples", 1),
-        )
-        if place is not reader:
-            place.reject_unknown_keys()
-        return action, f"sample {row.name}"
-
-    def set_parameter(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a parameter to be set."""
-        parameter = self._parameter(reader, "set_parameter")
-        refused = self._refusal_code(reader)
-        value = operand(reader.value("value"), reader, "value", frozenset(self._captured))
-        if refused is None and not isinstance(value, Variable):
-            try:
-                parameter.check(static_values({"value": value})["value"])
-            except ProtocolError as error:
-                reader.fail(str(error))
-        elif isinstance(value, str):
-            reader.fail("'value' must be a number if a refusal is expected")
-        return SetParameter(parameter, value, refused), f"set parameter {parameter.name}"
-
-    def get_parameter(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a request for a parameter."""
-        parameter = self._parameter(reader, "get_parameter")
-        return GetParameter(parameter), f"get parameter {parameter.name}"
-
-    def download_image(self, reader: TableReader) -> tuple[Action, str]:
-        """Read an image download."""
-        file = self._file_name(reader, "download_image")
-        size = reader.choice("size", self._icd.enums["image_size"].values, "size_128")
-        method = reader.choice("method", ("frames", "burst"), "frames")
-        return DownloadImage(file, size, method), f"download image {file}"
-
-    def send(self, reader: TableReader) -> tuple[Action, str]:
-        """Read raw bytes or frames to send; their format determines the link."""
-        data = reader.texts("send")
-        answer = reader.texts("answer") if reader.has("answer") else None
-        kinds = set()
-        try:
-            for text in data:
-                kinds.add("can" if "#" in text else "serial")
-                if "#" in text:
-                    parse_frame(text)
-                else:
-                    bytes.fromhex(text)
-            for text in answer or ():
-                pattern(text)
-        except (BenchError, ValueError) as error:
-            reader.fail(f"'send' or 'answer': {error}")
-        if len(kinds) != 1:
-            reader.fail("'send' takes bytes in hexadecimal or CAN frames in the format of cansend, not both")
-        listen_s = reader.number("listen_s", 0.3, minimum=0.0)
-        return Send(kinds.pop(), data, answer, listen_s), "send raw data"
-
-    def wait(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a pause."""
-        seconds = reader.number("wait_s", minimum=0.0)
-        return Wait(seconds), f"wait {seconds:g} s"
-
-    def restart(self, reader: TableReader) -> tuple[Action, str]:
-        """Read a restart of the emulator."""
-        signal = reader.choice("restart", SIGNALS)
-        return Restart(signal), f"restart the emulator ({signal})"
-
-    def _file_name(self, reader: TableReader, key: str, default: str | None = None) -> str:
-        """Read the name of a file to write in the log folder."""
-        name = reader.text(key, default)
-        if name in {"", ".."} or Path(name).name != name or "\0" in name:
-            reader.fail(f"'{key}' must be a plain file name; the file is written to the log folder")
-        return name
+def _step(location: str, table: dict[str, Any], context: dict[str, Any]) -> tuple[Step | None, list[str]]:
+    """Check a step; return it, or its problems."""
+    present = [key for key in ACTIONS if key in table]
+    if len(present) == 1:
+        return _checked(ACTIONS[present[0]], table, location, context)
+    known = {key for action in ACTIONS.values() for key in _keys_of(action)}
+    unknown = [key for key in table if key not in known]
+    hint = f"; '{unknown[0]}' is unknown{near_matches(unknown[0], known)}" if unknown else ""
+    found = f"has {' and '.join(present)}" if present else "has none"
+    return None, [f"{location}: needs exactly one action of {', '.join(ACTIONS)}; {found}{hint}"]
 
 
-ACTIONS: Final[Mapping[str, Callable[[_Checker, TableReader], tuple[Action, str]]]] = {
-    "command": _Checker.command,
-    "read": _Checker.read,
-    "listen": _Checker.listen,
-    "sample": _Checker.sample,
-    "set_parameter": _Checker.set_parameter,
-    "get_parameter": _Checker.get_parameter,
-    "download_image": _Checker.download_image,
-    "send": _Checker.send,
-    "wait_s": _Checker.wait,
-    "restart": _Checker.restart,
+# --- errors ---
+
+Table = TypeVar("Table", bound=Keys)
+TABLES: Final[Mapping[str, type[Keys]]] = {
+    "expect": Conditions,
+    "attitude": AttitudeCheck,
+    "truth": Truth,
+    "emulator": EmulatorRequest,
+    "defaults": Defaults,
 }
-"""Key of an action → its reader."""
-
-STEP_KEYS: Final = (
-    *ACTIONS,
-    "name", "with", "with_hex", "refused", "expect", "attitude", "capture", "link", "repeat", "every_s", "within_s",
-    "timeout_s", "retries", "max_latency_s", "count", "for_s", "file", "at_least", "min_samples", "value", "size", "method", "answer",
-    "listen_s",
-)  # fmt: skip
+"""The tables in which an error may lie."""
 
 
-def _in_bytes(reader: TableReader, item: Field, expectation: Expectation) -> Expectation:
-    """Convert the hexadecimal text in the expectation of a field of bytes."""
+def _checked(
+    model: type[Table], table: dict[str, Any], location: str, context: dict[str, Any] | None = None
+) -> tuple[Table | None, list[str]]:
+    """Validate a table; return the result, or the problems."""
+    try:
+        return model.model_validate(table, context=context), []
+    except ValidationError as error:
+        return None, [text for item in error.errors() for text in _texts_of(item, location, model)]
+
+
+def _texts_of(error: ErrorDetails, location: str, model: type[Keys]) -> Iterator[str]:
+    """Yield what an error says in the words of a script: tables that lead to it, key, problem, near matches."""
+    path = [str(step) for step in error["loc"]]
+    key = path[-1] if path else ""
+    table = TABLES.get(path[0], model) if len(path) > 1 else model
+    for text in _explanation(error, key, _keys_of(table)).split("\n"):
+        if text.startswith("must "):
+            yield ": ".join([location, *path[:-1], f"'{key}' {text}"])
+        else:
+            yield ": ".join([location, *(path[:-1] if error["type"] == "extra_forbidden" else path), text])
+
+
+def _explanation(error: ErrorDetails, key: str, known: list[str]) -> str:
+    given, context = error["input"], error.get("ctx", {})
+    match error["type"]:
+        case "extra_forbidden":
+            return (
+                f"unknown key '{key}'{near_matches(key, known) or ' (known here: ' + ', '.join(known) + ')'}"
+            )
+        case "missing":
+            return "must be given, but is missing"
+        case "greater_than_equal":
+            return f"must be at least {context['ge']:g}, not {given!r}"
+        case "literal_error":
+            allowed = [word for word in re.findall(r"\w+", context["expected"]) if word != "or"]
+            return f"must be one of {', '.join(allowed)}, not {given!r}{near_matches(str(given), allowed)}"
+        case "value_error":
+            return str(context["error"])
+        case kind:
+            return f"must be {NEEDED.get(kind, error['msg'])}, not {given!r}"
+
+
+NEEDED: Final = {
+    "float_type": "a number",
+    "finite_number": "a number",
+    "int_type": "a whole number",
+    "bool_type": "true or false",
+    "string_type": "a text",
+    "list_type": "a list",
+    "dict_type": "a table, such as { name = value }",
+    "model_type": "a table, such as { name = value }",
+}
+"""What is needed where pydantic reports a wrong type."""
+
+
+def _keys_of(model: type[Keys]) -> list[str]:
+    keys = (field.alias or name for name, field in model.model_fields.items())
+    return sorted(key for key in keys if (model, key) != (Send, "link"))
+
+
+# --- expectations and fields of the definition ---
+
+
+def _unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
+    known = row.named_fields
+    for name in names:
+        if name not in known:
+            hint = near_matches(name, known) or (
+                f"; its fields: {', '.join(known)}" if known else "; it has none"
+            )
+            yield f"{key}: row '{row.name}' has no field '{name}'{hint}"
+
+
+def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:
+    """Yield why conditions can never hold: wrong type, or unknown name of an enumeration.
+
+    For a field of bytes, hexadecimal text is converted in place.
+    """
+    if item.kind == "bytes":
+        yield from _in_bytes(item, wanted)
+        return
+    for value in (wanted.equals, wanted.differs_from, *wanted.one_of):
+        if value is None or isinstance(value, Variable):
+            continue
+        if item.enum is not None:
+            if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
+                known = f"; one of: {', '.join(item.enum.values)}"
+                yield f"'{item.name}' is never '{show(value)}'{near_matches(show(value), item.enum.values) or known}"
+        elif (item.kind == "flag") != isinstance(value, bool):
+            yield f"'{item.name}' is {'true or false' if item.kind == 'flag' else 'not true or false'}, not {value!r}"
+        elif item.kind in ("integer", "float", "bits") and isinstance(value, str):
+            yield f"'{item.name}' is a number, not {value!r}"
+
+
+def _in_bytes(item: RowField, wanted: Conditions) -> Iterator[str]:
+    """Convert the hexadecimal texts in the conditions of a field of bytes."""
+    numeric = {"min", "max", "above", "within", "plus", "angle_deg"}
+    given = {Conditions.model_fields[name].alias or name for name in wanted.model_fields_set}
+    for key in sorted(numeric & given):
+        yield f"'{item.name}' is bytes, and '{key}' is for numbers; give value, one_of or not"
 
     def convert(value: Operand) -> Operand:
         if isinstance(value, Variable):
@@ -442,25 +630,14 @@ def _in_bytes(reader: TableReader, item: Field, expectation: Expectation) -> Exp
         except ValueError:
             data = b""
         if len(data) != item.size:
-            reader.fail(f"'{item.name}' is {item.size} bytes in hexadecimal, not {show(value)!r}")
+            wrong.append(f"'{item.name}' is {item.size} bytes in hexadecimal, not {show(value)!r}")
         return data
 
-    for word, given in (
-        ("min", expectation.minimum),
-        ("max", expectation.maximum),
-        ("above", expectation.above),
-        ("within", expectation.within),
-        ("plus", expectation.plus or None),
-        ("angle_deg", expectation.angle or None),
-    ):
-        if given is not None:
-            reader.fail(f"'{item.name}' is bytes, and '{word}' is for numbers; give value, one_of or not")
-    return replace(
-        expectation,
-        equals=None if expectation.equals is None else convert(expectation.equals),
-        one_of=tuple(convert(value) for value in expectation.one_of),
-        differs_from=None if expectation.differs_from is None else convert(expectation.differs_from),
-    )
+    wrong: list[str] = []
+    wanted.one_of = [convert(value) for value in wanted.one_of]
+    wanted.value = None if wanted.value is None else convert(wanted.value)
+    wanted.differs_from = None if wanted.differs_from is None else convert(wanted.differs_from)
+    yield from wrong
 
 
 def static_values(values: Mapping[str, Operand]) -> dict[str, Value]:

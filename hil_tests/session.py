@@ -12,7 +12,7 @@ from typing import Final
 from starhil.hil_tests.bench import Bench
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError, NackError
-from starhil.hil_tests.expect import resolve, show
+from starhil.hil_tests.expect import resolve, show, show_angle
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.png import write_png
 from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
@@ -25,7 +25,7 @@ from starhil.hil_tests.results import (
     percentile,
     summarize,
 )
-from starhil.hil_tests.script_model import (
+from starhil.hil_tests.script import (
     Command,
     DownloadImage,
     GetParameter,
@@ -50,7 +50,7 @@ CLOCK_GRAIN_S: Final = 1e-6
 
 @dataclass
 class Outcome:
-    """Outcome of one attempt of an action.
+    """Outcome of one attempt of an step.
 
     Attributes
     ----------
@@ -131,7 +131,7 @@ class SessionRunner:
         try:
             for step, link in planned:
                 record(self._run_step(step, link))
-                if results[-1].status == FAILED and not self._script.keep_going:
+                if results[-1].status == FAILED and not self._script.defaults.keep_going:
                     break
             skip_rest("an earlier step failed")
         except Interrupted as signalled:
@@ -140,9 +140,9 @@ class SessionRunner:
         return SessionResult(self._script.title, tuple(results), time.monotonic() - begin, interruption)
 
     def _links_of(self, step: Step) -> tuple[str, ...]:
-        if isinstance(step.action, Wait | Restart):
+        if isinstance(step, Wait | Restart):
             return ("",)
-        wanted = step.link or self._script.link
+        wanted = step.link or self._script.defaults.link
         if wanted == "both":
             return self._bench.links
         return (wanted or self._bench.links[0],)
@@ -202,64 +202,65 @@ class SessionRunner:
         return outcome
 
     def _perform(self, step: Step, link: str) -> Outcome:
-        action = step.action
-        if isinstance(action, Wait):
-            time.sleep(action.seconds)
+        if isinstance(step, Wait):
+            time.sleep(step.seconds)
             return Outcome()
-        if isinstance(action, Restart):
-            self._bench.restart(action.signal)
+        if isinstance(step, Restart):
+            self._bench.restart(step.signal)
             return Outcome(detail="ready again")
         client = self._bench.client(link)
-        match action:
+        match step:
             case Command():
-                return self._command(step, action, client)
+                return self._command(step, client)
             case Read():
-                return self._read(step, action, client)
+                return self._read(step, client)
             case Listen():
-                return self._listen(step, action, client)
+                return self._listen(step, client)
             case Sample():
-                return self._sample(step, action, client)
+                return self._sample(step, client)
             case SetParameter():
-                return self._set_parameter(step, action, client)
+                return self._set_parameter(step, client)
             case GetParameter():
-                return self._compare(step, client.read_parameter(action.parameter.name))
+                return self._compare(step, client.read_parameter(step.parameter.name))
             case DownloadImage():
-                return self._download(action, client)
+                return self._download(step, client)
             case Send():
-                return self._send(step, action, client)
+                return self._send(step, client)
+            case _:
+                raise TypeError(f"{type(step).__name__}: no such step")
 
     # --- actions ---
 
-    def _command(self, step: Step, action: Command, client: ObcClient) -> Outcome:
-        row = action.row
-        if action.raw is None:
+    def _command(self, step: Command, client: ObcClient) -> Outcome:
+        row = step.row
+        if step.raw is None:
             variables = self._variables()
             values = {
-                name: _whole_as_integer(resolve(value, variables)) for name, value in action.values.items()
+                name: _whole_as_integer(resolve(value, variables)) for name, value in step.values.items()
             }
-            data = row.encode(values, check=action.refused is None)
+            data = row.encode(values, check=step.refused is None)
         else:
-            data = action.raw
+            data = step.raw
 
         def send() -> float:
             return client.command_raw(
                 row.name, data, timeout_s=step.timeout_s, retries=step.retries
             ).latency_s
 
-        return self._expect_acceptance_or_refusal(send, action.refused)
+        return self._expect_acceptance_or_refusal(send, step.refused)
 
-    def _set_parameter(self, step: Step, action: SetParameter, client: ObcClient) -> Outcome:
-        parameter = action.parameter
-        value = resolve(action.value, self._variables())
-        accepted = action.refused is None
+    def _set_parameter(self, step: SetParameter, client: ObcClient) -> Outcome:
+        parameter = step.parameter
+        value = resolve(step.value, self._variables())
+        accepted = step.refused is None
 
         def send() -> float:
             return client.set_parameter(
                 parameter.name, value, timeout_s=step.timeout_s, retries=step.retries, checked=accepted
             ).latency_s
 
-        outcome = self._expect_acceptance_or_refusal(send, action.refused)
-        if outcome.problem is None and action.refused is None:
+        outcome = self._expect_acceptance_or_refusal(send, step.refused)
+        if outcome.problem is None and step.refused is None:
             seen = client.get_parameter(parameter.name)
             wanted = parameter.check(value)
             if seen != wanted and not (
@@ -284,38 +285,38 @@ class SessionRunner:
             return Outcome(problem=f"accepted, expected to be refused with {refused}")
         return Outcome(detail="accepted", latency_s=latency)
 
-    def _read(self, step: Step, action: Read, client: ObcClient) -> Outcome:
+    def _read(self, step: Read, client: ObcClient) -> Outcome:
         readings: list[Reading] = []
 
         def ask() -> float:
-            reading = client.read(action.row.name, timeout_s=step.timeout_s, retries=step.retries)
+            reading = client.read(step.row.name, timeout_s=step.timeout_s, retries=step.retries)
             readings.append(reading)
             return reading.latency_s
 
-        outcome = self._expect_acceptance_or_refusal(ask, action.refused)
+        outcome = self._expect_acceptance_or_refusal(ask, step.refused)
         if outcome.problem is not None or not readings:
             return outcome
         return self._compare(step, readings[0])
 
-    def _listen(self, step: Step, action: Listen, client: ObcClient) -> Outcome:
+    def _listen(self, step: Listen, client: ObcClient) -> Outcome:
         outcome = Outcome()
         times = [time.monotonic()]
-        for _ in range(action.count):
+        for _ in range(step.count):
             reading = client.wait_unsolicited(
-                action.row.name, timeout_s=step.timeout_s or self._script.timeout_s, since_s=times[0]
+                step.row.name, timeout_s=step.timeout_s or self._script.defaults.timeout_s, since_s=times[0]
             )
             times.append(reading.received_s)
             outcome = self._compare(step, reading)
             if outcome.problem is not None:
                 return outcome
         outcome.latency_s = None
-        if action.count > 1:  # without the wait for the first reading
-            outcome.figures["rate_hz"] = (action.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
+        if step.count > 1:  # without the wait for the first reading
+            outcome.figures["rate_hz"] = (step.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
         return outcome
 
-    def _sample(self, step: Step, action: Sample, client: ObcClient) -> Outcome:
-        path = self._folder / action.file
-        fields = list(action.row.named_fields)
+    def _sample(self, step: Sample, client: ObcClient) -> Outcome:
+        path = self._folder / step.file
+        fields = list(step.row.named_fields)
         latencies: list[float] = []
         crosses: list[float] = []
         problems: list[str] = []
@@ -325,8 +326,8 @@ class SessionRunner:
         with path.open("w", newline="", encoding="utf-8", buffering=1) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])
-            while time.monotonic() - begin < action.for_s or count == 0:
-                reading = client.read(action.row.name, timeout_s=step.timeout_s, retries=step.retries)
+            while time.monotonic() - begin < step.for_s or count == 0:
+                reading = client.read(step.row.name, timeout_s=step.timeout_s, retries=step.retries)
                 values = [_csv_text(reading[name]) for name in fields]
                 writer.writerow(
                     [f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}", *values]
@@ -337,7 +338,7 @@ class SessionRunner:
                 if last.problem is not None:
                     problems.append(last.problem)
                 crosses += [last.figures[key] for key in ("cross_boresight_arcsec",) if key in last.figures]
-                time.sleep(max(0.0, begin + count * action.every_s - time.monotonic()))
+                time.sleep(max(0.0, begin + count * step.every_s - time.monotonic()))
         good = 1.0 - len(problems) / count
         figures = {
             "samples": float(count),
@@ -348,35 +349,35 @@ class SessionRunner:
         if crosses:
             figures["cross_boresight_median_arcsec"] = percentile(crosses, 0.5)
             figures["cross_boresight_max_arcsec"] = max(crosses)
-        detail = f"{count} samples in {action.file}, " + " ".join(f"{k}={v:.4g}" for k, v in figures.items())
+        detail = f"{count} samples in {step.file}, " + " ".join(f"{k}={v:.4g}" for k, v in figures.items())
         problem = None
-        if good < action.at_least:
+        if good < step.at_least:
             problem = f"{len(problems)} of {count} samples did not meet the expectations; the last one: {problems[-1]}"
-        elif count < action.min_samples:
+        elif count < step.min_samples:
             problem = (
-                f"only {count} samples arrived in {action.for_s:g} s, expected at least {action.min_samples}"
+                f"only {count} samples arrived in {step.for_s:g} s, expected at least {step.min_samples}"
             )
         return Outcome(problem, detail, last.values, figures, max(latencies))
 
-    def _download(self, action: DownloadImage, client: ObcClient) -> Outcome:
-        image = client.download_image(action.size, method=action.method)
-        write_png(self._folder / action.file, image.pixels, image.width, image.height)
+    def _download(self, step: DownloadImage, client: ObcClient) -> Outcome:
+        image = client.download_image(step.size, method=step.method)
+        write_png(self._folder / step.file, image.pixels, image.width, image.height)
         figures = {
             "seconds": image.seconds,
             "bytes": float(image.bytes_received),
             "repeats": float(image.repeats),
         }
         levels = sorted(set(image.pixels))
-        detail = f"{image.width}x{image.height} in {image.seconds:.2f} s → {action.file}"
+        detail = f"{image.width}x{image.height} in {image.seconds:.2f} s → {step.file}"
         problem = None if len(levels) > 1 else f"{detail}: the image is blank (all pixels {levels[0]})"
         return Outcome(problem, detail, {}, figures)
 
     @staticmethod
-    def _send(step: Step, action: Send, client: ObcClient) -> Outcome:
-        wanted = [pattern(text) for text in action.answer or ()]
-        seen = send_and_listen(client, action.data, action.listen_s, tuple(wanted), step.timeout_s)
+    def _send(step: Send, client: ObcClient) -> Outcome:
+        wanted = [pattern(text) for text in step.answer or ()]
+        seen = send_and_listen(client, step.data, step.listen_s, tuple(wanted), step.timeout_s)
         shown = ", ".join(text for text in seen if text) or "nothing"
-        if action.answer is None:
+        if step.answer is None:
             return Outcome(detail=f"came back: {shown}")
         if client.core.link.name == "serial":
             wanted = ["".join(wanted)]
@@ -393,11 +394,11 @@ class SessionRunner:
         variables = self._variables()
         problems = [
             text
-            for expectation in step.expect
-            if (text := expectation.mismatch(reading[expectation.field], variables)) is not None
+            for field, wanted in step.expect.items()
+            if (text := wanted.mismatch(field, reading[field], variables)) is not None
         ]
         if step.expect and not problems:
-            outcome.detail = " ".join(f"{item.field}={show(reading[item.field])}" for item in step.expect)
+            outcome.detail = " ".join(f"{field}={show(reading[field])}" for field in step.expect)
         if step.attitude is not None and not problems:
             problems += self._judge_attitude(step, reading, outcome)
         if problems:
@@ -408,7 +409,7 @@ class SessionRunner:
         check = step.attitude
         if check is None:
             return []
-        truth = check.truth or self._script.truth.attitude
+        truth = check.attitude or self._script.truth.attitude
         if truth is None:
             if self._truth_log is None:
                 raise BenchError(f"step {step.number}: no truth to compare the attitude with")
@@ -422,7 +423,7 @@ class SessionRunner:
                 roll_arcsec=error.roll_arcsec,
                 total_arcsec=error.total_arcsec,
             )
-            outcome.detail += f" error: {error.cross_boresight_arcsec:.1f} arcsec cross, {error.roll_arcsec:.1f} arcsec roll"
+            outcome.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"
         return [] if problem is None else [problem]
 
     def _variables(self) -> dict[str, Value]:

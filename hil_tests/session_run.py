@@ -27,8 +27,7 @@ from starhil.hil_tests.results import (
     write_junit,
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.script import load_script
-from starhil.hil_tests.script_model import Script
+from starhil.hil_tests.script import Script, load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.definition import InterfaceDefinition
@@ -90,7 +89,7 @@ def run_session(request: SessionRequest) -> SessionResult:
     path = find_script(request.script)
     script = load_script(path, icd)
     if request.keep_going:
-        script = replace(script, keep_going=True)
+        script.defaults.keep_going = True
     options = _options(request, script)
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
@@ -160,7 +159,7 @@ def _shown_on_console(
         return show
     address = console_address(view, bench.emulator)
     unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
-    planned = len(script.steps) * (len(bench.links) if script.link == "both" else 1)
+    planned = len(script.steps) * (len(bench.links) if script.defaults.link == "both" else 1)
     feed = stack.enter_context(
         RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
     )
@@ -186,13 +185,15 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
     if options.serial is None and options.can is None:
         if not request.start:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
-        wanted = {None: ("serial",), "both": ("serial", "can")}.get(script.link, (script.link,))
+        wanted = {None: ("serial",), "both": ("serial", "can")}.get(
+            script.defaults.link, (script.defaults.link,)
+        )
         options = replace(
             options, serial="auto" if "serial" in wanted else None, can="auto" if "can" in wanted else None
         )
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")
-    return replace(options, timeout_s=script.timeout_s, retries=script.retries)
+    return replace(options, timeout_s=script.defaults.timeout_s, retries=script.defaults.retries)
 
 
 def _emulator(
@@ -211,12 +212,20 @@ def _emulator(
             can=options.can or "off",
             dialect=options.dialect,
             seed=wanted.seed,
-            settings=wanted.settings,
+            settings=[*_pointed(script), *wanted.settings],
             state_dir=state,
             truth_log=truth_log,
             extra=["--view", "auto"] if request.view == "auto" else (),
         )
     )
+
+
+def _pointed(script: Script) -> list[str]:
+    """Return the settings that point the emulator at the script's true attitude, unless it has settings for this."""
+    truth = script.truth.attitude
+    if truth is None or any(setting.strip().startswith("truth.") for setting in script.emulator.settings):
+        return []
+    return ["truth.kind=fixed", f"truth.attitude={{ quaternion_xyzw = {list(truth)} }}"]
 
 
 def _printer(*, quiet: bool) -> Callable[[StepResult], None]:

@@ -151,9 +151,9 @@ def test_sessions_gives_the_defaults_of_a_step(tmp_path):
     for key in ("every_s", "repeat", "retries"):
         assert float(shown[key]) == getattr(script.steps[0], key)
     shown = {row[0].strip("`"): row[1] for row in rows_under("Keys of `[defaults]`")}
-    assert float(shown["timeout_s"]) == script.timeout_s
-    assert float(shown["retries"]) == script.retries
-    assert shown["keep_going"] == str(script.keep_going).lower()
+    assert float(shown["timeout_s"]) == script.defaults.timeout_s
+    assert float(shown["retries"]) == script.defaults.retries
+    assert shown["keep_going"] == str(script.defaults.keep_going).lower()
 
 
 # --- examples ---

@@ -9,7 +9,7 @@ from typing import Final
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe, is_integer, size_of
-from starhil.hil_tests.conformance.canopen_sdo_block import upload_blocks
+from starhil.hil_tests.conformance.canopen_sdo import upload_blocks
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 
 EDS: Final = CaseArea[CanopenProbe]("canopen.eds", "CiA 306 4.5")

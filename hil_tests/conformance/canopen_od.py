@@ -7,7 +7,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, is_integer, size_of
+from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, encoded, is_integer, size_of
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
 from starhil.hil_tests.judge.canopen import multiplexer
 
@@ -51,11 +51,8 @@ def defaults(probe: CanopenProbe) -> None:
             continue
         seen = probe.try_read(item.index, item.subindex)
         if isinstance(seen, bytes):
-            check_equal(
-                item.decode_raw(seen),
-                item.default,
-                f"{item.index:04X}h:{item.subindex:02X}h ({item.qualname})",
-            )
+            number = int.from_bytes(seen, "little", signed=item.data_type in datatypes.SIGNED_TYPES)
+            check_equal(number, item.default, f"{item.index:04X}h:{item.subindex:02X}h ({item.qualname})")
 
 
 @OD.case("texts", "names and versions agree with the EDS", "CiA 301 7.5.2.7", intrusive=False)
@@ -105,48 +102,43 @@ def read_only(probe: CanopenProbe) -> None:
                 probe.expect_abort(command + multiplexer(item.index, item.subindex), Abort.READ_ONLY)
 
 
+def _check_missing(probe: CanopenProbe, index: int, subindex: int, code: Abort) -> None:
+    for command in (0x40, 0x2F):
+        probe.expect_abort(bytes([command]) + multiplexer(index, subindex), code)
+
+
 @OD.case("no-object", "objects that are not in the EDS do not exist")
 def no_object(probe: CanopenProbe) -> None:
     present = {index for index in probe.od.indices if index >= 0x1000}
-    gaps = sorted({near for index in present for near in (index - 1, index + 1) if near >= 0x1000} - present)
-    for index in [0x0000, 0x0005, *gaps, 0xFFFF]:
-        if index not in present:
-            probe.expect_abort(b"\x40" + multiplexer(index, 0), Abort.NO_OBJECT)
-            probe.expect_abort(b"\x2f" + multiplexer(index, 0), Abort.NO_OBJECT)
+    gaps = {near for index in present for near in (index - 1, index + 1) if near >= 0x1000} - present
+    for index in (0x0000, 0x0005, *sorted(gaps), *({0xFFFF} - present)):
+        _check_missing(probe, index, 0, Abort.NO_OBJECT)
 
 
 @OD.case("no-sub-index", "sub-indices that are not in the EDS do not exist")
 def no_sub_index(probe: CanopenProbe) -> None:
-    for index in sorted(probe.od.indices):
-        if index < 0x1000:
-            continue
+    for index in sorted(index for index in probe.od.indices if index >= 0x1000):
         item = probe.od.indices[index]
         beyond = 1 if isinstance(item, ODVariable) else max(item.subindices) + 1
         if beyond < 0xFF:
-            probe.expect_abort(b"\x40" + multiplexer(index, beyond), Abort.NO_SUBINDEX)
-            probe.expect_abort(b"\x2f" + multiplexer(index, beyond), Abort.NO_SUBINDEX)
+            _check_missing(probe, index, beyond, Abort.NO_SUBINDEX)
 
 
-@OD.case("length-high", "a value that is too long is refused")
-def length_high(probe: CanopenProbe) -> None:
+def _wrong_length(longer: int, code: Abort, probe: CanopenProbe) -> None:
+    """Write each object of 1 to 4 bytes with a byte more or less, announced by the command of the transfer."""
     for item in probe.variables():
-        size = size_of(item)
-        if item.writable and size is not None and size < 4 and item.index not in {0x1010, 0x1011}:
-            command = bytes([0x23 | (3 - size) << 2])
-            probe.expect_abort(
-                command + multiplexer(item.index, item.subindex), Abort.LENGTH, Abort.LENGTH_HIGH
-            )
+        size = (size_of(item) or 0) + longer
+        signature = longer > 0 and item.index in {0x1010, 0x1011}
+        if item.writable and 1 + (longer > 0) <= size <= 4 and not signature:
+            command = bytes([0x23 | (4 - size) << 2])
+            probe.expect_abort(command + multiplexer(item.index, item.subindex), Abort.LENGTH, code)
 
 
-@OD.case("length-low", "a value that is too short is refused")
-def length_low(probe: CanopenProbe) -> None:
-    for item in probe.variables():
-        size = size_of(item)
-        if item.writable and size is not None and 1 < size <= 5:
-            command = bytes([0x23 | (5 - size) << 2])
-            probe.expect_abort(
-                command + multiplexer(item.index, item.subindex), Abort.LENGTH, Abort.LENGTH_LOW
-            )
+for _name, _word, _longer, _code in (
+    ("length-high", "long", 1, Abort.LENGTH_HIGH),
+    ("length-low", "short", -1, Abort.LENGTH_LOW),
+):
+    OD.case(_name, f"a value that is too {_word} is refused")(partial(_wrong_length, _longer, _code))
 
 
 def _bounded(probe: CanopenProbe) -> list[ODVariable]:
@@ -158,7 +150,7 @@ def _bounded(probe: CanopenProbe) -> list[ODVariable]:
     ]
 
 
-def _expect_refusal_beyond(probe: CanopenProbe, step: int, code: Abort) -> None:
+def _beyond_limits(step: int, code: Abort, probe: CanopenProbe) -> None:
     """Write the value above (1) or below (-1) the limit of each object, if its type can hold it."""
     for item in _bounded(probe):
         size = size_of(item) or 4
@@ -166,42 +158,30 @@ def _expect_refusal_beyond(probe: CanopenProbe, step: int, code: Abort) -> None:
         limit = item.max if step > 0 else item.min
         lowest, highest = (-(1 << 8 * size - 1) if signed else 0), (1 << 8 * size - signed) - 1
         if limit is not None and lowest <= int(limit) + step <= highest:
-            data = (int(limit) + step).to_bytes(size, "little", signed=signed)
+            data = encoded(item, int(limit) + step)
             probe.expect_refusal(item.index, item.subindex, data, size, code, Abort.VALUE)
 
 
-@OD.case("value-high", "values above the limit are refused")
-def value_high(probe: CanopenProbe) -> None:
-    _expect_refusal_beyond(probe, 1, Abort.VALUE_HIGH)
-
-
-@OD.case("value-low", "values below the limit are refused")
-def value_low(probe: CanopenProbe) -> None:
-    _expect_refusal_beyond(probe, -1, Abort.VALUE_LOW)
+for _name, _word, _step, _code in (
+    ("value-high", "above", 1, Abort.VALUE_HIGH),
+    ("value-low", "below", -1, Abort.VALUE_LOW),
+):
+    OD.case(_name, f"values {_word} the limit are refused")(partial(_beyond_limits, _step, _code))
 
 
 @OD.case("write-back", "a written value is read back", "CiA 301 7.2.4.3")
 def write_back(probe: CanopenProbe) -> None:
     found = 0
     for item in probe.variables():
-        size = size_of(item)
-        bounded = item.min is not None and item.max is not None
-        if (
-            item.index < 0x2000
-            or item.access_type != "rw"
-            or not is_integer(item)
-            or not bounded
-            or size not in {1, 2, 4}
-        ):
+        bounded = is_integer(item) and item.min is not None and item.max is not None
+        if item.index < 0x2000 or item.access_type != "rw" or not bounded or size_of(item) not in {1, 2, 4}:
             continue
-        before = probe.read(item.index, item.subindex)
-        for value in (item.min, item.max):
-            data = int(value or 0).to_bytes(
-                size or 4, "little", signed=item.data_type in datatypes.SIGNED_TYPES
-            )
+        before = probe.value(item)
+        for limit in (item.min, item.max):
+            data = encoded(item, int(limit or 0))
             if probe.write(item.index, item.subindex, data) == 0:
                 found += 1
-                check_equal(probe.read(item.index, item.subindex), data, f"{item.qualname}")
-        probe.set(item.index, item.subindex, before)
+                check_equal(probe.value(item), data, f"{item.qualname}")
+        probe.put(item, before)
     if not found:
         raise CaseSkipped("the EDS has no object that accepts its limits")

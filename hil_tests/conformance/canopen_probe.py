@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Collection
 from enum import IntEnum
 from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
-from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_equal
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
@@ -266,30 +267,19 @@ class CanopenProbe:
         self.drain()
 
     def expect_answer(self, request: str | bytes, answer: str) -> bytes:
-        """Fail unless an SDO request gets this answer, in which `..` matches any byte."""
+        """Fail unless an SDO request gets this answer; its form is that of `check_answer`."""
         seen = self.ask(request)
-        wanted = answer.replace(" ", "")
-        if seen is None:
-            raise CaseFailed(f"SDO answer {answer}", "nothing")
-        pairs = zip(wanted[::2] + "", wanted[1::2], seen.hex()[::2], seen.hex()[1::2], strict=False)
-        if len(wanted) != len(seen.hex()) or any(a + b not in {"..", c + d} for a, b, c, d in pairs):
-            raise CaseFailed(f"SDO answer {answer}", seen.hex(" "))
-        return seen
+        check_answer(seen, answer)
+        return seen or b""
 
     def expect_abort(self, request: str | bytes, *codes: int) -> None:
         """Fail unless an SDO request is aborted with one of the codes and its own multiplexer."""
         data = bytes.fromhex(request) if isinstance(request, str) else request
-        self.check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
+        check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
 
-    def check_abort(self, seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
-        """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer matches any."""
-        expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
-        if seen is None:
-            raise CaseFailed(expected, "nothing")
-        if len(seen) != 8 or seen[0] != ABORT or abort_code(seen) not in codes:
-            raise CaseFailed(expected, seen.hex(" "))
-        if multiplexer and seen[1:4].hex() != multiplexer:
-            raise CaseFailed(f"{expected} for object {multiplexer}", seen.hex(" "))
+    def value(self, item: ODVariable) -> bytes:
+        """Read an object of the EDS."""
+        return self.read(item.index, item.subindex)
 
     def read(self, index: int, subindex: int = 0) -> bytes:
         """Read an object, expedited or segmented; fail if that is not possible."""
@@ -331,6 +321,10 @@ class CanopenProbe:
         if answer[1:4] != multiplexer(index, subindex):
             raise CaseFailed(f"an answer for {index:04X}h:{subindex:02X}h", answer.hex(" "))
         return 0 if answer[0] == 0x60 else abort_code(answer)
+
+    def put(self, item: ODVariable, data: bytes) -> None:
+        """Write an object of the EDS; fail if it is refused."""
+        self.set(item.index, item.subindex, data)
 
     def set(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> None:
         """Write; fail if it is refused."""
@@ -388,7 +382,22 @@ class CanopenProbe:
         if 0x1017 in self.od:
             self.set(0x1017, 0, 0, 2)
         for index in (*self.pdo_indices(0x1400), *self.pdo_indices(0x1800)):
-            self.set(index, 1, self.number(index, 1) | PDO_OFF)
+            self.disable_pdo(index)
+
+    def disable_pdo(self, index: int) -> None:
+        """Disable a PDO, given the index of its communication record."""
+        self.set(index, 1, self.number(index, 1) | PDO_OFF)
+
+    def emergency_id(self) -> int:
+        """Read the CAN ID of EMCY; skip the case if the node has none."""
+        self.require(0x1014)
+        return self.number(0x1014) & 0x7FF
+
+    def expect_emergency(self, can_id: int, code: int, timeout_s: float | None = None) -> bytes:
+        """Take the next EMCY, which must have an error code."""
+        data = self.expect(can_id, f"EMCY {code:04X}h", timeout_s)
+        check_equal(data[:2], code.to_bytes(2, "little"), "error code")
+        return data
 
     # Content of the dictionary
 
@@ -405,6 +414,11 @@ class CanopenProbe:
                 found += [item.subindices[subindex] for subindex in sorted(item.subindices)]
         return found
 
+    def has(self, index: int, subindex: int) -> bool:
+        """Return whether the EDS has an entry of a record."""
+        record = self.od.indices.get(index)
+        return record is not None and not isinstance(record, ODVariable) and subindex in record.subindices
+
     def find(self, what: str, wanted: Callable[[ODVariable], bool]) -> ODVariable:
         """Return the first variable that is wanted; skip the case if there is none."""
         for item in self.variables():
@@ -412,20 +426,42 @@ class CanopenProbe:
                 return item
         raise CaseSkipped(f"the EDS has no {what}")
 
-    def require(self, index: int) -> None:
+    def require(self, *indices: int) -> None:
         """Skip the case if an object is missing."""
-        if index not in self.od:
-            raise CaseSkipped(f"the EDS has no object {index:04X}h")
+        for index in indices:
+            if index not in self.od:
+                raise CaseSkipped(f"the EDS has no object {index:04X}h")
 
     def pdo_indices(self, first: int) -> list[int]:
         """Return the indices of communication records from 1400h or 1800h on."""
         return [index for index in sorted(self.od.indices) if first <= index < first + 0x200]
 
 
+def check_abort(seen: bytes | None, *codes: int, multiplexer: str = "") -> None:
+    """Fail unless an SDO answer is an abort with one of the codes; an empty multiplexer matches any."""
+    expected = "abort " + " or ".join(f"0x{code:08X}" for code in codes)
+    if seen is None or len(seen) != 8 or seen[0] != ABORT or abort_code(seen) not in codes:
+        raise CaseFailed(expected, _seen(seen))
+    if multiplexer not in ("", seen[1:4].hex()):
+        raise CaseFailed(f"{expected} for object {multiplexer}", _seen(seen))
+
+
+def check_answer(seen: bytes | None, answer: str) -> None:
+    """Fail unless an SDO answer has these bytes, of which `..` is any one, and a final `*` any others."""
+    pattern = re.escape(answer.replace(" ", "")).replace(r"\.\.", "..").replace(r"\*", ".*")
+    if seen is None or re.fullmatch(pattern, seen.hex()) is None:
+        raise CaseFailed(f"SDO answer {answer}", _seen(seen))
+
+
 def size_of(item: ODVariable) -> int | None:
     """Return the size of a variable in bytes, or None if it varies."""
     packer = ODVariable.STRUCT_TYPES.get(item.data_type if item.data_type is not None else -1)
     return None if packer is None else packer.size
+
+
+def encoded(item: ODVariable, number: int) -> bytes:
+    """Return the bytes of an integer in the type of a variable."""
+    return number.to_bytes(size_of(item) or 1, "little", signed=item.data_type in datatypes.SIGNED_TYPES)
 
 
 def is_integer(item: ODVariable) -> bool:

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from functools import partial
 from typing import Final
 
+from starhil.hil_tests.conformance.canopen_dialogue import Dialogue, add_dialogues
 from starhil.hil_tests.conformance.canopen_probe import (
     LSS_FROM_SLAVE,
     LSS_TO_SLAVE,
     RESET_COMMUNICATION,
     RESET_NODE,
-    START,
-    STOP,
     Abort,
     CanopenProbe,
 )
@@ -63,8 +64,7 @@ def _restore(probe: CanopenProbe) -> None:
 
 @STORE.case("restore", "defaults take effect at the next reset", "CiA 301 7.5.2.12")
 def restore(probe: CanopenProbe) -> None:
-    probe.require(0x1010)
-    probe.require(0x1011)
+    probe.require(0x1010, 0x1011)
     default = probe.od.get_variable(0x1017)
     probe.set(0x1017, 0, 777, 2)
     probe.set(0x1010, 1, b"save")
@@ -89,8 +89,7 @@ def groups(probe: CanopenProbe) -> None:
 
 @STORE.case("pdo", "a stored PDO configuration is restored by a reset")
 def pdo(probe: CanopenProbe) -> None:
-    probe.require(0x1010)
-    probe.require(0x1800)
+    probe.require(0x1010, 0x1800)
     probe.set(0x1800, 2, 17, 1)
     probe.set(0x1010, 2, b"save")
     _reset(probe)
@@ -101,10 +100,28 @@ def pdo(probe: CanopenProbe) -> None:
 # LSS
 
 
+DIALOGUES: Final = (
+    Dialogue("global", "switch state global", "04 > silence; 5e > silence; 04 01 > silence; 5e > 5e *; 04 > -", "CiA 305 switch state global"),
+    Dialogue("inquire", "inquire identity and node ID", "5a > 5a {vendor} 000000; 5b > 5b {product} 000000; 5c > 5c {revision} 000000; 5d > 5d {serial} 000000; 5e > 5e {node} 000000000000; 04 > -", "CiA 305 inquire"),
+    Dialogue("waiting", "a waiting node ignores configuration commands", "04 > -; 11 05 > silence; 13 00 02 > silence; 17 > silence; 5a > silence; 5e > silence"),
+    Dialogue("configured", "a configured node does not take part in Fastscan", "04 > -; 51 00 00 00 00 80 > silence; 4c > silence", "CiA 305 fastscan"),
+    Dialogue("states", "LSS works in every NMT state", "04 > -; nmt 1; 04 01 > -; 5e > 5e {node} 000000000000; 04 > -; nmt 2; 04 01 > -; 5e > 5e {node} 000000000000; 04 > -"),
+)  # fmt: skip
+
+
 def _lss(probe: CanopenProbe, data: bytes | str, timeout_s: float = 0.2) -> bytes | None:
+    """Send a request, padded to 8 bytes; return the answer, or None."""
     payload = bytes.fromhex(data) if isinstance(data, str) else data
     probe.send(LSS_TO_SLAVE, payload.ljust(8, b"\0"))
-    return probe.wait_for(LSS_FROM_SLAVE, timeout_s)
+    return probe.wait_for(LSS_FROM_SLAVE, timeout_s) if timeout_s else None
+
+
+def _numbers(
+    probe: CanopenProbe, command: int, numbers: Iterable[int], timeout_s: float
+) -> list[bytes | None]:
+    """Send numbers with consecutive commands; return the answers."""
+    requests = [bytes([step]) + number.to_bytes(4, "little") for step, number in enumerate(numbers, command)]
+    return [_lss(probe, request, timeout_s) for request in requests]
 
 
 def _identity(probe: CanopenProbe) -> list[int]:
@@ -116,15 +133,16 @@ def _select(probe: CanopenProbe) -> list[int]:
     if not probe.od.device_information.LSS_supported:
         raise CaseSkipped("the EDS has no LSS")
     identity = _identity(probe)
-    answer = None
-    for step, number in enumerate(identity):
-        answer = _lss(probe, bytes([0x40 + step]) + number.to_bytes(4, "little"), 0.2 if step == 3 else 0.05)
+    answer = _numbers(probe, 0x40, identity, 0.1)[-1]
     check_equal(answer, b"\x44" + bytes(7), "answer to switch state selective")
     return identity
 
 
 def _wait(probe: CanopenProbe) -> None:
-    probe.send(LSS_TO_SLAVE, b"\x04" + bytes(7))
+    _lss(probe, "04", 0.0)
+
+
+add_dialogues(LSS, DIALOGUES, lambda probe: partial(_lss, probe), _select)
 
 
 @LSS.case("selective", "switch state selective", "CiA 305 switch state selective")
@@ -134,39 +152,9 @@ def selective(probe: CanopenProbe) -> None:
     _wait(probe)
     for wrong in range(4):
         parts = [number ^ (1 << 20 if part == wrong else 0) for part, number in enumerate(identity)]
-        for step, number in enumerate(parts):
-            answer = _lss(probe, bytes([0x40 + step]) + number.to_bytes(4, "little"), 0.05)
+        for answer in _numbers(probe, 0x40, parts, 0.05):
             check(answer is None, "no answer to another identity", answer)
     check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
-
-
-@LSS.case("global", "switch state global", "CiA 305 switch state global")
-def global_(probe: CanopenProbe) -> None:
-    _select(probe)
-    check(_lss(probe, "04 00", 0.1) is None, "no answer to switch state global", "one")
-    check(_lss(probe, "5e", 0.1) is None, "waiting state", "configuration")
-    check(_lss(probe, "04 01", 0.1) is None, "no answer to switch state global", "one")
-    check(_lss(probe, "5e") is not None, "configuration state", "waiting")
-    _wait(probe)
-
-
-@LSS.case("inquire", "inquire identity and node ID", "CiA 305 inquire")
-def inquire(probe: CanopenProbe) -> None:
-    identity = _select(probe)
-    for command, number in enumerate(identity, 0x5A):
-        answer = _lss(probe, bytes([command]))
-        check_equal(answer, bytes([command]) + number.to_bytes(4, "little") + bytes(3), "answer")
-    check_equal(_lss(probe, "5e"), bytes([0x5E, probe.node]) + bytes(6), "answer")
-    _wait(probe)
-
-
-@LSS.case("waiting", "a waiting node ignores configuration commands")
-def waiting(probe: CanopenProbe) -> None:
-    _select(probe)
-    _wait(probe)
-    for data in ("11 05", "13 00 02", "17", "5a", "5e"):
-        answer = _lss(probe, data, 0.05)
-        check(answer is None, f"no answer to {data}", answer)
 
 
 @LSS.case("node-id", "configure node ID", "CiA 305 configure node-ID")
@@ -218,11 +206,7 @@ def identify(probe: CanopenProbe) -> None:
     everything = (vendor, product, 0, 0xFFFFFFFF, 0, 0xFFFFFFFF)
     exact = (vendor, product, revision, revision, serial, serial)
     for ranges in (everything, exact):
-        for step, number in enumerate(ranges):
-            answer = _lss(
-                probe, bytes([0x46 + step]) + number.to_bytes(4, "little"), 0.2 if step == 5 else 0.02
-            )
-        check_equal(answer, b"\x4f" + bytes(7), "answer")
+        check_equal(_numbers(probe, 0x46, ranges, 0.1)[-1], b"\x4f" + bytes(7), "answer")
     others = [
         (vendor, product ^ 1, *everything[2:]),
         (vendor, product, revision + 1, 0xFFFFFFFF, 0, 0xFFFFFFFF),
@@ -230,18 +214,8 @@ def identify(probe: CanopenProbe) -> None:
     if serial:
         others.append((vendor, product, 0, 0xFFFFFFFF, 0, serial - 1))
     for ranges in others:
-        for step, number in enumerate(ranges):
-            answer = _lss(probe, bytes([0x46 + step]) + number.to_bytes(4, "little"), 0.05)
+        for answer in _numbers(probe, 0x46, ranges, 0.05):
             check(answer is None, "no answer", answer)
-
-
-@LSS.case("configured", "a configured node does not take part in Fastscan", "CiA 305 fastscan")
-def configured(probe: CanopenProbe) -> None:
-    _select(probe)
-    _wait(probe)
-    for data in ("51 00 00 00 00 80 00 00", "4c"):
-        answer = _lss(probe, data, 0.1)
-        check(answer is None, f"no answer to {data}", answer)
 
 
 @LSS.case("fastscan", "Fastscan finds a node without a node ID", "CiA 305 fastscan")
@@ -263,7 +237,7 @@ def fastscan(probe: CanopenProbe) -> None:
         check_equal(found, identity, "identity")
         check_equal(_lss(probe, "5e"), b"\x5e\xff" + bytes(6), "answer to inquire node ID")
     finally:
-        probe.send(LSS_TO_SLAVE, b"\x04\x01" + bytes(6))
+        _lss(probe, "04 01", 0.0)
         _lss(probe, bytes([0x11, old]))
         _wait(probe)
     probe.expect_boot_up()
@@ -286,14 +260,3 @@ def _scan(probe: CanopenProbe) -> list[int]:
             raise CaseFailed(f"part {part + 1} of the identity confirmed", f"nothing for 0x{number:08X}")
         identity.append(number)
     return identity
-
-
-@LSS.case("states", "LSS works in every NMT state")
-def states(probe: CanopenProbe) -> None:
-    _select(probe)
-    _wait(probe)
-    for command in (START, STOP):
-        probe.command(command)
-        probe.send(LSS_TO_SLAVE, b"\x04\x01" + bytes(6))
-        check_equal(_lss(probe, "5e"), bytes([0x5E, probe.node]) + bytes(6), "answer")
-        _wait(probe)

@@ -5,17 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.hil_tests.conformance import (
-    canopen_design,
     canopen_eds,
     canopen_emcy,
     canopen_nmt,
     canopen_od,
-    canopen_rpdo,
+    canopen_pdo,
     canopen_sdo,
-    canopen_sdo_block,
     canopen_store_lss,
     canopen_sync_time,
-    canopen_tpdo,
 )
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
@@ -24,19 +21,9 @@ from starhil.hil_tests.judge.definition import Unit
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
     cases_of(
-        canopen_eds,
-        canopen_nmt,
-        canopen_sdo,
-        canopen_sdo_block,
-        canopen_od,
-        canopen_sync_time,
-        canopen_emcy,
-        canopen_tpdo,
-        canopen_rpdo,
-        canopen_store_lss,
-        canopen_design,
+        canopen_eds, canopen_nmt, canopen_sdo, canopen_od, canopen_sync_time, canopen_emcy, canopen_pdo, canopen_store_lss
     )
-)
+)  # fmt: skip
 """Cases of CiA 301, for any unit."""
 
 

@@ -47,8 +47,7 @@ def sync_counter_range(probe: CanopenProbe) -> None:
     "counter-fixed", "the counter overflow cannot be changed while a period is set", "CiA 301 7.5.2.22"
 )
 def sync_counter_fixed(probe: CanopenProbe) -> None:
-    probe.require(0x1019)
-    probe.require(0x1006)
+    probe.require(0x1019, 0x1006)
     probe.set(0x1006, 0, 100_000)
     probe.expect_refusal(0x1019, 0, 10, 1, Abort.DEVICE_STATE)
     probe.set(0x1006, 0, 0)
@@ -57,17 +56,16 @@ def sync_counter_fixed(probe: CanopenProbe) -> None:
 
 @SYNC.case("length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3")
 def sync_length(probe: CanopenProbe) -> None:
-    probe.require(0x1014)
+    emergency = probe.emergency_id()
     _quiet_and_drain(probe)
-    emergency = probe.number(0x1014) & 0x7FF
     probe.send(0x080, b"\x01")
-    check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
+    probe.expect_emergency(emergency, 0x8240)
     probe.send(0x080)
-    check_equal(probe.expect(emergency, "EMCY 0000h")[:2], b"\0\0", "error code")
+    probe.expect_emergency(emergency, 0)
     if 0x1019 in probe.od:
         probe.set(0x1019, 0, 10, 1)
         probe.send(0x080)
-        check_equal(probe.expect(emergency, "EMCY 8240h")[:2], b"\x40\x82", "error code")
+        probe.expect_emergency(emergency, 0x8240)
 
 
 @SYNC.case("producer", "SYNC producer")

@@ -16,6 +16,7 @@ from starhil.hil_tests.attitude import (
     from_radec_roll,
     from_vector_part,
     interpolate,
+    to_radec_roll,
     unit,
     wrapped_difference,
 )
@@ -103,6 +104,12 @@ def test_the_vector_part_alone_gives_the_attitude(ra, dec, roll):
 def test_an_invalid_attitude_is_rejected(values):
     with pytest.raises(BenchError, match="quaternion"):
         unit(values)
+
+
+@given(angles, declinations, angles)
+def test_angles_are_those_from_which_an_attitude_was_made(ra, dec, roll):
+    seen = from_radec_roll(*to_radec_roll(from_radec_roll(ra, dec, roll)))
+    assert attitude_error(seen, from_radec_roll(ra, dec, roll)).total_arcsec < TOLERANCE_ARCSEC
 
 
 def test_interpolation_goes_the_short_way_at_constant_rate():

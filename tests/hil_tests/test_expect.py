@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import pytest
+from pydantic import TypeAdapter
 
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.expect import (
     AttitudeCheck,
-    Expectation,
+    Conditions,
+    ReadConditions,
     Variable,
     measured_attitude,
-    read_expectation,
     show,
 )
-from starhil.hil_tests.script_reader import TableReader
 
 
-def expectation(value, known=frozenset()):
-    return read_expectation("x", value, TableReader({}, "place"), known)
+def expectation(value, known=()):
+    return TypeAdapter(ReadConditions).validate_python(value, context={"captured": known})
 
 
 @pytest.mark.parametrize(
@@ -41,8 +41,8 @@ def expectation(value, known=frozenset()):
     ],
 )
 def test_each_form_matches_only_its_own_values(wanted, good, bad):
-    assert expectation(wanted).mismatch(good, {}) is None
-    text = expectation(wanted).mismatch(bad, {})
+    assert expectation(wanted).mismatch("x", good, {}) is None
+    text = expectation(wanted).mismatch("x", bad, {})
     assert text is not None
     assert text.startswith(f"x is {show(bad)}, expected ")
 
@@ -50,43 +50,62 @@ def test_each_form_matches_only_its_own_values(wanted, good, bad):
 def test_a_captured_value_is_taken_at_the_time_of_the_check():
     growing = expectation({"above": "$before"}, frozenset({"before"}))
     assert growing.above == Variable("before")
-    assert growing.mismatch(8, {"before": 7}) is None
-    assert growing.mismatch(7, {"before": 7}) == "x is 7, expected more than 7"
+    assert growing.mismatch("x", 8, {"before": 7}) is None
+    assert growing.mismatch("x", 7, {"before": 7}) == "x is 7, expected more than 7"
 
 
 def test_not_a_number_fails_every_comparison():
     nan = float("nan")
     for wanted in ({"min": 0}, {"max": 0}, {"above": 0}, {"value": 0, "within": 1}, 0.0):
-        assert expectation(wanted).mismatch(nan, {}) is not None
+        assert expectation(wanted).mismatch("x", nan, {}) is not None
 
 
 def test_bytes_are_compared_with_bytes_given_or_captured():
-    assert Expectation("x", equals=b"\x0a\x0b").mismatch(b"\x0a\x0b", {}) is None
-    assert Expectation("x", equals=b"\x0a\x0b").mismatch(b"\x0a\x0c", {}) == "x is 0A 0C, expected 0A 0B"
+    assert Conditions.model_construct(value=b"\x0a\x0b").mismatch("x", b"\x0a\x0b", {}) is None
+    assert (
+        Conditions.model_construct(value=b"\x0a\x0b").mismatch("x", b"\x0a\x0c", {})
+        == "x is 0A 0C, expected 0A 0B"
+    )
     before = {"before": b"\x0a\x0b"}
-    assert Expectation("x", equals=Variable("before")).mismatch(b"\x0a\x0b", before) is None
-    assert Expectation("x", differs_from=Variable("before")).mismatch(b"\x0a\x0b", before) is not None
-    assert Expectation("x", equals=Variable("before")).mismatch(b"\x0a\x0b", {"before": "text"}) is not None
+    assert Conditions.model_construct(value=Variable("before")).mismatch("x", b"\x0a\x0b", before) is None
+    assert (
+        Conditions.model_construct(differs_from=Variable("before")).mismatch("x", b"\x0a\x0b", before)
+        is not None
+    )
+    assert (
+        Conditions.model_construct(value=Variable("before")).mismatch("x", b"\x0a\x0b", {"before": "text"})
+        is not None
+    )
 
 
 def test_a_flag_is_not_the_number_one():
-    assert Expectation("x", equals=True).mismatch(1, {}) is not None
+    assert Conditions.model_construct(value=True).mismatch("x", 1, {}) is not None
 
 
 def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
     truth = from_radec_roll(10.0, 20.0, 30.0)
     off = from_radec_roll(10.0, 20.0 + 10.0 / 3600.0, 30.0)
     values = dict(zip(("q_x", "q_y", "q_z", "q_w"), off, strict=True)) | {"valid": True, "reason": "ok"}
-    error, problem = AttitudeCheck(10.1, None, None, None).judge(values, truth)
+    error, problem = AttitudeCheck(within_arcsec=10.1).judge(values, truth)
     assert problem is None
     assert error.cross_boresight_arcsec == pytest.approx(10.0, abs=1e-6)
-    _, problem = AttitudeCheck(9.9, None, None, None).judge(values, truth)
+    _, problem = AttitudeCheck(within_arcsec=9.9).judge(values, truth)
     assert problem == "cross-boresight error 10.0 arcsec, expected at most 9.9 arcsec"
-    error, problem = AttitudeCheck(1e9, None, None, None).judge(
+    error, problem = AttitudeCheck(within_arcsec=1e9).judge(
         values | {"valid": False, "reason": "no_match"}, truth
     )
     assert error is None
     assert "no_match" in problem
+
+
+def test_a_large_error_is_given_in_degrees_with_both_attitudes():
+    truth, measured = from_radec_roll(83.8, -1.2, 30.0), from_radec_roll(133.3438, -1.2, 30.0)
+    values = dict(zip(("q_x", "q_y", "q_z", "q_w"), measured, strict=True))
+    _, problem = AttitudeCheck(within_arcsec=60.0).judge(values, truth)
+    assert problem == (
+        "cross-boresight error 49.532 deg, expected at most 60 arcsec; measured RA 133.3438, Dec -1.2000, "
+        "roll 30.0000 deg, true RA 83.8000, Dec -1.2000, roll 30.0000 deg"
+    )
 
 
 def test_an_all_zero_quaternion_is_not_an_attitude():

@@ -8,9 +8,8 @@ import pytest
 
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import ScriptError
-from starhil.hil_tests.expect import Expectation, Variable
-from starhil.hil_tests.script import load_script
-from starhil.hil_tests.script_model import Command, Read, Sample, Send
+from starhil.hil_tests.expect import Variable
+from starhil.hil_tests.script import Command, Read, Sample, Send, load_script
 from starhil.hil_tests.session_run import SCRIPT_FOLDER, find_script
 from starhil.protocol.icd import load_unit
 
@@ -78,7 +77,8 @@ wait_s = 0.5
 
 def test_a_full_script_is_read_unchanged(load):
     script = load(FULL)
-    assert (script.title, script.timeout_s, script.retries, script.keep_going, script.link) == (
+    defaults = script.defaults
+    assert (script.title, defaults.timeout_s, defaults.retries, defaults.keep_going, defaults.link) == (
         "All parts", 0.5, 1, True, "both",
     )  # fmt: skip
     assert (script.emulator.profile, script.emulator.settings, script.emulator.seed) == (
@@ -86,16 +86,16 @@ def test_a_full_script_is_read_unchanged(load):
     )  # fmt: skip
     assert attitude_error(script.truth.attitude, from_radec_roll(83.8, -1.2, 30.0)).total_arcsec == 0.0
     read, clock, attitude, sample, send, wait = script.steps
-    assert isinstance(read.action, Read)
-    assert read.action.row.id == 128
+    assert isinstance(read, Read)
+    assert read.row.id == 128
     assert read.capture == {"before": "runtime_s"}
-    assert isinstance(clock.action, Command)
-    assert clock.action.values["seconds"] == Variable("now_s")
+    assert isinstance(clock, Command)
+    assert clock.values["seconds"] == Variable("now_s")
     assert clock.name == "set the clock"
-    assert (attitude.link, attitude.within_s, attitude.attitude.cross_arcsec) == ("can", 20.0, 30.0)
-    assert isinstance(sample.action, Sample)
-    assert (sample.action.file, sample.action.at_least, sample.every_s) == ("slew.csv", 0.9, 0.2)
-    assert isinstance(send.action, Send)
+    assert (attitude.link, attitude.within_s, attitude.attitude.within_arcsec) == ("can", 20.0, 30.0)
+    assert isinstance(sample, Sample)
+    assert (sample.file, sample.at_least, sample.every_s) == ("slew.csv", 0.9, 0.2)
+    assert isinstance(send, Send)
     assert send.link == "serial"
     assert wait.name == "wait 0.5 s"
 
@@ -192,12 +192,37 @@ def test_an_error_is_reported_with_file_step_name_and_near_matches(load, text, w
         assert word in message
 
 
+def test_every_error_of_a_script_is_reported_with_its_place(load):
+    with pytest.raises(ScriptError) as caught:
+        load(
+            "[defaults]\ntimeout = 3\n"
+            "[[step]]\nread = 'quaternoin'\ncapture = { first = 'q_x' }\n"
+            "[[step]]\nread = 'rates'\nexpect = { rat_x = 1, rate_y = '$first' }\nwithin = 3\n"
+            "[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }"
+        )
+    lines = str(caught.value).splitlines()
+    assert [line.split(": ")[1] for line in lines] == ["defaults", "step 1", "step 2", "step 3"]
+    for line, word in zip(lines, ("timeout_s", "quaternion", "within_s", "tracking"), strict=True):
+        assert word in line
+
+
+def test_every_wrong_field_of_a_step_is_reported(load):
+    with pytest.raises(ScriptError) as caught:
+        load(
+            "[[step]]\nread = 'rates'\nexpect = { rat_x = 1, rate_y = 'fast' }\ncapture = { first = 'rate_zz' }"
+        )
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 3
+    for word in ("'rat_x'", "'rate_y' is a number", "'rate_zz'"):
+        assert any(word in line for line in lines)
+
+
 def test_a_captured_value_may_be_used_by_later_steps_only(load):
     script = load(
         "[[step]]\nread = 'boot_status'\ncapture = { boots = 'boot_count' }\n"
         "[[step]]\nread = 'boot_status'\nexpect = { boot_count = { value = '$boots', plus = 1 } }"
     )
-    assert script.steps[1].expect[0].equals == Variable("boots")
+    assert script.steps[1].expect["boot_count"].equals == Variable("boots")
 
 
 def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
@@ -207,15 +232,15 @@ def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
         "[[step]]\nread = 'hole_map_1'\ncapture = { map = 'map' }\n"
         f"[[step]]\nread = 'hole_map_1'\nexpect = {{ map = {{ {wanted} }} }}"
     )
-    (expectation,) = script.steps[1].expect
-    assert expectation == Expectation("map", equals=zeros, one_of=(zeros, Variable("map")), differs_from=ones)
-    assert expectation.mismatch(zeros, {"map": ones}) is None
-    assert expectation.mismatch(ones, {"map": ones}) is not None
+    wanted = script.steps[1].expect["map"]
+    assert (wanted.equals, wanted.one_of, wanted.differs_from) == (zeros, [zeros, Variable("map")], ones)
+    assert wanted.mismatch("map", zeros, {"map": ones}) is None
+    assert wanted.mismatch("map", ones, {"map": ones}) is not None
 
 
 def test_values_that_a_correct_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):
     script = load("[[step]]\ncommand = 'set_mode'\nwith = { mode = 77 }\nrefused = 'invalid_parameter'")
-    assert script.steps[0].action.refused == "invalid_parameter"
+    assert script.steps[0].refused == "invalid_parameter"
 
 
 def test_a_missing_file_is_rejected_with_near_names(tmp_path):

@@ -6,20 +6,22 @@ import csv
 import json
 import signal
 import threading
+from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import pytest
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
-from starhil.hil_tests.attitude import from_radec_roll
+from starhil.emulator.profile import load_profile
+from starhil.hil_tests.attitude import attitude_error, from_radec_roll, unit
 from starhil.hil_tests.bench import Bench, LinkOptions
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import SessionRunner
-from starhil.hil_tests.session_run import SessionRequest, _printer, run_session
+from starhil.hil_tests.session_run import SessionRequest, _emulator, _printer, run_session
 from starhil.protocol.candump import read_candump
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
@@ -43,7 +45,7 @@ def play(device, tmp_path):
         path = tmp_path / "trial.toml"
         path.write_text("[defaults]\ntimeout_s = 5\nkeep_going = true\n" + text, encoding="utf-8")
         script = load_script(path, ICD)
-        options = LinkOptions(serial=port, can=can, timeout_s=script.timeout_s)
+        options = LinkOptions(serial=port, can=can, timeout_s=script.defaults.timeout_s)
         with Bench(options, ICD, log_folder=tmp_path) as bench:
             return SessionRunner(script, bench, tmp_path).run()
 
@@ -246,6 +248,28 @@ def test_the_attitude_is_compared_with_the_truth_of_its_time_in_a_file(play, dev
     assert play(text).passed
     device.telemetry["precise_attitude"] = attitude_values(time_of_exposure=100.6)
     assert not play(text).passed
+
+
+@pytest.mark.parametrize("own", ["", "truth.kind=rate"])
+def test_the_truth_of_a_script_points_the_emulator_that_is_started(own, tmp_path):
+    path = tmp_path / "trial.toml"
+    path.write_text(
+        f"[emulator]\nset = ['{own or 'parameters.update_rate=2'}']\n"
+        "[truth]\nra_deg = 201.3\ndec_deg = -11.2\nroll_deg = 5\n[[step]]\nread = 'rates'\n"
+    )
+    options = LinkOptions(serial="auto")
+    emulator = _emulator(SessionRequest(path, options), load_script(path, ICD), options, tmp_path, tmp_path)
+    given = [setting for option, setting in pairwise(emulator.command) if option == "--set"]
+    if own:  # settings of the script's own go before
+        assert given == [own]
+        return
+    attitude = load_profile("cubestar", given).truth.attitude.build()
+    assert (
+        attitude_error(
+            unit(attitude.quaternion_xyzw.tolist()), from_radec_roll(201.3, -11.2, 5.0)
+        ).total_arcsec
+        < 1e-3
+    )
 
 
 def test_an_invalid_attitude_never_passes(play, device):

@@ -71,8 +71,8 @@ def test_what_the_console_sent_is_a_session_script(run, tmp_path):
             path.write_text(await page.get("/session.toml"))
             script = load_script(path, load_unit())
             mode, rate, *others = [step for step in script.steps if not step.name.startswith("wait")]
-            assert mode.action.values == {"mode": "lost_in_space"}
-            assert rate.action.refused == "invalid_parameter"
+            assert mode.values == {"mode": "lost_in_space"}
+            assert rate.refused == "invalid_parameter"
             assert len(others) == 2
             await page.ask(do="clear_session")
             assert "nothing has been sent yet" in await page.get("/session.toml")
