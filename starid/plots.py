@@ -46,16 +46,3 @@ def colours(count: int) -> list[Any]:
     import matplotlib as mpl
 
     return [mpl.colormaps["viridis"](0.05 + 0.85 * i / max(count - 1, 1)) for i in range(count)]
-
-
-def precision_curve(axes: Any, errors: Any, limit: float, **options: Any) -> None:
-    """Draw the percentage of errors at or below a threshold, for 1000 thresholds from 0 to limit."""
-    import numpy as np
-
-    thresholds = np.linspace(0.0, limit, 1001)
-    ordered = np.sort(np.asarray(errors, dtype=np.float64))
-    share = 100.0 * np.searchsorted(ordered, thresholds, side="right") / max(ordered.size, 1)
-    axes.plot(thresholds, share, **options)
-    axes.set_xlim(0.0, limit)
-    axes.set_ylim(0.0, 102.0)
-    axes.set_ylabel("precision rate / %")

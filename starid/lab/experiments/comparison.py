@@ -1,25 +1,140 @@
 """Checks against published numbers: agreement within a stated tolerance, or improvement on the number.
 
-An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
-and marks the checks that it meets as weak. (Constants fitted to published numbers: see `choices`.)
+`compared` makes the row of a quantity from what an experiment measured and what the thesis prints. The check is
+a word and its arguments, in a column of `published.csv` or formed by an experiment for a line of a large table:
 
-`published.csv` holds the numbers that the thesis prints: experiment, quantity, the number or numbers, unit, digits,
-tolerance, remark. `compared` makes the check of a quantity from what an experiment measured. The tolerance is
-``digit`` (half of the last of the digits shown), ``rounding N`` (of N digits), ``sampling`` (see `sampling`), ``the
-same``, or a number and its origin.
+=================  ===============================================================================
+``digit``          half of the last of the digits shown
+``rounding N``     half of the Nth decimal
+``sampling N``     three standard errors of two shares of N trials (without N: of the trials made)
+``mean S N``       three standard errors of two means of N trials with the standard deviation S
+``deviation S N``  the same of two standard deviations
+``coefficient N``  the same of two correlation coefficients
+``X ORIGIN``       at most X, and why
+``same``           equal, each of several numbers
+``> X``, ``< X``   larger or smaller than X; the thesis has a phrase
+``more, less``     ours is better, as it is larger or smaller
+=================  ===============================================================================
+
+An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
+and marks the checks that it meets as weak. (Constants fitted to published numbers: see `tables`.)
 """
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
-from typing import Any, TypedDict
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Final, Literal, TypedDict
 
-from starid.lab.experiments.experiment import Kind, ReproduceError, Row, space_before, value_text
+from starid.errors import StaridError
+
+Kind = Literal["", "agrees", "fitted", "better", "ours"]
+"""Class of a check: agreement with a published number, the same after a constant was fitted to that number (only in
+the report, see `tables`), improvement on it, our own bound, or none ("")."""
+
+
+class ReproduceError(StaridError):
+    """A reproduction that cannot be run as requested."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A row of the report.
+
+    Attributes
+    ----------
+    quantity
+        What was measured, and under what conditions.
+    published, ours, author, printed
+        The published value, this project's, and those from the author's version of the algorithm and from the
+        printed one, as printed in the report; "—" if there is none.
+    target
+        What is checked, and the tolerance and its origin; "" without a check.
+    passed
+        Outcome of the check; None if there is none.
+    remark
+        Why the values differ, or how to read them.
+    kind
+        Class of the check.
+    met, of
+        How many of the published numbers in the row agree, and how many there are.
+    interval
+        Lowest and highest value that agrees, for one published number.
+    weak, weak_met
+        How many of the published numbers the best constant answer of the null model meets as well, and how
+        many of these agree.
+    """
+
+    quantity: str
+    published: str
+    ours: str
+    target: str = ""
+    passed: bool | None = None
+    remark: str = ""
+    author: str = "—"
+    printed: str = "—"
+    kind: Kind = ""
+    met: int = 0
+    of: int = 0
+    interval: tuple[float, ...] = ()
+    weak: int = 0
+    weak_met: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What an experiment adds to the report: rows, names of files, and paragraphs of Markdown."""
+
+    rows: tuple[Row, ...]
+    files: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def failed(self) -> tuple[Row, ...]:
+        """Rows whose check failed."""
+        return tuple(row for row in self.rows if row.passed is False)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Convert to plain values."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Outcome:
+        """Make an outcome from the values of `to_dict`."""
+        rows = tuple(Row(**{**row, "interval": tuple(row["interval"])}) for row in values["rows"])
+        return cls(rows, tuple(values["files"]), tuple(values["notes"]))
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    """What the thesis prints of a quantity.
+
+    Attributes
+    ----------
+    text
+        The number, several numbers separated by spaces, or a phrase; "" for nothing.
+    unit, digits
+        Unit, and decimals with which the report shows it.
+    check
+        How it is checked; "" if it is only shown.
+    remark
+        Remark in the report.
+    """
+
+    text: str
+    unit: str = ""
+    digits: int = 2
+    check: str = ""
+    remark: str = ""
+
+    @property
+    def numbers(self) -> list[float]:
+        """The numbers; none in a phrase."""
+        try:
+            return [float(word) for word in self.text.split()]
+        except ValueError:
+            return []
 
 
 class Readings(TypedDict, total=False):
@@ -28,6 +143,18 @@ class Readings(TypedDict, total=False):
     author: float
     printed: float
     ours: float
+
+
+def space_before(unit: str) -> str:
+    """Separator between a number and its unit."""
+    return "" if unit in ("", "°", "″") else " "
+
+
+def value_text(value: float | str | None, unit: str, digits: int) -> str:
+    """Format a value for the report; "—" for None."""
+    if value is None:
+        return "—"
+    return value if isinstance(value, str) else f"{value:.{digits}f}{space_before(unit)}{unit}"
 
 
 Tolerance = tuple[float, str]
@@ -39,26 +166,102 @@ def rounding(digits: int, unit: str = "") -> Tolerance:
     return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
 
 
-def sampling(percent: float, trials: int, sigmas: float = 3.0) -> Tolerance:
+def sampling(percent: float, trials: float, sigmas: float = 3.0) -> Tolerance:
     """Tolerance for two shares (percent) counted in equally many trials, as a multiple of the standard error.
 
     The standard error is computed for (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too.
     """
     share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
     error = 100.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
-    return sigmas * error, f"{sigmas:g} standard errors of two shares of {trials}, {sigmas * error:.2g} %"
+    return sigmas * error, f"{sigmas:g} standard errors of two shares of {trials:g}, {sigmas * error:.2g} %"
 
 
-def sampled_mean(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
-    """Tolerance for two means over equally many trials, as a multiple of the standard error."""
-    error = sigma * math.sqrt(2.0 / trials)
-    return sigmas * error, f"{sigmas:g} standard errors of two means of {trials}, {sigmas * error:.2g}"
+def _mean(_: float, sigma: float, trials: float) -> Tolerance:
+    error = 3.0 * sigma * math.sqrt(2.0 / trials)
+    return error, f"3 standard errors of two means of {trials:g}, {error:.2g}"
 
 
-def sampled_deviation(sigma: float, trials: int, sigmas: float = 3.0) -> Tolerance:
-    """Tolerance for two standard deviations over equally many trials, as a multiple of the standard error."""
-    error = sigma / math.sqrt(trials - 1)
-    return sigmas * error, f"{sigmas:g} standard errors of two deviations of {trials}, {sigmas * error:.2g}"
+def _deviation(_: float, sigma: float, trials: float) -> Tolerance:
+    error = 3.0 * sigma / math.sqrt(trials - 1.0)
+    return error, f"3 standard errors of two deviations of {trials:g}, {error:.2g}"
+
+
+def _coefficient(published: float, trials: float) -> Tolerance:
+    """By Fisher's transformation."""
+    error = 3.0 * (1.0 - published**2) * math.sqrt(2.0 / (trials - 3.0))
+    return error, f"3 standard errors of two coefficients of {trials:g}, {error:.2g}"
+
+
+_SAMPLED: Final[dict[str, Callable[..., Tolerance]]] = {
+    "sampling": sampling,
+    "mean": _mean,
+    "deviation": _deviation,
+    "coefficient": _coefficient,
+}
+
+
+def _tolerance(known: Published, trials: int) -> Tolerance:
+    word, _, rest = known.check.partition(" ")
+    if word in ("digit", "rounding"):
+        return rounding(known.digits if word == "digit" else int(rest), known.unit)
+    if word in _SAMPLED:
+        numbers = [float(each) for each in rest.split()] or [float(trials)]
+        return _SAMPLED[word](known.numbers[0], *numbers)
+    return float(word), rest
+
+
+def row(
+    quantity: str,
+    *,
+    ours: float | str,
+    published: float | str | None = None,
+    unit: str = "",
+    digits: int = 2,
+    at_least: float | None = None,
+    at_most: float | None = None,
+    passed: bool | None = None,
+    target: str = "",
+    remark: str = "",
+) -> Row:
+    """Make a row for the report; with a bound it becomes a check of class "ours".
+
+    `starid.lab.experiments.comparison` makes the checks against published numbers.
+
+    Parameters
+    ----------
+    quantity
+        What was measured.
+    ours, published
+        Values: numbers (printed with `digits` decimals and `unit`) or text; published may be None.
+    at_least, at_most
+        Bounds on `ours`, set by this project; `ours` must then be a number.
+    passed, target
+        Result of another kind of check, and its description.
+    remark
+        Why the two values differ.
+    """
+    space = space_before(unit)
+    if isinstance(ours, str) and not (at_least is None and at_most is None):
+        raise ReproduceError(f"reproduce: {quantity}: text cannot have bounds; give a number")
+    bounds = []
+    if at_least is not None and not isinstance(ours, str):
+        bounds.append(f"≥ {at_least:g}{space}{unit}")
+        passed = bool(ours >= at_least) and passed is not False
+    if at_most is not None and not isinstance(ours, str):
+        bounds.append(f"≤ {at_most:g}{space}{unit}")
+        passed = bool(ours <= at_most) and passed is not False
+    verdict = None if passed is None else bool(passed)
+    return Row(
+        quantity,
+        value_text(published, unit, digits),
+        value_text(ours, unit, digits),
+        target or ", ".join(bounds),
+        verdict,
+        remark,
+        kind="" if verdict is None else "ours",
+        met=int(verdict is True),
+        of=int(verdict is not None),
+    )
 
 
 def shown(
@@ -73,14 +276,9 @@ def shown(
     remark: str = "",
 ) -> Row:
     """Make a row without a check."""
-    return Row(
-        quantity,
-        value_text(published, unit, digits),
-        value_text(ours, unit, digits),
-        remark=remark,
-        author=value_text(author, unit, digits),
-        printed=value_text(printed, unit, digits),
-    )
+    values = (value_text(value, unit, digits) for value in (published, ours, author, printed))
+    one, two, three, four = values
+    return Row(quantity, one, two, author=three, printed=four, remark=remark)
 
 
 def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -> Row:
@@ -188,21 +386,9 @@ def improvement(
     return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])
 
 
-@lru_cache(maxsize=1)
-def _published() -> dict[tuple[str, str], dict[str, str]]:
-    with Path(__file__).with_name("published.csv").open(encoding="utf-8", newline="") as stream:
-        return {(line["experiment"], line["quantity"]): line for line in csv.DictReader(stream)}
-
-
-def published(experiment: str, quantity: str) -> list[float]:
-    """Return the published numbers of a quantity; none if the thesis has none."""
-    line = _published().get((experiment, quantity))
-    return [] if line is None else [float(word) for word in line["published"].split()]
-
-
 def compared(
-    experiment: str,
     quantity: str,
+    known: Published,
     *,
     author: Any = None,
     printed: Any = None,
@@ -210,12 +396,12 @@ def compared(
     trials: int = 0,
     remark: str = "",
 ) -> Row:
-    """Check a quantity of `published.csv`; several numbers must agree one by one.
+    """Check what was measured against what the thesis prints, or show both.
 
     Parameters
     ----------
-    experiment, quantity
-        Key in `published.csv`.
+    quantity, known
+        What was measured, and what the thesis prints.
     author, printed, ours
         The number, or as many as are published; the first that is given is checked.
     trials
@@ -223,36 +409,46 @@ def compared(
     remark
         Added to that of the table.
     """
-    line, numbers = _published()[experiment, quantity], published(experiment, quantity)
-    unit, digits, rule = line["unit"], int(line["digits"]), line["tolerance"]
-    remark = f"{line['remark']} {remark}".strip()
-    if len(numbers) == 1 and rule != "the same":
-        word, _, rest = rule.partition(" ")
-        if word == "sampling":
-            tolerance = sampling(numbers[0], trials)
-        elif word in ("digit", "rounding"):
-            tolerance = rounding(digits if word == "digit" else int(rest), unit)
-        else:
-            tolerance = float(word), rest
-        readings = {
-            name: None if value is None else float(value)
-            for name, value in (("author", author), ("printed", printed), ("ours", ours))
-        }
-        return agreement(
+    numbers, unit, digits = known.numbers, known.unit, known.digits
+    remark = f"{known.remark} {remark}".strip()
+    readings = {"author": author, "printed": printed, "ours": ours}
+    word, _, rest = known.check.partition(" ")
+    if word in ("more", "less"):
+        return improvement(
             quantity,
             published=numbers[0],
-            tolerance=tolerance,
-            **readings,
+            ours=ours,
+            larger=word == "more",
             unit=unit,
             digits=digits,
             remark=remark,
         )
+    if len(numbers) == 1 and known.check not in ("", "same"):
+        values = {name: None if value is None else float(value) for name, value in readings.items()}
+        tolerance = _tolerance(known, trials)
+        return agreement(
+            quantity,
+            published=numbers[0],
+            tolerance=tolerance,
+            **values,
+            unit=unit,
+            digits=digits,
+            remark=remark,
+        )
+    if len(numbers) <= 1 and known.check != "same":
+        published = numbers[0] if numbers else known.text or None
+        informing = shown(quantity, published=published, **readings, unit=unit, digits=digits, remark=remark)
+        if not known.check:
+            return informing
+        checked = next(value for value in readings.values() if value is not None)
+        agrees = checked > float(rest) if word == ">" else checked < float(rest)
+        return _checked(informing, "agrees", f"{known.check}{space_before(unit)}{unit}", [agrees])
 
     def text(values: Any) -> str | None:
         return None if values is None else ", ".join(f"{value:.{digits}f}" for value in values) + unit
 
-    checked = next(values for values in (author, printed, ours) if values is not None)
-    largest, origin = (0.0, rule) if rule == "the same" else rounding(digits, unit)
+    checked = next(values for values in readings.values() if values is not None)
+    largest, origin = (0.0, "the same") if known.check == "same" else rounding(digits, unit)
     return same(
         quantity,
         published=text(numbers) or "",
@@ -260,6 +456,6 @@ def compared(
         printed=text(printed),
         ours=text(ours),
         matches=[bool(abs(a - b) <= largest) for a, b in zip(checked, numbers, strict=True)],
-        target=origin if rule == "the same" else f"each ± {origin}",
+        target=origin if known.check == "same" else f"each ± {origin}",
         remark=remark,
     )

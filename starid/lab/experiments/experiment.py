@@ -1,4 +1,10 @@
-"""Experiments of `starid reproduce`: separately computed parts, and an outcome for the report."""
+"""Experiments of `starid reproduce`: trials that are computed separately, and what they add to the report.
+
+An experiment is an entry of `experiments.toml` (title, parameters of the full and of the quick run, and the trials
+they stand for), a module with two functions, and its lines in `published.csv`. `compute` makes named arrays from one
+trial, in a separate process; `evaluate` makes rows, tables and figures from those of all trials. Paragraphs for the
+report stand in `notes/NAME.md`.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +12,26 @@ import csv
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.errors import StaridError
+from starid.lab.experiments.comparison import (
+    Outcome,
+    Published,
+    ReproduceError,
+    Row,
+    compared,
+    null_model,
+    row,
+)
+from starid.lab.experiments.figures import Panel, draw
+from starid.lab.experiments.tables import PUBLISHED, published
 
 if TYPE_CHECKING:
     from starid.catalog import StarCatalog
@@ -32,18 +48,10 @@ Parameters = Mapping[str, Any]
 EPOCH: Final = 1991.25
 """Epoch of the catalogue: the published numbers are without proper motion."""
 
-Kind = Literal["", "agrees", "fitted", "better", "ours"]
-"""Class of a check: agreement with a published number, the same after a constant was fitted to that number (only in
-the report, see `choices`), improvement on it, our own bound, or none ("")."""
-
-
-class ReproduceError(StaridError):
-    """A reproduction that cannot be run as requested."""
-
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A piece of an experiment that can be computed separately.
+    """Trials that are computed together, apart from all others.
 
     Attributes
     ----------
@@ -57,95 +65,37 @@ class Part:
     values: Parameters = field(default_factory=dict)
 
 
-def parts_of(key: str, **values: Iterable[Any]) -> list[Part]:
-    """Make a part for each combination of values, the last varying fastest; `key` is a format string."""
-    chosen = [dict(zip(values, line, strict=True)) for line in itertools.product(*values.values())]
-    return [Part(key.format(**line), line) for line in chosen]
+def parts_of(parameters: Parameters) -> list[Part]:
+    """List the parts that the parameter ``trials`` stands for.
 
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A row of the report.
-
-    Attributes
-    ----------
-    quantity
-        What was measured, and under what conditions.
-    published, ours
-        The published value and this project's, as printed in the report; "—" if there is none.
-    target
-        What is checked, and the tolerance and its origin; "" without a check.
-    passed
-        Outcome of the check; None if there is none.
-    remark
-        Why the values differ, or how to read them.
-    author, printed
-        Values from the author's version of the algorithm and from the printed one; "—" if there is none.
-    kind
-        Class of the check.
-    met, of
-        How many of the published numbers in the row agree, and how many there are.
-    interval
-        Lowest and highest value that agrees, for one published number.
-    weak, weak_met
-        How many of the published numbers the best constant answer of the null model meets as well, and how
-        many of these agree.
+    Each entry has a format string ``key``, and values by name: a list, a single value, or the name of a parameter.
+    There is a part for each combination, the last name varying fastest.
     """
-
-    quantity: str
-    published: str
-    ours: str
-    target: str = ""
-    passed: bool | None = None
-    remark: str = ""
-    author: str = "—"
-    printed: str = "—"
-    kind: Kind = ""
-    met: int = 0
-    of: int = 0
-    interval: tuple[float, ...] = ()
-    weak: int = 0
-    weak_met: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """What an experiment adds to the report: rows, names of files, and paragraphs of Markdown."""
-
-    rows: tuple[Row, ...]
-    files: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    @property
-    def failed(self) -> tuple[Row, ...]:
-        """Rows whose check failed."""
-        return tuple(row for row in self.rows if row.passed is False)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Convert to plain values."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Outcome:
-        """Make an outcome from the values of `to_dict`."""
-        rows = tuple(Row(**{**row, "interval": tuple(row["interval"])}) for row in values["rows"])
-        return cls(rows, tuple(values["files"]), tuple(values["notes"]))
+    parts = []
+    for entry in parameters["trials"]:
+        values = {
+            name: parameters.get(value, value) if isinstance(value, str) else value
+            for name, value in entry.items()
+            if name != "key"
+        }
+        lists = [value if isinstance(value, list) else [value] for value in values.values()]
+        for line in itertools.product(*lists):
+            chosen = dict(zip(values, line, strict=True))
+            parts.append(Part(entry["key"].format(**chosen), chosen))
+    return parts
 
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """One experiment.
+    """One experiment: an entry of `experiments.toml` with the functions of its module.
 
     Attributes
     ----------
     name, title
         Name on the command line, and heading in the report.
-    parts
-        Function that lists the parts for given parameters.
-    compute
-        Function that computes a part, in a separate process; it must be defined at module level.
-    evaluate
-        Function that makes tables, figures and rows from the results of all parts, by key.
+    parts, compute, evaluate
+        List the parts for given parameters; compute one; make an outcome from the results of all, by key. They
+        must be defined at module level.
     full, quick
         Parameters of the full run and of the quick one; None leaves the experiment out of the quick run.
     alone
@@ -161,7 +111,7 @@ class Experiment:
     title: str
     parts: Callable[[Parameters], Sequence[Part]]
     compute: Callable[[Context, Part], Results]
-    evaluate: Callable[[Context, Mapping[str, Results]], Outcome]
+    evaluate: Callable[[Evaluation], None]
     full: Parameters
     quick: Parameters | None
     alone: bool = False
@@ -232,70 +182,92 @@ class Context:
         return planar_sky(None, "faintest")
 
 
-def row(
-    quantity: str,
-    *,
-    ours: float | str,
-    published: float | str | None = None,
-    unit: str = "",
-    digits: int = 2,
-    at_least: float | None = None,
-    at_most: float | None = None,
-    passed: bool | None = None,
-    target: str = "",
-    remark: str = "",
-) -> Row:
-    """Make a row for the report; with a bound it becomes a check of class "ours".
-
-    `starid.lab.experiments.comparison` makes the checks against published numbers.
+class Evaluation:
+    """Rows, tables, figures and notes of an experiment in the making, from the results of all its parts.
 
     Parameters
     ----------
-    quantity
-        What was measured.
-    ours, published
-        Values: numbers (printed with `digits` decimals and `unit`) or text; published may be None.
-    at_least, at_most
-        Bounds on `ours`, set by this project; `ours` must then be a number.
-    passed, target
-        Result of another kind of check, and its description.
-    remark
-        Why the two values differ.
+    context, parts, results
+        The run, its parts, and their results by key.
     """
-    space = space_before(unit)
-    if isinstance(ours, str) and not (at_least is None and at_most is None):
-        raise ReproduceError(f"reproduce: {quantity}: text cannot have bounds; give a number")
-    bounds = []
-    if at_least is not None and not isinstance(ours, str):
-        bounds.append(f"≥ {at_least:g}{space}{unit}")
-        passed = bool(ours >= at_least) and passed is not False
-    if at_most is not None and not isinstance(ours, str):
-        bounds.append(f"≤ {at_most:g}{space}{unit}")
-        passed = bool(ours <= at_most) and passed is not False
-    verdict = None if passed is None else bool(passed)
-    return Row(
-        quantity,
-        value_text(published, unit, digits),
-        value_text(ours, unit, digits),
-        target or ", ".join(bounds),
-        verdict,
-        remark,
-        kind="" if verdict is None else "ours",
-        met=int(verdict is True),
-        of=int(verdict is not None),
-    )
 
+    def __init__(self, context: Context, parts: Sequence[Part], results: Mapping[str, Results]) -> None:
+        self.context, self.parts, self.results = context, parts, results
+        self.parameters = context.parameters
+        self.rows: list[Row] = []
+        self.files: list[str] = []
+        self.note: dict[str, Any] = {}
+        """Values for the fields in the notes."""
+        self._columns: dict[int, str] = {}
 
-def space_before(unit: str) -> str:
-    """Separator between a number and its unit."""
-    return "" if unit in ("", "°", "″") else " "
+    def published(self, quantity: str) -> list[float]:
+        """Return the published numbers of a quantity of this experiment; none if the thesis has none."""
+        return published(self.context.name, quantity)
 
+    def compare(
+        self,
+        quantity: str,
+        *,
+        text: float | str | None = None,
+        unit: str = "",
+        digits: int = 2,
+        check: str = "",
+        column: str = "",
+        author: Any = None,
+        printed: Any = None,
+        ours: Any = None,
+        trials: int = 0,
+        remark: str = "",
+    ) -> None:
+        """Add a row that compares what was measured with the line of `published.csv`, as the line says.
 
-def value_text(value: float | str | None, unit: str, digits: int) -> str:
-    """Format a value for the report; "—" for None."""
-    if value is None:
-        return "—"
-    return value if isinstance(value, str) else f"{value:.{digits}f}{space_before(unit)}{unit}"
+        Parameters
+        ----------
+        quantity
+            Key in `published.csv`.
+        text, unit, digits, check
+            The line, if the file has none (see `Published`); without a check, the row is only shown.
+        column
+            Column of a table; its rows are reported together, and those that a constant meets are marked.
+        author, printed, ours, trials, remark
+            See `compared`.
+        """
+        line = PUBLISHED.get((self.context.name, quantity))
+        if line is None:
+            line = Published("" if text is None else str(text), unit, digits, check)
+        if column:
+            self._columns[len(self.rows)] = column
+        readings = {"author": author, "printed": printed, "ours": ours}
+        self.rows.append(compared(quantity, line, **readings, trials=trials, remark=remark))
+
+    def require(self, quantity: str, **values: Any) -> None:
+        """Add a row with a value of this project and, if given, a bound; see `row`."""
+        self.rows.append(row(quantity, **values))
+
+    def write(self, name: str, table: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> None:
+        """Write a CSV file from lines with the same keys, or from columns."""
+        columns = (
+            table if isinstance(table, Mapping) else {key: [line[key] for line in table] for key in table[0]}
+        )
+        self.files.append(write_csv(self.context.folder / name, columns))
+
+    def draw(self, name: str, panels: Sequence[Panel], **options: Any) -> None:
+        """Draw a figure; see `starid.lab.experiments.figures.draw`."""
+        self.files.append(draw(self.context.folder / name, panels, **options))
+
+    def outcome(self) -> Outcome:
+        """Return what was added; rows of a column of a table together, where the first of them stands."""
+        groups: dict[str | int, list[Row]] = {}
+        for i, each in enumerate(self.rows):
+            groups.setdefault(self._columns.get(i, i), []).append(each)
+        rows = [
+            each
+            for name, group in groups.items()
+            for each in (null_model(group) if isinstance(name, str) else group)
+        ]
+        path = Path(__file__).parent / "notes" / f"{self.context.name}.md"
+        notes = (path.read_text(encoding="utf-8").strip().format(**self.note),) if path.exists() else ()
+        return Outcome(tuple(rows), tuple(self.files), notes)
 
 
 def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -> str:
@@ -314,11 +286,6 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -
     return path.name
 
 
-def write_lines(path: Path, lines: Sequence[Mapping[str, Any]]) -> str:
-    """As `write_csv`, for a list of lines with the same keys."""
-    return write_csv(path, {name: [line[name] for line in lines] for name in lines[0]})
-
-
 @lru_cache(maxsize=1)
 def star_catalog() -> StarCatalog:
     """The stars at the epoch of the catalogue."""
@@ -330,7 +297,6 @@ def star_catalog() -> StarCatalog:
 @lru_cache(maxsize=16)
 def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None) -> FrameSky:
     """Stars of the flat sky for a brightness limit (None: as in the published databases)."""
-    from dataclasses import replace
     from typing import cast
 
     from starid.thesis.database import DatabaseParameters, sky_of
@@ -351,8 +317,6 @@ def author_database(overlap: float) -> FeatureDatabase:
     These are the weights of the thesis's frame object, a − min(a). The normalised features differ only in r,
     by hundredths of a degree before normalisation. The mean brightness A is larger by −min(a).
     """
-    from dataclasses import replace
-
     from starid.thesis.database import DatabaseParameters, build_database
 
     stars, parameters = star_catalog(), DatabaseParameters(overlap=overlap)

@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from starid.arrays import Array, Mask
-from starid.lab.experiments.comparison import same, shown
-from starid.lab.experiments.experiment import (
-    Context,
-    Experiment,
-    Outcome,
-    Parameters,
-    Part,
-    Results,
-    star_catalog,
-    write_csv,
-)
+from starid.lab.experiments.comparison import same
+from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.simulation import INTENSITY_UNITS, PIXEL_DEG, turned
 from starid.plots import figure, save
 from starid.thesis.cme import matched_motion
@@ -40,22 +30,9 @@ _PIXELS: Final = 937
 _STARS: Final = 6
 _TURN_DEG: Final = 10.0
 _SHIFT_DEG: Final = (0.0, -5.0)
-_INTERVAL: Final = (9.75, 10.58)
 _FAINTEST: Final = 3.8
 _PATCH: Final = (28.1, 30.1, 29.2, 31.9)
 _BRIGHTNESS_SIGMA: Final = 5.0
-
-_NOTE: Final = """The field α, δ ∈ (0°, 42°) with its six brightest stars (no catalogue star is "brighter than
-−12 M_V", as the thesis has it) and a false star in each of two frames. The second frame is shifted by −5° in
-declination and rotated by 10° counter-clockwise. 21 pairs in each frame make the 441 disparities of figure
-3.2. Without noise every pair of true stars has the same rotation; with positions rounded to whole pixels the
-rotations spread as in the thesis. Figure 5.3 shows the stars of the field to 3.8 mag as Gaussians, without
-noise and with σ_p = 1 px and σ_m = 5 intensity units, and the patch that the thesis magnifies."""
-
-
-def _parts(parameters: Parameters) -> list[Part]:
-    del parameters
-    return [Part("example")]
 
 
 def _field(limit: float) -> tuple[Array, Array]:
@@ -94,7 +71,8 @@ def _disparities(before: ObservedFrame, now: ObservedFrame) -> tuple[Array, Mask
     return found, labels == main_cluster(labels)
 
 
-def _compute(context: Context, part: Part) -> Results:
+def compute(context: Context, part: Part) -> Results:
+    """Disparities, cluster and motion of the two frames, exact and to whole pixels."""
     before, now = _frames(context.rng(part.key))
     found: Results = {}
     for name, frames in (("exact", (before, now)), ("pixels", (_to_pixels(before), _to_pixels(now)))):
@@ -175,51 +153,31 @@ def _pair_figure(context: Context, result: Results) -> str:
     return save(fig, context.folder / "figure_5_4.png")
 
 
-def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
-    result = results["example"]
-    rows: list[Any] = [
-        same(
-            "figure 3.2: feature vectors of a frame, disparities",
-            published="21, 441",
-            printed=f"{pair_count(_STARS + 1)}, {len(result['disparities_exact'])}",
-            matches=[pair_count(_STARS + 1) == 21, len(result["disparities_exact"]) == 441],
-            target="the same",
-        ),
+def evaluate(e: Evaluation) -> None:
+    """Counts, the objects kept and the rotation, with the three figures."""
+    result = e.results["example"]
+    disparities = len(result["disparities_exact"])
+    e.compare(
+        "figure 3.2: feature vectors of a frame, disparities", printed=[pair_count(_STARS + 1), disparities]
+    )
+    kept = result["stars_exact"]
+    e.rows.append(
         same(
             "figure 5.4: objects taken for stars; the false one is rejected",
             published="all six stars, not the false one",
-            printed=", ".join(str(i + 1) for i in np.flatnonzero(result["stars_exact"])),
-            matches=[bool(result["stars_exact"][:-1].all()), not result["stars_exact"][-1]],
+            printed=", ".join(str(i + 1) for i in np.flatnonzero(kept)),
+            matches=[bool(kept[:-1].all()), not kept[-1]],
             target="1 to 6, not 7",
-        ),
-    ]
+        )
+    )
     for name, label in (("exact", "exact places"), ("pixels", "places to whole pixels")):
         turns = np.abs(result[f"disparities_{name}"][result[f"chosen_{name}"], 2])
-        rows.append(
-            shown(
-                f"section 6.2.1: turns γ̃ of the cluster's pairs, {label}",
-                published=f"{_INTERVAL[0]}° … {_INTERVAL[1]}°",
-                printed=f"{turns.min():.2f}° … {turns.max():.2f}°",
-                ours=f"{abs(float(result[f'turn_{name}'])):.3f}°",
-                remark="Ours: the rotation of the affine motion of all matches; the true one is 10°.",
-            )
+        e.compare(
+            f"section 6.2.1: turns γ̃ of the cluster's pairs, {label}",
+            printed=f"{turns.min():.2f}° … {turns.max():.2f}°",
+            ours=f"{abs(float(result[f'turn_{name}'])):.3f}°",
         )
+    e.files += [_cluster_figure(e.context, result), _noise_figure(e.context), _pair_figure(e.context, result)]
     points = result["disparities_pixels"]
     columns = dict(zip(("brightness_mag", "separation_deg", "slope_deg"), points.T, strict=True))
-    columns["in_cluster"] = result["chosen_pixels"].astype(int)
-    files = (_cluster_figure(context, result), _noise_figure(context), _pair_figure(context, result))
-    return Outcome(tuple(rows), (*files, write_csv(context.folder / "figure_3_2.csv", columns)), (_NOTE,))
-
-
-EXPERIMENTS: Final = (
-    Experiment(
-        "filter-example",
-        "The filter by example: figures 3.2, 5.3, 5.4",
-        _parts,
-        _compute,
-        _evaluate,
-        full={},
-        quick={},
-        start_order=0,
-    ),
-)
+    e.write("figure_3_2.csv", {**columns, "in_cluster": result["chosen_pixels"].astype(int)})

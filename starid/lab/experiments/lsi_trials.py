@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Final
 
 import numpy as np
@@ -13,6 +13,7 @@ from starid.lab.experiments.comparison import Readings
 from starid.lab.experiments.experiment import Context, Results
 from starid.lab.simulation import NoiseModel, add_noise, turned
 from starid.thesis.features import extract_features
+from starid.thesis.frame_sky import FrameSky
 from starid.thesis.lsi import LsiEstimate
 from starid.thesis.metrics import boresight_error, rotation_error
 from starid.thesis.subcell import FineEstimate, SubcellSearch
@@ -59,6 +60,25 @@ def frames_under_test(rng: np.random.Generator, grid: str, step_deg: float, ever
     return positions
 
 
+def stars_of(
+    sky: FrameSky,
+    frames: Array,
+    rng: np.random.Generator | None = None,
+    noise: Callable[[np.random.Generator], NoiseModel] | None = None,
+) -> Iterator[tuple[Array, Array]]:
+    """Yield magnitudes (m,) and offsets in degrees (m, 2) of the stars in each frame, with the noise drawn for it."""
+    for ra, dec in frames:
+        brightness, positions, _ = sky.stars_in_frame(ra % 360.0, dec)
+        if rng is not None and noise is not None:
+            brightness, positions, _ = add_noise(rng, brightness, positions, noise(rng), sky.half_width)
+        yield brightness, positions
+
+
+def error_of(estimate: LsiEstimate | FineEstimate, ra_deg: float, dec_deg: float) -> float:
+    """ε_f of an estimate, degrees."""
+    return float(boresight_error(estimate.right_ascension_deg, estimate.declination_deg, ra_deg, dec_deg))
+
+
 def solve_frames(
     context: Context,
     overlap: float,
@@ -75,20 +95,15 @@ def solve_frames(
 
     Parameters
     ----------
-    context
-        Provides the databases.
-    overlap
-        Overlap ratio p as a fraction.
-    grid
-        "on" or "off".
-    rng
-        Random generator for the shift of the frames and their noise.
-    noise
-        Noise of the stars; called for each frame, so that it can draw a mean.
+    context, overlap
+        Provides the databases; overlap ratio p as a fraction.
+    grid, every
+        "on" or "off"; use only every n-th frame.
+    rng, noise
+        Random generator for the shift of the frames and their noise; noise of the stars, called for each frame,
+        so that it can draw a mean.
     roll_deg
         Roll of the camera, degrees.
-    every
-        Use only every n-th frame.
     compares
         Also run the sub-cell search that compares the stars.
     with_angle
@@ -103,52 +118,39 @@ def solve_frames(
         `theta_…`: ε_θ in degrees of the same; `psi_mse`, `psi_author`, `residual`: ε_ψ of both kinds of LSI
         and the sub-cell search.
     """
-    lsi = context.lost_in_space(overlap)
-    author = context.lost_in_space(overlap, "matlab")
-    fine = SubcellSearch(lsi)
-    compared = SubcellSearch(lsi, neighbours=_COMPARED_NEIGHBOURS)
+    lsi, author = context.lost_in_space(overlap), context.lost_in_space(overlap, "matlab")
+    fine, compared = SubcellSearch(lsi), SubcellSearch(lsi, neighbours=_COMPARED_NEIGHBOURS)
     sky = context.sky()
     frames = frames_under_test(rng, grid, lsi.database.grid.step_deg, every)
-    names = ["mse", "1se", "author_mse", "author_1se", "fine"]
-    names += ["stars"] * compares + ["six"] * with_angle
+    names = ["mse", "1se", "author_mse", "author_1se", "fine", *["stars"] * compares, *["six"] * with_angle]
     answers = np.empty((len(names), len(frames), 2))
     angles = np.empty((len(names), len(frames)))
     psi = np.empty((3, len(frames)))
-    for i, (ra, dec) in enumerate(frames):
-        brightness, positions, _ = sky.stars_in_frame(ra % 360.0, dec)
-        if noise is not None:
-            brightness, positions, _ = add_noise(rng, brightness, positions, noise(rng), sky.half_width)
-        if roll_deg != 0.0:
-            positions = turned(positions, roll_deg)
+    for i, (brightness, seen) in enumerate(stars_of(sky, frames, rng, noise)):
+        positions = turned(seen, roll_deg) if roll_deg != 0.0 else seen
         features = extract_features(brightness, positions)
         solution = lsi.solve(features)
         other = author.estimate(solution.observation, solution.nearest, solution.distance)
         better = fine.solve(features)
         estimates: list[LsiEstimate | FineEstimate] = [
-            *(solution.mse, solution.one_se),
-            *(other.mse, other.one_se),
-            better,
+            *(solution.mse, solution.one_se, other.mse, other.one_se, better)
         ]
         if compares:
             estimates.append(compared.solve(features, positions))
-        for j, estimate in enumerate(estimates):
-            answers[j, i] = estimate.right_ascension_deg, estimate.declination_deg
-            turn = features.theta_rad - estimate.theta_rad
-            angles[j, i] = rotation_error(math.degrees(turn), roll_deg)
-        psi[:, i] = solution.mse.error_psi, other.mse.error_psi, better.residual
+        found = [(each.right_ascension_deg, each.declination_deg, each.theta_rad) for each in estimates]
         if with_angle:
             cell, _ = lsi.nearest(solution.observation, theta_rad=features.theta_rad)
-            answers[-1, i] = lsi.database.grid.centre(cell)
-            theta = lsi.database.exact_features(cell).theta_rad
-            angles[-1, i] = rotation_error(math.degrees(features.theta_rad - theta), roll_deg)
+            found.append((*lsi.database.grid.centre(cell), lsi.database.exact_features(cell).theta_rad))
+        for j, (ra, dec, theta) in enumerate(found):
+            answers[j, i] = ra, dec
+            angles[j, i] = rotation_error(math.degrees(features.theta_rad - theta), roll_deg)
+        psi[:, i] = solution.mse.error_psi, other.mse.error_psi, better.residual
     errors = boresight_error(answers[..., 0], answers[..., 1], frames[:, 0], frames[:, 1])
     return {
         "frames": frames,
         **{f"f_{name}": errors[j] for j, name in enumerate(names)},
         **{f"theta_{name}": angles[j] for j, name in enumerate(names)},
-        "psi_mse": psi[0],
-        "psi_author": psi[1],
-        "residual": psi[2],
+        **dict(zip(("psi_mse", "psi_author", "residual"), psi, strict=True)),
     }
 
 

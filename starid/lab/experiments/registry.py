@@ -1,49 +1,41 @@
-"""Registry of the experiments."""
+"""Registry of the experiments: the entries of `experiments.toml` with the functions of their modules."""
 
 from __future__ import annotations
 
 import difflib
 import importlib
+import tomllib
 from collections.abc import Sequence
-from typing import Final
+from pathlib import Path
 
-from starid.lab.experiments.experiment import Experiment, ReproduceError
+from starid.lab.experiments.comparison import ReproduceError
+from starid.lab.experiments.experiment import Experiment, parts_of
 
-MODULES: Final[tuple[str, ...]] = (
-    "feature_maps",
-    "database_sizes",
-    "worked_example",
-    "lsi_accuracy",
-    "lsi_noise",
-    "lsi_run_time",
-    "missing_stars",
-    "sensitivity",
-    "memory",
-    "filter_example",
-    "fsf",
-    "fsf_studies",
-    "rsi",
-    "rsi_printed",
-    "spherical",
-    "classics",
-)
-"""Modules of this package that export `EXPERIMENTS`, in the order of the thesis."""
+_FILE = Path(__file__).with_name("experiments.toml")
 
 
 def experiments() -> dict[str, Experiment]:
     """All experiments by name, in the order of the thesis.
 
-    Raises
-    ------
-    ReproduceError
-        Two modules use the same name.
+    An entry names a module of this package and, if it holds several experiments, the end of the names of its
+    functions: `compute`, `evaluate` and, instead of the trials in the entry, `parts`. The quick run has the
+    parameters of the full one but for those in `quick`; without that table there is none.
     """
-    found: dict[str, Experiment] = {}
-    for module in MODULES:
-        for experiment in importlib.import_module(f"starid.lab.experiments.{module}").EXPERIMENTS:
-            if experiment.name in found:
-                raise ReproduceError(f"reproduce: two experiments are called {experiment.name}")
-            found[experiment.name] = experiment
+    found = {}
+    for name, entry in tomllib.loads(_FILE.read_text(encoding="utf-8")).items():
+        module_name, _, end = entry.pop("module").partition(":")
+        functions = vars(importlib.import_module(f"starid.lab.experiments.{module_name}"))
+        compute, evaluate = (functions[f"{word}_{end}" if end else word] for word in ("compute", "evaluate"))
+        full, quick = entry.pop("full"), entry.pop("quick", None)
+        found[name] = Experiment(
+            name,
+            parts=functions.get("parts", parts_of),
+            compute=compute,
+            evaluate=evaluate,
+            full=full,
+            quick=None if quick is None else full | quick,
+            **entry,
+        )
     return found
 
 

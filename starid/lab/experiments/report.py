@@ -7,48 +7,12 @@ from pathlib import Path
 from typing import Any, Final
 
 from starid.files import write_atomically
-from starid.lab.experiments.choices import class_of, numbers_by_choice
-from starid.lab.experiments.experiment import Row
-from starid.lab.experiments.known_misses import known_miss
+from starid.lab.experiments.comparison import Row
 from starid.lab.experiments.runner import FinishedExperiment
+from starid.lab.experiments.tables import class_of, known_miss, numbers_by_choice
 
 REPORT_FILE: Final = "report.md"
 """Name of the report in the folder of results."""
-
-_HEAD: Final = """# The thesis's experiments, reproduced
-
-Experiments of E. O. Özyurt, *A Feedback Star Identification Algorithm via Regularized Pattern Recognition
-Using a Unique Feature Extraction* (Ph.D. thesis, Istanbul Technical University), computed here from the
-Hipparcos catalogue (new reduction) and compared with the published values. There are four columns, of which a
-row fills those that apply:
-
-* **published**: the value printed in the thesis; a curve or a phrase is quoted, "—" means none.
-* **as the author ran it**: the author's version, inferred from the published numbers, with MATLAB's `lasso`.
-* **as printed**: the equations and parameters of the thesis's text, solved exactly.
-* **ours**: this project's own solution of the task.
-
-A check belongs to one of these classes, which are counted separately:
-
-* **agrees**: the value as the author ran it (or else as printed, or else ours) is within a tolerance on
-  *both* sides of the published number. The tolerance comes from the printed digits or from the sampling
-  error; the row says which.
-* **agrees, weak**: the same, but one constant answer for the whole column of the table agrees as well (the
-  best such constant is the null model): these checks can hardly fail.
-* **fitted**: as *agrees*, but a constant was chosen so that this very number comes out. This is no agreement, and it
-  is counted apart.
-* **better**: ours is better than the published number; the row says by how much.
-* **ours**: nothing was published; the bound is a requirement of this project.
-
-A known miss states its reason; any other failed check is a *regression* and gives the exit status 1.
-
-How to read the accuracy figures of the LSI algorithm:
-
-* **On the grid**: the thesis tests on 1 701 frames, and with p = 99.5 % every one of them *is* a frame of the
-  database. The nearest neighbour is then the frame itself, and the figure says little about frames in
-  between.
-* **Off the grid**: the same frames, each moved by a random fraction of the grid step, which is what a real
-  sensor sees. Every accuracy figure is given for both.
-"""
 
 CLASSES: Final = {
     "agrees": "published numbers agree",
@@ -164,7 +128,7 @@ def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int
     """Format the report in Markdown."""
     missed = [(name, row) for name, row in _named_rows(results) if row.passed is False]
     lost = regressions(results)
-    lines = [_HEAD]
+    lines = [Path(__file__).with_name("notes").joinpath("report.md").read_text(encoding="utf-8")]
     if quick:
         lines += [
             "This is the **quick** run: fewer databases, fewer frames. Numbers that depend on the number of frames differ",

@@ -2,170 +2,130 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from starid.lab.experiments.experiment import Context, Part, Results
-from starid.lab.experiments.rsi_parts import (
-    BY_TABLE,
-    FIELDS,
-    LSI_ONLY,
-    SETTLING,
-    method_of,
-    noise_label,
-    rsi_parts,
-)
-from starid.plots import colours, figure, precision_curve, save
+from starid.lab.experiments.experiment import Evaluation, Part
+from starid.lab.experiments.figures import Curve, Panel, precision, precision_axes
+from starid.lab.experiments.rsi_trials import BY_TABLE, FIELDS, LSI_ONLY, method_of, noise_label
+from starid.plots import colours, figure, save
 
 _SHOWN: Final = 40
 _LEAST: Final = 1e-4
 _MAX_MS: Final = 1.0
 
 
-def rsi_figures(context: Context, results: Mapping[str, Results]) -> list[str]:
-    """Draw all figures; return the names of the files."""
-    files = []
-    for scale in context.parameters["scales"]:
-        files.append(_by_noise(context, results, scale))
-        files += [_by_method(context, results, p, scale) for p in context.parameters["overlaps"]]
-    files.append(_sequences(context, results))
-    files.append(_run_times(context, results))
-    return files
+def draw_sequences(e: Evaluation, parts: Sequence[Part], settling: int) -> None:
+    """Draw all figures from the runs with μ = f; precision without the first `settling` frames."""
+    parts = [part for part in parts if part.values["side"] != BY_TABLE]
+    overlaps = e.parameters["overlaps"]
+    for scale in e.parameters["scales"]:
+        # runs without noise belong to every scale
+        chosen = [p for p in parts if p.values["scale"] == scale or p.values["factor"] == 0]
 
+        def by_factor(part: Part) -> str:
+            return f"μ = f = {part.values['factor']}"
 
-def _chosen(context: Context, scale: float) -> list[Part]:
-    """Sets with μ = f at one scale of the noise; those without noise belong to every scale."""
-    return [
-        part
-        for part in rsi_parts(context.parameters)
-        if part.values["false_stars"] == part.values["factor"]
-        and part.values["side"] != BY_TABLE
-        and (part.values["scale"] == scale or part.values["factor"] == 0)
-    ]
+        def by_overlap(part: Part) -> str:
+            return f"{_method(part)}, p = {100 * part.values['overlap']:g} %"
 
-
-def _unique(values: Sequence[Any]) -> list[Any]:
-    return list(dict.fromkeys(values))
-
-
-def _by_noise(context: Context, results: Mapping[str, Results], scale: float) -> str:
-    """Draw a panel for each noise, a curve for each method and overlap: figures 6.37, 6.38, F.1 and F.2."""
-    parts = _chosen(context, scale)
-    factors = _unique([part.values["factor"] for part in parts])
-    fig, axes = figure(2, (len(factors) + 1) // 2, width=9.0, height=7.0, squeeze=False, sharey=True)
-    overlaps = context.parameters["overlaps"]
-    for factor, axis in zip(factors, axes.ravel(), strict=False):
-        members = [part for part in parts if part.values["factor"] == factor]
-        names = _unique([method_of(part.values) for part in members])
-        palette = dict(zip(names, colours(len(names)), strict=True))
-        for part in members:
-            first = part.values["overlap"] == overlaps[0]
-            precision_curve(
-                axis,
-                results[part.key]["numbers"][0, SETTLING:],
-                1.0,
-                color=palette[method_of(part.values)],
-                ls="--" if first else "-",
-                label=f"{method_of(part.values)}, p = {100 * part.values['overlap']:g} %",
+        name = f"figures_6_37_6_38_f_1_f_2_x{scale:g}.png"
+        title = f"Figures 6.37, 6.38, F.1, F.2; {noise_label(scale)}"
+        _draw_precision(e, name, title, chosen, by_factor, by_overlap, settling)
+        for overlap in overlaps:
+            number, words = (
+                ("6_39_to_6_41", "6.39 to 6.41") if overlap == overlaps[-1] else ("f_3_to_f_5", "F.3 to F.5")
             )
-        axis.set(title=f"μ = f = {factor}", xlabel="threshold of ε_f / °")
-    axes[0, 0].legend(loc="lower right")
-    fig.suptitle(f"Figures 6.37, 6.38, F.1, F.2; {noise_label(scale)}")
-    return save(fig, context.folder / f"figures_6_37_6_38_f_1_f_2_x{scale:g}.png")
-
-
-def _by_method(context: Context, results: Mapping[str, Results], overlap: float, scale: float) -> str:
-    """Draw a panel for each method, a curve for each noise: figures 6.39 to 6.41, or F.3 to F.5."""
-    parts = [part for part in _chosen(context, scale) if part.values["overlap"] == overlap]
-    names = _unique([method_of(part.values) for part in parts])
-    fig, axes = figure(2, (len(names) + 1) // 2, width=9.0, height=7.0, squeeze=False, sharey=True)
-    for name, axis in zip(names, axes.ravel(), strict=False):
-        members = [part for part in parts if method_of(part.values) == name]
-        for part, colour in zip(members, colours(len(members)), strict=True):
-            precision_curve(
-                axis,
-                results[part.key]["numbers"][0, SETTLING:],
-                1.0,
-                color=colour,
-                label=f"μ = f = {part.values['factor']}",
-            )
-        axis.set(title=name, xlabel="threshold of ε_f / °")
-        axis.legend(loc="lower right")
-    last = overlap == context.parameters["overlaps"][-1]
-    number, words = ("6_39_to_6_41", "6.39 to 6.41") if last else ("f_3_to_f_5", "F.3 to F.5")
-    fig.suptitle(f"Figures {words}: p = {100 * overlap:g} %, {noise_label(scale)}")
-    return save(fig, context.folder / f"figures_{number}_x{scale:g}.png")
-
-
-def _sequence_parts(context: Context) -> tuple[list[int], list[float], dict[tuple[int, float], Part]]:
-    """Runs as printed, with the finest database and the lowest noise, by noise factor and τ."""
-    found = {
-        (part.values["factor"], part.values["tau"]): part
-        for part in _chosen(context, context.parameters["scales"][0])
-        if part.values["overlap"] == context.parameters["overlaps"][-1]
+            members = [part for part in chosen if part.values["overlap"] == overlap]
+            title = f"Figures {words}: p = {100 * overlap:g} %, {noise_label(scale)}"
+            name = f"figures_{number}_x{scale:g}.png"
+            _draw_precision(e, name, title, members, _method, by_factor, settling)
+    sequences = {
+        (part.values["factor"], part.values["tau"]): dict(
+            zip(FIELDS, e.results[part.key]["numbers"][:, :_SHOWN], strict=True)
+        )
+        for part in parts
+        if part.values["scale"] == e.parameters["scales"][0]
+        and part.values["overlap"] == overlaps[-1]
         and part.values["tau"] != LSI_ONLY
         and not part.values["memory"]
     }
-    return _unique([m for m, _ in found]), _unique([t for _, t in found]), found
+    _draw_errors(e, sequences)
+    _draw_run_times(e, sequences)
 
 
-def _numbers(results: Mapping[str, Results], part: Part) -> dict[str, Any]:
-    return dict(zip(FIELDS, results[part.key]["numbers"][:, :_SHOWN], strict=True))
+def _method(part: Part) -> str:
+    return method_of(part.values["tau"], part.values["memory"])
 
 
-def _sequences(context: Context, results: Mapping[str, Results]) -> str:
+def _draw_precision(
+    e: Evaluation,
+    name: str,
+    title: str,
+    parts: Sequence[Part],
+    panel_of: Callable[[Part], str],
+    label_of: Callable[[Part], str],
+    settling: int,
+) -> None:
+    """Draw a panel for each value of one function of a part, a curve for each value of another."""
+    methods = dict.fromkeys(map(_method, parts))
+    shades = dict(zip(methods, colours(len(methods)), strict=True))
+    panels = []
+    for words in dict.fromkeys(map(panel_of, parts)):
+        curves = []
+        for part in parts:
+            if panel_of(part) == words:
+                several = len(e.parameters["overlaps"]) > 1 and panel_of is not _method
+                style = "--" if several and part.values["overlap"] == e.parameters["overlaps"][0] else "-"
+                colour = {"color": shades[_method(part)]} if panel_of is not _method else {}
+                errors = e.results[part.key]["numbers"][0, settling:]
+                curves.append(precision(errors, 1.0, label_of(part), style, **colour))
+        panels.append(Panel(words, curves, precision_axes("ε_f", 1.0), "lower right"))
+    e.draw(name, panels, columns=2, width=9.0, height=7.0, title=title, sharey=True)
+
+
+def _draw_errors(e: Evaluation, sequences: dict[tuple[int, float], dict[str, Any]]) -> None:
     """Draw ε_ψ and ε_f frame by frame: figures 6.33 to 6.36 and E."""
-    factors, taus, parts = _sequence_parts(context)
-    fig, axes = figure(
-        len(factors),
-        len(taus),
-        width=10.0,
-        height=2.2 * len(factors),
-        squeeze=False,
-        sharex=True,
-        sharey=True,
-    )
     frames = np.arange(1, _SHOWN + 1)
-    for i, factor in enumerate(factors):
-        for j, tau in enumerate(taus):
-            axis, numbers = axes[i, j], _numbers(results, parts[factor, tau])
-            error, psi = (1.0 + np.log10(np.maximum(numbers[name], _LEAST)) for name in ("error", "psi"))
-            axis.plot(frames, error, "r-", label="1 + log₁₀ ε_f")
-            axis.plot(frames, psi, "b--", label="1 + log₁₀ ε_ψ")
-            axis.axhline(1.0 + np.log10(tau), color="0.5", lw=0.8, label="τ")
-            hit = numbers["triggered"] > 0.0
-            axis.plot(frames[hit], psi[hit], "kv", markersize=5, label="update triggered")
-            axis.set(title=f"μ = f = {factor}, τ = {tau:g}")
-    for axis in axes[-1]:
-        axis.set_xlabel("frame")
-    fig.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
-    fig.suptitle(f"Figures 6.33 to 6.36 and E: p = {100 * context.parameters['overlaps'][-1]:g} %")
-    return save(fig, context.folder / "figures_6_33_to_6_36_and_e.png")
+    panels = []
+    for (factor, tau), numbers in sequences.items():
+        error, psi = (1.0 + np.log10(np.maximum(numbers[name], _LEAST)) for name in ("error", "psi"))
+        hit = numbers["triggered"] > 0.0
+        threshold = np.full(2, 1.0 + np.log10(tau))
+        curves = [
+            Curve(frames, error, "-", "1 + log₁₀ ε_f", {"color": "red"}),
+            Curve(frames, psi, "--", "1 + log₁₀ ε_ψ", {"color": "blue"}),
+            Curve(frames[[0, -1]], threshold, "-", "τ", {"color": "0.5", "lw": 0.8}),
+            Curve(frames[hit], psi[hit], "v", "update triggered", {"color": "black", "markersize": 5}),
+        ]
+        panels.append(Panel(f"μ = f = {factor}, τ = {tau:g}", curves, {"xlabel": "frame"}))
+    taus = len({tau for _, tau in sequences})
+    title = f"Figures 6.33 to 6.36 and E: p = {100 * e.parameters['overlaps'][-1]:g} %"
+    size = {"columns": taus, "width": 10.0, "height": 2.2 * len(panels) / taus}
+    legend = {"legend": "outside lower center", "legend_columns": 4}
+    name = "figures_6_33_to_6_36_and_e.png"
+    e.draw(name, panels, title=title, sharex=True, sharey=True, **size, **legend)
 
 
-def _run_times(context: Context, results: Mapping[str, Results]) -> str:
+def _draw_run_times(e: Evaluation, sequences: dict[tuple[int, float], dict[str, Any]]) -> None:
     """Draw ε_f, side of the region and run times frame by frame: figures 6.42, 6.43 and G."""
-    factors, taus, parts = _sequence_parts(context)
-    fig, axes = figure(
-        len(factors), len(taus), width=10.0, height=2.2 * len(factors), squeeze=False, sharex=True
-    )
+    factors, taus = (list(dict.fromkeys(values)) for values in zip(*sequences, strict=True))
+    size = {"width": 10.0, "height": 2.2 * len(factors)}
+    fig, axes = figure(len(factors), len(taus), squeeze=False, sharex=True, **size)
     frames = np.arange(1, _SHOWN + 1)
-    for i, factor in enumerate(factors):
-        for j, tau in enumerate(taus):
-            axis, numbers = axes[i, j], _numbers(results, parts[factor, tau])
-            right = axis.twinx()
-            lines = axis.plot(frames, numbers["error"], "r-", label="ε_f / °")
-            lines += axis.plot(frames, numbers["side"], "g-.", label="Γ / °")
-            lines += right.plot(frames, numbers["search_ms"], "b--", label="1NN / ms (right)")
-            lines += right.plot(frames, numbers["lasso_ms"], "k:", label="LASSO / ms (right)")
-            axis.set(title=f"μ = f = {factor}, τ = {tau:g}", ylim=(0.0, 4.0))
-            right.grid(visible=False)
-            right.set_ylim(0.0, _MAX_MS)
-            if (i, j) == (0, 0):
-                fig.legend(handles=lines, loc="outside lower center", ncols=4)
-    for axis in axes[-1]:
-        axis.set_xlabel("frame")
-    fig.suptitle(f"Figures 6.42, 6.43 and G: p = {100 * context.parameters['overlaps'][-1]:g} %")
-    return save(fig, context.folder / "figures_6_42_6_43_and_g.png")
+    for axis, (factor, tau) in zip(axes.ravel(), itertools.product(factors, taus), strict=True):
+        numbers, right = sequences[factor, tau], axis.twinx()
+        lines = axis.plot(frames, numbers["error"], "r-", label="ε_f / °")
+        lines += axis.plot(frames, numbers["side"], "g-.", label="Γ / °")
+        lines += right.plot(frames, numbers["search_ms"], "b--", label="1NN / ms (right)")
+        lines += right.plot(frames, numbers["lasso_ms"], "k:", label="LASSO / ms (right)")
+        axis.set(title=f"μ = f = {factor}, τ = {tau:g}", xlabel="frame", ylim=(0.0, 4.0))
+        axis.label_outer()
+        right.grid(visible=False)
+        right.set_ylim(0.0, _MAX_MS)
+    fig.legend(handles=lines, loc="outside lower center", ncols=4)
+    fig.suptitle(f"Figures 6.42, 6.43 and G: p = {100 * e.parameters['overlaps'][-1]:g} %")
+    e.files.append(save(fig, e.context.folder / "figures_6_42_6_43_and_g.png"))

@@ -12,15 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from starid.files import write_atomically
-from starid.lab.experiments.experiment import (
-    Context,
-    Experiment,
-    Outcome,
-    Parameters,
-    Part,
-    ReproduceError,
-    Results,
-)
+from starid.lab.experiments.comparison import Outcome, ReproduceError
+from starid.lab.experiments.experiment import Context, Evaluation, Experiment, Parameters, Part, Results
 from starid.result_store import read_results, write_results
 
 OUTCOME_FILE: Final = "outcome.json"
@@ -142,7 +135,9 @@ def _evaluate_plan(plan: _Plan, computed: int) -> FinishedExperiment:
     plan.context.folder.mkdir(parents=True, exist_ok=True)
     # tables and figures are overwritten, so an outcome for other parameters is no longer valid
     (plan.context.folder / OUTCOME_FILE).unlink(missing_ok=True)
-    outcome = plan.experiment.evaluate(plan.context, results)
+    evaluation = Evaluation(plan.context, plan.parts, results)
+    plan.experiment.evaluate(evaluation)
+    outcome = evaluation.outcome()
     seconds += _processor_time() - start
     text = json.dumps(
         {

@@ -10,17 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.attitude import Attitude, propagate, random_attitude
-from starid.lab.experiments.experiment import (
-    Context,
-    Experiment,
-    Outcome,
-    Parameters,
-    Part,
-    Results,
-    Row,
-    row,
-    write_lines,
-)
+from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
 from starid.lab.experiments.lsi_trials import share
 
 _WRONG_ARCSEC: Final = 300.0
@@ -64,7 +54,8 @@ def points(
     return xy[order], 10.0 ** (-0.4 * (magnitude[order] - _ZERO_POINT))
 
 
-def _parts(parameters: Parameters) -> list[Part]:
+def parts(parameters: Parameters) -> list[Part]:
+    """Both algorithms with each noise."""
     return [
         Part(f"{algorithm}-{number}", {"algorithm": algorithm, "noise": noise})
         for algorithm in ("lsi", "rsi")
@@ -72,7 +63,8 @@ def _parts(parameters: Parameters) -> list[Part]:
     ]
 
 
-def _compute(context: Context, part: Part) -> Results:
+def compute(context: Context, part: Part) -> Results:
+    """Errors, times and modes of the frames, (n, 8), in the order of `_COLUMNS`."""
     identifier = _identifier(part.values["algorithm"])
     recursive = part.values["algorithm"] == "rsi"
     rng = context.rng(part.key)
@@ -91,9 +83,7 @@ def _compute(context: Context, part: Part) -> Results:
         else:
             solution = identifier.identify(xy, flux)
         elapsed = 1e3 * (time.perf_counter() - begin)
-        numbers[i, 2] = solution.valid
-        numbers[i, 6] = elapsed
-        numbers[i, 7] = solution.mode == "tracking"
+        numbers[i, 2], numbers[i, 6], numbers[i, 7] = solution.valid, elapsed, solution.mode == "tracking"
         predicted = solution.attitude if solution.valid else None
         if solution.valid:
             error = solution.attitude.error_to(attitude)
@@ -111,86 +101,30 @@ def _label(noise: Mapping[str, Any]) -> str:
     return f"σ {noise['magnitude']:g} mag, {noise['position']:g} px, {noise['false']} false stars"
 
 
-def _rows(context: Context, results: Mapping[str, Results]) -> list[Row]:
-    rows = []
-    for part in _parts(context.parameters):
-        found = dict(zip(_COLUMNS, results[part.key]["numbers"].T, strict=True))
-        name, label = part.values["algorithm"].upper(), _label(part.values["noise"])
+def evaluate(e: Evaluation) -> None:
+    """Shares, errors and times of each algorithm and noise; none may be valid and wrong."""
+    lines = []
+    for part in e.parts:
+        numbers, noise = e.results[part.key]["numbers"], part.values["noise"]
+        name, label = part.values["algorithm"].upper(), _label(noise)
+        head = {"algorithm": part.values["algorithm"], "noise": label}
+        lines += [head | dict(zip(_COLUMNS, frame, strict=True)) for frame in numbers]
+        found = dict(zip(_COLUMNS, numbers.T, strict=True))
         valid = found["valid"] > 0.0
         errors = found["cross_arcsec"][valid]
-        if name == "LSI":
-            rows += [
-                row(
-                    f"one neighbour and LASSO, boresight within {limit:g}°, {label}",
-                    ours=share(found["coarse_deg"], limit),
-                    unit="%",
-                    digits=1,
-                )
-                for limit in (0.3, 1.0, 2.0)
-            ]
-        rows.append(
-            row(
-                f"{name} verified and valid, {label}",
-                ours=100.0 * float(valid.mean()),
-                unit="%",
-                digits=1,
-                at_least=98.0 if part.values["noise"]["false"] <= 5 else None,
-            )
-        )
+        for limit in (0.3, 1.0, 2.0) if name == "LSI" else ():
+            quantity = f"one neighbour and LASSO, boresight within {limit:g}°, {label}"
+            e.require(quantity, ours=share(found["coarse_deg"], limit), unit="%", digits=1)
+        bound = {"at_least": 98.0} if noise["false"] <= 5 else {}
+        right = 100.0 * float(valid.mean())
+        e.require(f"{name} verified and valid, {label}", ours=right, unit="%", digits=1, **bound)
         wrong = float(np.count_nonzero(errors > _WRONG_ARCSEC))
-        rows.append(row(f"{name} valid but wrong, {label}", ours=wrong, digits=0, at_most=0.0))
+        e.require(f"{name} valid but wrong, {label}", ours=wrong, digits=0, at_most=0.0)
         if valid.any():
             middle = float(np.median(errors))
-            rows.append(row(f"{name} median cross-boresight error, {label}", ours=middle, unit="″"))
-        rows.append(
-            row(f"{name} median time a frame, {label}", ours=float(np.median(found["ms"])), unit="ms")
-        )
+            e.require(f"{name} median cross-boresight error, {label}", ours=middle, unit="″")
+        e.require(f"{name} median time a frame, {label}", ours=float(np.median(found["ms"])), unit="ms")
         if name == "RSI":
             inside = 100.0 * float(found["tracking"][1:].mean())
-            rows.append(row(f"RSI answered from the region, {label}", ours=inside, unit="%", digits=1))
-    return rows
-
-
-_NOTE: Final = """Camera of 42° on 937 pixels, stars to 6 mag, random attitudes (LSI) or a slew of 0.6° per
-frame from a random attitude (RSI); positions and fluxes, without images. The features use the stars to 5.1
-mag in the inscribed circle; there are 234 095 cells, 0.42° apart over the whole sphere. The thesis's own
-answer, from one nearest neighbour and LASSO, is right in few frames: noise of 0.1 mag already carries several
-stars across the brightness limit, and each changes all five features. The features are still useful to order
-the cells: for each of the best candidates, the stars vote for a roll and are paired, and the attitude is
-verified. An attitude that is not verified is invalid; none may be wrong."""
-
-
-def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
-    lines = [
-        {
-            "algorithm": part.values["algorithm"],
-            "noise": _label(part.values["noise"]),
-            **dict(zip(_COLUMNS, numbers, strict=True)),
-        }
-        for part in _parts(context.parameters)
-        for numbers in results[part.key]["numbers"]
-    ]
-    table = write_lines(context.folder / "frames.csv", lines)
-    return Outcome(tuple(_rows(context, results)), (table,), (_NOTE,))
-
-
-_NOISES: Final = [
-    {"magnitude": 0.0, "position": 0.0, "false": 0},
-    {"magnitude": 0.1, "position": 0.2, "false": 0},
-    {"magnitude": 0.2, "position": 0.2, "false": 0},
-    {"magnitude": 0.1, "position": 0.2, "false": 5},
-    {"magnitude": 0.1, "position": 0.2, "false": 20},
-]
-
-EXPERIMENTS: Final = (
-    Experiment(
-        "spherical",
-        "LSI and RSI on the sphere, on what a real sensor sees",
-        _parts,
-        _compute,
-        _evaluate,
-        full={"noises": _NOISES, "frames": 1000},
-        quick={"noises": _NOISES[1:2], "frames": 60},
-        revision=2,
-    ),
-)
+            e.require(f"RSI answered from the region, {label}", ours=inside, unit="%", digits=1)
+    e.write("frames.csv", lines)

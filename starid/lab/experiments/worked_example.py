@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 
-from starid.lab.experiments.comparison import compared, improvement, published
 from starid.lab.experiments.experiment import (
     Context,
-    Experiment,
-    Outcome,
-    Parameters,
+    Evaluation,
     Part,
     Results,
-    Row,
     author_database,
     star_catalog,
-    write_csv,
 )
 from starid.lab.experiments.lsi_trials import HALF_FRAME_DEG
 from starid.plots import figure, save
@@ -26,6 +20,7 @@ from starid.thesis.metrics import boresight_error
 
 _CORNER: Final = (95.0, -85.0)
 _NAMES: Final = ("n", "A", "r", "σ_A", "σ_r")
+_COLUMNS: Final = ("n", "A", "r", "sigma_A", "sigma_r")
 _NEAREST: Final = 735
 _CELLS: Final = (509, 510, 511, 734, 735, 736, 959, 960, 961)
 _THETAS: Final = "polar angles θ of the dictionary"
@@ -37,30 +32,13 @@ _LAMBDA: Final = {"mse": 1.00, "one_se": 1.40}
 _TURN: Final = 3.6
 """Degrees of polar angle per unit of the normalised scale."""
 
-_NOTE: Final = """Frame with lower-left corner (95°, −85°), κ = 11.5, p = 96 %. The printed features are
-reproduced if brightness is the Hp magnitude, stars *fainter* than κ are kept, the frame is 40° wide (the text
-says 42°), the frame object is the mean weighted with a − min(a), with magnitudes relative to the brightest
-star of the catalogue (eq. 2.5 is printed with a division by n), and the deviations are square roots of
-variances over n − 1 (eqs 2.6 and 2.8 are printed as variances over n). The normalisation printed with eq. 5.1
-belongs to the database of p = 98 %; the example itself continues with p = 96 %. From there the author's
-program was MATLAB's `lasso` with *six* features, including the polar angle as θ/3.6. The printed ω is ω/Σω,
-with which the boresight is F·ω, while the printed features T·ω use ω itself and are converted back to their
-units. Which λ the cross-validation chose is not known, because its folds are random: the printed weights and,
-within a few units of their last digit, the printed reconstructions belong to λ = 1.00 and 1.40. "As printed"
-is eq. 2.34 with five features, solved exactly, at the λ of the least error."""
 
-
-def _parts(parameters: Parameters) -> list[Part]:
-    return [Part("example", {"percent": parameters["percent"]})]
-
-
-def _author(context: Context) -> Results:
+def _author() -> Results:
     """The author's version: weights relative to the brightest star, six features, MATLAB's `lasso`."""
     from starid.thesis.lasso import LAMBDAS
     from starid.thesis.lsi import LostInSpace
     from starid.thesis.matlab_lasso import matlab_path
 
-    del context
     database, wider = author_database(_PERCENT / 100.0), author_database(_WIDER_PERCENT / 100.0)
     least = float(star_catalog().hp.min())
     centre = np.array(_CORNER) + HALF_FRAME_DEG
@@ -90,13 +68,13 @@ def _author(context: Context) -> Results:
         results[f"omega_{kind}"] = omega / omega.sum()
         results[f"boresight_{kind}"] = omega / omega.sum() @ centres
         results[f"rebuilt_{kind}"] = rebuilt + np.array([*brightness, 0.0])
-        results[f"epsilon_{kind}"] = np.array(
-            np.linalg.norm(rebuilt - np.array([*features.vector, features.theta_deg]))
-        )
+        error = np.linalg.norm(rebuilt - np.array([*features.vector, features.theta_deg]))
+        results[f"epsilon_{kind}"] = np.array(error)
     return {f"author_{name}": value for name, value in results.items()}
 
 
-def _compute(context: Context, part: Part) -> Results:
+def compute(context: Context, part: Part) -> Results:
+    """The example as printed, by the sub-cell search, and as the author ran it (`author_…`)."""
     from starid.thesis.subcell import SubcellSearch
 
     lsi = context.lost_in_space(part.values["percent"] / 100.0)
@@ -125,145 +103,106 @@ def _compute(context: Context, part: Part) -> Results:
         results[f"lambda_{name}"] = np.array(estimate.penalty)
         results[f"boresight_{name}"] = np.array([estimate.right_ascension_deg, estimate.declination_deg])
         results[f"psi_{name}"] = np.array(estimate.error_psi)
-    return {**results, **_author(context)}
+    return {**results, **_author()}
 
 
-def _compared(quantity: str, **readings: Any) -> Row:
-    return compared("worked-example", quantity, **readings)
-
-
-def _estimate_rows(result: Results, kind: str) -> list[Row]:
+def _compare_estimate(e: Evaluation, result: Results, kind: str) -> None:
     word = _LABELS[kind]
     corners = {
-        name: values - HALF_FRAME_DEG
-        for name, values in (
-            ("author", result[f"author_boresight_{kind}"]),
-            ("printed", result[f"boresight_{kind}"]),
-            ("ours", result["fine"]),
+        name: result[key] - HALF_FRAME_DEG
+        for name, key in (
+            ("author", f"author_boresight_{kind}"),
+            ("printed", f"boresight_{kind}"),
+            ("ours", "fine"),
         )
     }
-    errors = {
+    errors: dict[str, Any] = {
         name: float(boresight_error(corner[0], corner[1], *_CORNER)) for name, corner in corners.items()
     }
+    e.compare(
+        f"ω ({word}) of the nine cells",
+        author=result[f"author_omega_{kind}"],
+        printed=result[f"omega_{kind}"],
+        remark=f"λ = {_LAMBDA[kind]:.2f} as the author ran it; as printed {float(result[f'lambda_{kind}']):.2f}.",
+    )
+    e.compare(
+        f"reconstructed features ψ̃ ({word}): n, A, r, σ_A, σ_r, θ", author=result[f"author_rebuilt_{kind}"]
+    )
+    e.compare(
+        f"error of the reconstruction ε_ψ ({word}), in the features' own units",
+        author=result[f"author_epsilon_{kind}"],
+        remark=f"On the normalised scale, as printed, {float(result[f'psi_{kind}']):.3f}.",
+    )
+    e.compare(
+        f"corner of the estimated frame ({word}), α, δ", author=corners["author"], printed=corners["printed"]
+    )
     error = f"error of the estimate ε_f ({word})"
-    return [
-        _compared(
-            f"ω ({word}) of the nine cells",
-            author=result[f"author_omega_{kind}"],
-            printed=result[f"omega_{kind}"],
-            remark=f"λ = {_LAMBDA[kind]:.2f} as the author ran it; as printed {float(result[f'lambda_{kind}']):.2f}.",
-        ),
-        _compared(
-            f"reconstructed features ψ̃ ({word}): n, A, r, σ_A, σ_r, θ",
-            author=result[f"author_rebuilt_{kind}"],
-        ),
-        _compared(
-            f"error of the reconstruction ε_ψ ({word}), in the features' own units",
-            author=result[f"author_epsilon_{kind}"],
-            remark=f"On the normalised scale, as printed, {float(result[f'psi_{kind}']):.3f}.",
-        ),
-        _compared(
-            f"corner of the estimated frame ({word}), α, δ",
-            author=corners["author"],
-            printed=corners["printed"],
-        ),
-        _compared(error, **errors),
-        improvement(
-            f"{error}, sub-cell search of the whole database",
-            published=published("worked-example", error)[0],
-            ours=errors["ours"],
-            larger=False,
-            unit="°",
-            digits=4,
-        ),
-    ]
+    e.compare(error, **errors)
+    e.compare(
+        f"{error}, sub-cell search of the whole database",
+        text=e.published(error)[0],
+        unit="°",
+        digits=4,
+        check="less",
+        ours=errors["ours"],
+    )
 
 
-def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
-    result = results["example"]
-    vectors = result["dictionary"]
-    author = result["author_dictionary"]
-    pairs = {
-        quantity: (result[f"author_{name}"], result[name])
-        for quantity, name in (
-            ("feature vector (n, A, r, σ_A, σ_r)", "features"),
-            ("polar angle θ", "theta"),
-            ("normalised feature vector, eq. 5.1", "normalised"),
-        )
-    }
-    dictionary = {
-        f"dictionary vector {cell}": pair
-        for cell, pair in zip(_CELLS, zip(author, vectors, strict=True), strict=True)
-    }
-    dictionary[_THETAS] = (result["author_thetas"], result["thetas"])
-    rows = [
-        *(_compared(quantity, author=one, printed=other) for quantity, (one, other) in pairs.items()),
-        _compared(
-            "nearest database vector (counted from 1)",
-            author=[int(result["author_nearest"]) + 1],
-            printed=[int(result["nearest"]) + 1],
-            remark=f"As the author ran it with the polar angle as a sixth feature. In five features ours is at distance "
-            f"{float(result['distance']):.2f}, {_NEAREST} at {result['distances'][4]:.2f}; by the printed vectors others are nearer too. "
-            "The rows below continue from 735, as the thesis does.",
-        ),
-        _compared("cells of the dictionary", printed=result["cells"] + 1),
-        *(_compared(quantity, author=one, printed=other) for quantity, (one, other) in dictionary.items()),
-        *_estimate_rows(result, "mse"),
-        *_estimate_rows(result, "one_se"),
-    ]
-    printed = [published("worked-example", f"dictionary vector {cell}") for cell in _CELLS]
+def evaluate(e: Evaluation) -> None:
+    """All numbers of the section, the dictionary, and figure 5.1."""
+    result = e.results["example"]
+    vectors, author = result["dictionary"], result["author_dictionary"]
+    for quantity, name in (
+        ("feature vector (n, A, r, σ_A, σ_r)", "features"),
+        ("polar angle θ", "theta"),
+        ("normalised feature vector, eq. 5.1", "normalised"),
+    ):
+        e.compare(quantity, author=result[f"author_{name}"], printed=result[name])
+    e.compare(
+        "nearest database vector (counted from 1)",
+        author=[int(result["author_nearest"]) + 1],
+        printed=[int(result["nearest"]) + 1],
+        remark=f"As the author ran it with the polar angle as a sixth feature. In five features ours is at distance "
+        f"{float(result['distance']):.2f}, {_NEAREST} at {result['distances'][4]:.2f}; by the printed vectors others are nearer too. "
+        "The rows below continue from 735, as the thesis does.",
+    )
+    e.compare("cells of the dictionary", printed=result["cells"] + 1)
+    for cell, one, other in zip(_CELLS, author, vectors, strict=True):
+        e.compare(f"dictionary vector {cell}", author=one, printed=other)
+    e.compare(_THETAS, author=result["author_thetas"], printed=result["thetas"])
+    for kind in _LABELS:
+        _compare_estimate(e, result, kind)
+    known = [e.published(f"dictionary vector {cell}") for cell in _CELLS]
     table: dict[str, Any] = {"cell": result["cells"] + 1}
     for head, features, thetas in (
         ("", vectors, result["thetas"]),
-        ("published_", printed, published("worked-example", _THETAS)),
+        ("published_", known, e.published(_THETAS)),
     ):
-        names = (f"{head}{name}" for name in ("n", "A", "r", "sigma_A", "sigma_r"))
-        table |= dict(zip(names, zip(*features, strict=True), strict=True))
-        table[f"{head}theta_deg"] = thetas
+        names = (f"{head}{name}" for name in _COLUMNS)
+        table |= dict(zip(names, zip(*features, strict=True), strict=True)) | {f"{head}theta_deg": thetas}
     for kind, word in _LABELS.items():
         table |= {name: result[name] for name in (f"author_omega_{kind}", f"omega_{kind}")}
-        table[f"published_omega_{kind}"] = published("worked-example", f"ω ({word}) of the nine cells")
-    files = (write_csv(context.folder / "dictionary.csv", table), _draw(context, result))
-    return Outcome(tuple(rows), files, (_NOTE,))
+        table[f"published_omega_{kind}"] = e.published(f"ω ({word}) of the nine cells")
+    e.write("dictionary.csv", table)
+    e.files.append(_draw(e.context, result))
 
 
 def _draw(context: Context, result: Results) -> str:
     """Draw the dictionary as in figure 5.1: corners, features and weights of the nine cells."""
     fig, axis = figure(width=7.5, height=5.4)
     corners = result["centres"] - HALF_FRAME_DEG
-    axis.scatter(corners[:, 0], corners[:, 1], s=20 + 900 * np.abs(result["author_omega_mse"]), alpha=0.5)
+    weights = result["author_omega_mse"]
+    axis.scatter(corners[:, 0], corners[:, 1], s=20 + 900 * np.abs(weights), alpha=0.5)
     axis.plot(*_CORNER, "r+", ms=12, mew=2, label="observation")
-    estimate = result["author_boresight_mse"] - HALF_FRAME_DEG
-    axis.plot(estimate[0], estimate[1], "kx", ms=9, mew=2, label="estimate (MSE)")
-    for i, cell in enumerate(result["cells"]):
-        values = ", ".join(
-            f"{n} {v:.4g}" for n, v in zip(_NAMES, result["author_dictionary"][i], strict=True)
-        )
-        words = values.replace(", σ_A", "\nσ_A") + f"\nω {result['author_omega_mse'][i]:.2f}"
-        axis.annotate(
-            f"{cell + 1}\n{words}",
-            corners[i],
-            xytext=(0, 14),
-            textcoords="offset points",
-            ha="center",
-            fontsize=6.5,
-        )
+    axis.plot(*(result["author_boresight_mse"] - HALF_FRAME_DEG), "kx", ms=9, mew=2, label="estimate (MSE)")
+    for cell, corner, vector, weight in zip(
+        result["cells"], corners, result["author_dictionary"], weights, strict=True
+    ):
+        values = ", ".join(f"{n} {v:.4g}" for n, v in zip(_NAMES, vector, strict=True))
+        words = f"{cell + 1}\n" + values.replace(", σ_A", "\nσ_A") + f"\nω {weight:.2f}"
+        place = {"xytext": (0, 14), "textcoords": "offset points", "ha": "center"}
+        axis.annotate(words, corner, fontsize=6.5, **place)
     axis.margins(0.25)
     axis.set(xlabel="α of the lower-left corner / °", ylabel="δ of the lower-left corner / °")
     axis.legend(loc="lower left")
     return save(fig, context.folder / "figure_5_1.png")
-
-
-EXPERIMENTS: Final = (
-    Experiment(
-        "worked-example",
-        "The worked example of section 5.1",
-        _parts,
-        _compute,
-        _evaluate,
-        full={"percent": 96.0},
-        quick={"percent": 96.0},
-        start_order=0,
-        revision=4,
-    ),
-)

@@ -4,7 +4,6 @@ import csv
 import dataclasses
 import json
 import zipfile
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,27 +12,44 @@ from typer.testing import CliRunner
 
 from starid.cli.app import build_app
 from starid.errors import StaridError
-from starid.lab.experiments import known_misses, registry, report, runner
-from starid.lab.experiments.choices import CHOICES, class_of, numbers_by_choice
-from starid.lab.experiments.comparison import agreement, improvement, null_model, same, sampling
+from starid.lab.experiments import registry, report, runner, tables
+from starid.lab.experiments.comparison import (
+    Outcome,
+    Published,
+    Row,
+    agreement,
+    compared,
+    improvement,
+    null_model,
+    row,
+    same,
+    sampling,
+)
 from starid.lab.experiments.experiment import (
     Context,
+    Evaluation,
     Experiment,
-    Outcome,
     Parameters,
     Part,
     Results,
-    Row,
-    row,
+    parts_of,
     write_csv,
 )
-from starid.lab.experiments.known_misses import KnownMiss
 from starid.lab.experiments.lsi_trials import (
     FRAMES,
     OFF,
     ON,
     centres,
     frames_under_test,
+)
+from starid.lab.experiments.tables import (
+    CHOICES,
+    KNOWN_MISSES,
+    PUBLISHED,
+    KnownMiss,
+    class_of,
+    known_miss,
+    numbers_by_choice,
 )
 from starid.thesis.frame_grid import make_grid
 
@@ -52,17 +68,10 @@ def _compute(context: Context, part: Part) -> Results:
     return {"value": context.rng(part.key).normal(size=3) + part.values["number"]}
 
 
-def _evaluate(context: Context, results: Mapping[str, Results]) -> Outcome:
-    total = float(sum(result["value"].sum() for result in results.values()))
-    write_csv(
-        context.folder / "values.csv",
-        {"key": list(results), "sum": [r["value"].sum() for r in results.values()]},
-    )
-    return Outcome(
-        (row("total | of all", published=1.0, ours=total, at_least=context.parameters["least"]),),
-        ("values.csv",),
-        ("A note.",),
-    )
+def _evaluate(e: Evaluation) -> None:
+    sums = {key: result["value"].sum() for key, result in e.results.items()}
+    e.write("values.csv", {"key": list(sums), "sum": list(sums.values())})
+    e.require("total | of all", published=1.0, ours=float(sum(sums.values())), at_least=e.parameters["least"])
 
 
 def _experiment(name: str = "toy", least: float = -1e9) -> Experiment:
@@ -158,8 +167,8 @@ def test_an_interrupted_evaluation_leaves_no_outcome_of_other_parameters(tmp_pat
     runner.run([_experiment()], tmp_path, jobs=1)
     values = (tmp_path / "toy" / "values.csv").read_text()
 
-    def interrupted(context: Context, results: Mapping[str, Results]) -> Outcome:
-        _evaluate(context, results)
+    def interrupted(evaluation: Evaluation) -> None:
+        _evaluate(evaluation)
         raise KeyboardInterrupt
 
     longer = dataclasses.replace(
@@ -322,8 +331,8 @@ def test_the_report_lists_failed_checks_and_links_the_files(tmp_path):
 
 
 def test_a_known_miss_is_shown_with_its_reason_and_is_not_a_regression(tmp_path, monkeypatch):
-    known = {"toy": {"total | of all": KnownMiss("The sky has no such total.")}}
-    monkeypatch.setattr(known_misses, "KNOWN", known)
+    known = {("toy", "total | of all"): KnownMiss("The sky has no such total.")}
+    monkeypatch.setattr(tables, "KNOWN_MISSES", known)
     results = runner.run([_experiment(least=1e9)], tmp_path, jobs=1)
     text = report.report_text(results, quick=False, seed=1)
     assert "## Known misses" in text
@@ -334,18 +343,17 @@ def test_a_known_miss_is_shown_with_its_reason_and_is_not_a_regression(tmp_path,
 
 
 def test_a_row_that_agrees_less_than_known_is_a_regression():
-    entry = {"toy": {"q": KnownMiss("Two of them are not known.", 2)}}
+    entry = {("toy", "q"): KnownMiss("Two of them are not known.", 2)}
     for met, regression in ((2, False), (3, False), (1, True)):
         made = same("q", published="", matches=[True] * met + [False] * (4 - met), target="")
-        assert (known_misses.known_miss("toy", made, entry) is None) is regression
+        assert (known_miss("toy", made, entry) is None) is regression
 
 
 def test_every_known_miss_has_a_reason_and_an_experiment():
     names = set(registry.experiments())
-    for experiment, entries in known_misses.KNOWN.items():
+    for (experiment, quantity), entry in KNOWN_MISSES.items():
         assert experiment in names
-        for quantity, entry in entries.items():
-            assert entry.reason.endswith("."), quantity
+        assert entry.reason.endswith("."), quantity
 
 
 def _finished(rows):
@@ -359,8 +367,8 @@ def _invoke(*arguments: str):
 @pytest.mark.parametrize(("least", "known", "status"), [(-1e9, False, 0), (1e9, False, 1), (1e9, True, 0)])
 def test_the_exit_status_reports_a_regression(tmp_path, monkeypatch, least, known, status):
     monkeypatch.setattr(registry, "experiments", lambda: {"toy": _experiment(least=least)})
-    entries = {"toy": {"total | of all": KnownMiss("Known.")}} if known else {}
-    monkeypatch.setattr(known_misses, "KNOWN", entries)
+    entries = {("toy", "total | of all"): KnownMiss("Known.")} if known else {}
+    monkeypatch.setattr(tables, "KNOWN_MISSES", entries)
     result = _invoke("toy", "-o", str(tmp_path), "--jobs", "1", "--json")
     assert result.exit_code == status, result.output
     figures = json.loads(result.stdout)
@@ -455,6 +463,85 @@ def test_the_experiments_of_the_thesis_need_nothing_else_of_the_emulator():
         for line in module.read_text(encoding="utf-8").splitlines():
             if line.strip().startswith(("from emulator", "import emulator")):
                 assert "starid.lab.experiments" in line, f"{module.name}: {line}"
+
+
+@pytest.mark.parametrize(
+    ("known", "values", "passed", "target"),
+    [
+        (Published("0.1", "°", 3, "0.05 half of it"), {"author": 0.14}, True, "± half of it"),
+        (Published("99.5", "%", 1, "rounding 0"), {"printed": 99.9}, True, "± half of the last digit, 0.5 %"),
+        (Published("0.49", check="mean 0.5 200"), {"author": 0.6}, True, "of two means of 200, 0.15"),
+        (Published("0.49", check="mean 0.5 200"), {"author": 0.65}, False, "of two means of 200, 0.15"),
+        (
+            Published("0.5", check="deviation 0.5 101"),
+            {"author": 0.66},
+            False,
+            "of two deviations of 101, 0.15",
+        ),
+        (
+            Published("0.9", check="coefficient 203"),
+            {"author": 0.86},
+            True,
+            "of two coefficients of 203, 0.057",
+        ),
+        (
+            Published("0.9", check="coefficient 203"),
+            {"author": 0.84},
+            False,
+            "of two coefficients of 203, 0.057",
+        ),
+        (Published("50", "%", 1, "sampling"), {"ours": 45.0, "trials": 1000}, True, "two shares of 1000"),
+        (Published("1 2", digits=0, check="same"), {"printed": [1, 2]}, True, "the same"),
+        (Published("1 2", digits=1, check="digit"), {"printed": [1.04, 2.06]}, False, "each ± half"),
+        (Published("below a fifth", "%", 1, "< 20"), {"author": 19.0}, True, "< 20 %"),
+        (Published("positive", check="> 0"), {"author": -0.1, "printed": 1.0}, False, "> 0"),
+        (Published("2", check="less"), {"ours": 1.0}, True, "≤ 2"),
+        (Published("2", check="more"), {"ours": 1.0}, False, "≥ 2"),
+        (Published("about 2"), {"ours": 9.0}, None, ""),
+        (Published("2"), {"ours": 9.0}, None, ""),
+    ],
+)
+def test_a_quantity_is_checked_as_its_line_says(known, values, passed, target):
+    made = compared("q", known, **values)
+    assert made.passed is passed
+    assert target in made.target
+    assert (made.of > 0) is (passed is not None)
+
+
+def test_every_published_line_has_its_place_in_the_thesis_and_a_check_that_can_be_made():
+    names = set(registry.experiments())
+    with Path(tables.__file__).with_name("published.csv").open(encoding="utf-8") as stream:
+        lines = list(csv.DictReader(stream))
+    assert len(lines) == len(PUBLISHED)
+    assert all(line["source"].startswith(("section ", "table", "figure", "eq. ")) for line in lines)
+    for (experiment, quantity), known in PUBLISHED.items():
+        assert experiment in names
+        if known.check:
+            values = known.numbers or [1.0]
+            value = values if known.check == "same" or len(values) > 1 else values[0]
+            key = "ours" if known.check in ("more", "less") else "author"
+            assert compared(quantity, known, **{key: value}, trials=100).of == len(values)
+
+
+def test_parts_are_the_combinations_of_lists_values_and_parameters():
+    parameters = {
+        "percent": [1, 2],
+        "trials": [{"key": "{kind}-p{percent}", "kind": ["a", "b"], "percent": "percent"}],
+    }
+    assert [part.key for part in parts_of(parameters)] == ["a-p1", "a-p2", "b-p1", "b-p2"]
+    assert parts_of({"trials": [{"key": "x", "word": "one"}]}) == [Part("x", {"word": "one"})]
+
+
+def test_rows_of_a_column_are_reported_together_and_its_constant_is_weak(tmp_path):
+    evaluation = Evaluation(Context(tmp_path, tmp_path, "toy", 1, {}, quick=False), [], {})
+    for number in (1.0, 2.0):
+        for column in ("a", "b"):
+            text = 5.0 if column == "a" else number
+            evaluation.compare(
+                f"{column}{number:g}", text=text, check="0.1 tenth", column=column, author=text
+            )
+    rows = evaluation.outcome().rows
+    assert [(made.quantity, made.weak) for made in rows] == [("a1", 1), ("a2", 1), ("b1", 1), ("b2", 0)]
 
 
 def _rate(quantity: str, published: float) -> Row:
