@@ -96,7 +96,7 @@ def _load_object(code: bytes) -> dict[str, int]:
         raise NotLoadableError("not code of Linux on x86-64")
     sections = np.frombuffer(code, _SECTION, head["count"], head["sections"])
     (table,) = sections[sections["type"] == _SYMTAB]
-    symbols = np.frombuffer(code, _SYMBOL, table["size"] // _SYMBOL.itemsize, table["offset"])
+    symbols = np.frombuffer(code, _SYMBOL, int(table["size"]) // _SYMBOL.itemsize, table["offset"])
     texts = sections[table["link"]]
     names = [_text(code, int(texts["offset"] + each)) for each in symbols["name"]]
     loaded = (sections["flags"] & _ALLOC != 0) & (sections["type"] != _UNWIND)
@@ -134,7 +134,7 @@ def _relocate(
     memory: mmap.mmap, base: int, start: int, addresses: NDArray[np.uint64], code: bytes, section: Any
 ) -> None:
     """Fill in the addresses in one section, which begins at `start`."""
-    entries = np.frombuffer(code, _RELOCATION, section["size"] // _RELOCATION.itemsize, section["offset"])
+    entries = np.frombuffer(code, _RELOCATION, int(section["size"]) // _RELOCATION.itemsize, section["offset"])
     if not np.isin(entries["type"], (_ADDRESS, _DISTANCE)).all():
         raise NotLoadableError(f"relocations of types {sorted(set(entries['type'].tolist()))}")
     places = entries["offset"] + np.uint64(start)

@@ -13,8 +13,9 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from starid.arrays import Array, Indices, Indices32
+from starid.arrays import Array, Array32, Indices, Indices32
 from starid.jit import compiled_ieee, inner
 
 MAX_TIED: Final = 4
@@ -119,6 +120,40 @@ def neighbour_list(vectors: Array, pivot: int, radius: float) -> tuple[Array, In
     rows = np.empty(vectors.shape[0], dtype=np.int64)
     count = neighbours_of(vectors, pivot, radius, polar, rows)
     return polar[:count].copy(), rows[:count].copy()
+
+
+@compiled_ieee
+def neighbour_table(vectors: Array, radius: float) -> tuple[Indices32, Array32, NDArray[np.uint16]]:
+    """List the neighbours of all stars.
+
+    Parameters
+    ----------
+    vectors : ndarray (n, 3)
+        Unit vectors.
+    radius : float
+        Largest chord.
+
+    Returns
+    -------
+    start : ndarray (n + 1,)
+        First neighbour of each star in the other two arrays.
+    polar : ndarray (m, 2)
+        Chords, ascending for each star, and azimuths.
+    rows : ndarray (m,)
+        The neighbours.
+    """
+    n = vectors.shape[0]
+    polar, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
+    start = np.zeros(n + 1, dtype=np.int32)
+    for star in range(n):
+        start[star + 1] = start[star] + neighbours_of(vectors, star, radius, polar, rows)
+    every, whose = np.empty((start[n], 2), dtype=np.float32), np.empty(start[n], dtype=np.uint16)
+    for star in range(n):
+        neighbours_of(vectors, star, radius, polar, rows)
+        for i in range(start[star + 1] - start[star]):
+            every[start[star] + i] = polar[i]
+            whose[start[star] + i] = rows[i]
+    return start, every, whose
 
 
 @inner

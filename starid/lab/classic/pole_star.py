@@ -25,7 +25,7 @@ from starid.lab.classic.neighbours import neighbours_of
 from starid.lab.classic.rings import MAX_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_table
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 
-MIN_RINGS: Final = 4
+MIN_RINGS: Final = 8
 CANDIDATES: Final = 8
 
 

@@ -25,6 +25,10 @@ CLASSICS: Final = (
     "oriented-svd",
     "pole-star",
     "radial-cyclic",
+    "radial-dynamic-cyclic",
+    "multi-poles",
+    "ant-colony",
+    "correlation",
 )
 """Names of the published algorithms; module and class are named after them (`oriented_svd`, `OrientedSvdIdentifier`)."""
 

@@ -5,6 +5,8 @@ under rotation. A lookup table leads from each ring to the guide stars with a ne
 vote.
 
 own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.2 px of 937 each).
+own choice: an observed neighbour also votes for the ring that is next nearest to it, as noise carries it there; each
+guide star gets one vote of it at most.
 """
 
 from __future__ import annotations
@@ -60,10 +62,13 @@ def radial_votes(
     """Count the rings that an observed star, given its neighbours, shares with each guide star."""
     start, owner = table
     votes[:] = 0
-    last = -1
+    voter = np.full(votes.shape[0], -1, dtype=np.int64)
     for i in range(count):
         ring = ring_of(polar[i, 0], radius)
-        if ring > last:
-            last = ring
-            for place in range(start[ring], start[ring + 1]):
-                votes[owner[place]] += 1
+        for beside in (0, -1, 1):
+            if ring < 0 or not 0 <= ring + beside < RINGS:
+                continue
+            for place in range(start[ring + beside], start[ring + beside + 1]):
+                if voter[owner[place]] != i:
+                    votes[owner[place]] += 2 if beside == 0 else 1
+                    voter[owner[place]] = i

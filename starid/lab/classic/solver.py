@@ -6,7 +6,8 @@ proposes which observed star may be which guide star (`_match`). Everything befo
 own choices for all of them:
 
 - Guide stars are the brightest stars of the sky: as many as put `stars_per_field` into a field on average,
-  and none fainter than the sensor sees. The papers also thin them out to be evenly spread; here they are not.
+  and none fainter than the sensor sees. The papers also thin them out to be evenly spread; here only on
+  request (`even`).
 - The papers assume a calibrated detection threshold. Where the magnitude of unit flux is known (`zero_point`)
   it is used; otherwise as many of the brightest detections are taken as a field has guide stars.
 - There is one tolerance, for the difference of two distances. It is given in pixels (at the coarsest scale in
@@ -35,6 +36,7 @@ from starid.errors import StaridError
 from starid.geometric.identifier import Identifier
 from starid.geometric.index_choice import pixels_per_radian
 from starid.geometric.pattern_index import field_solid_angle, resolved_stars
+from starid.geometric.pattern_stars import select_pattern_stars
 from starid.geometric.verified import VerifiedIdentifier
 from starid.lab.classic.agreement import MIN_GROUP, largest_group
 from starid.single_camera import CheckedDetections
@@ -48,6 +50,9 @@ BLEND_PX: Final = 2.0
 
 MIN_GUIDE_STARS: Final = 20
 """Smallest number of guide stars in the whole sky."""
+
+EVEN_PER_FIELD: Final = 12
+"""Largest number of evenly spread guide stars in the solid angle of a field around any of them."""
 
 _VERIFY_WINDOW_PX: Final = 20.0
 _MIN_TOLERANCE_PX: Final = 0.5
@@ -67,6 +72,9 @@ class ClassicOptions:
         V magnitude of unit flux, where it is known.
     tolerance_px : float or None
         Largest difference of two distances, pixels, without position errors; default: the algorithm's.
+    even : bool
+        Thin the guide stars out to be evenly spread: at most `EVEN_PER_FIELD` in the solid angle of a field
+        around any of them, the brightest.
     verify : bool
         Verify the answer as strictly as the geometric identifier does its own (True), or return the raw
         answer, right or wrong, without correction for aberration.
@@ -78,6 +86,7 @@ class ClassicOptions:
     limiting_magnitude: float | None = None
     zero_point: float | None = None
     tolerance_px: float | None = None
+    even: bool = False
     verify: bool = True
     cache: bool = True
 
@@ -158,6 +167,9 @@ class ClassicIdentifier(VerifiedIdentifier):
     tolerance_px: ClassVar[float] = 3.0
     """Largest difference of two distances, pixels, where no position errors are given."""
 
+    clutter: ClassVar[float] = 2.0
+    """Largest number of detections used, as a multiple of the stars per field."""
+
     sigmas: ClassVar[float] = 3.0
     """The same in standard deviations of a distance, where position errors are given."""
 
@@ -219,10 +231,12 @@ class ClassicIdentifier(VerifiedIdentifier):
         magnitudes = np.sort(self._catalog.v)
         if magnitudes.size < MIN_GUIDE_STARS:
             raise StaridError(f"classic catalog: {magnitudes.size} stars, at least {MIN_GUIDE_STARS} needed")
-        limit = float(magnitudes[min(wanted, magnitudes.size) - 1])
+        limit = float(magnitudes[-1 if self.options.even else min(wanted, magnitudes.size) - 1])
         if self.options.limiting_magnitude is not None:
             limit = min(limit, self.options.limiting_magnitude)
         stars = resolved_stars(self._catalog, limit, BLEND_PX / self._px_per_rad)
+        if self.options.even:
+            stars = stars.subset(select_pattern_stars(stars.vectors, self._area_sr, EVEN_PER_FIELD))
         if len(stars) < MIN_GUIDE_STARS:
             raise StaridError(
                 f"classic limiting_magnitude: {limit:g} leaves {len(stars)} guide stars, at least {MIN_GUIDE_STARS} needed"
@@ -262,7 +276,7 @@ class ClassicIdentifier(VerifiedIdentifier):
         else:
             magnitude = magnitude + self.options.zero_point
             seen = int(np.searchsorted(magnitude, self.guide.magnitude[-1], side="right"))
-            count = min(max(seen, self.min_stars), 2 * self._detections)
+            count = min(max(seen, self.min_stars), math.ceil(self.clutter * self._detections))
         rows = usable[:count]
         tolerance_px = self.options.tolerance_px or self.tolerance_px
         if sigmas is not None and rows.size:

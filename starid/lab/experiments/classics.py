@@ -34,6 +34,10 @@ SHORT: Final = {
     "oriented-svd": "OSV",
     "pole-star": "PS",
     "radial-cyclic": "RC",
+    "radial-dynamic-cyclic": "RDC",
+    "multi-poles": "MP",
+    "ant-colony": "AAC",
+    "correlation": "CA",
     "lsi": "LSI (thesis)",
     "geometric": "geometric (ours)",
 }

@@ -1,9 +1,9 @@
 """Star identification solvers, third-party and ours, behind one interface, to compare them on the same scenes.
 
-Names of solvers: `OWN`, the published algorithms (`CLASSICS`) and the third-party `PEERS`. Not listed by
-``all`` are `VARIANTS`, the thesis's LSI with another solver of its equations (their verified answers are
-LSI's), and a published algorithm with the suffix `EVEN`, whose guide stars are thinned out to be evenly
-spread.
+Names of solvers: `OWN`, the published algorithms (`CLASSICS`) and the third-party `PEERS`. A published algorithm
+with the suffix `EVEN` has evenly spread guide stars, as most papers have; ``all`` lists it only for `EVEN_LISTED`,
+which are weak without. Not listed either are `VARIANTS`, the thesis's LSI with another solver of its equations
+(their verified answers are LSI's).
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
 from starid.geometric.pattern_index import field_solid_angle
-from starid.geometric.pattern_stars import select_pattern_stars
 from starid.lab.classic.registry import CLASSICS, make_identifier
 from starid.lab.leaderboard import astrometry_net
 from starid.lab.leaderboard.scenes import Scene
@@ -39,8 +38,11 @@ Array = NDArray[np.float64]
 OWN: Final = ("geometric", "lsi", "rsi")
 VARIANTS: Final = ("lsi-matlab", "lsi-sklearn")
 EVEN: Final = "-even"
+EVEN_LISTED: Final = tuple(
+    name + EVEN for name in ("pyramid", "geometric-voting", "iterative", "multi-poles")
+)
 PEERS: Final = ("tetra3rs", "ruststartracker", "cedar-solve", "solve-field")
-ALL: Final = (*OWN, *CLASSICS, *PEERS)
+ALL: Final = (*OWN, *CLASSICS, *EVEN_LISTED, *PEERS)
 PATTERN_MAX_ERROR: Final = 0.005
 RUST_TOLERANCE_PX: Final = 3.0
 """Tolerance of ruststartracker for an angle between two stars, pixels at the centre of the field."""
@@ -48,8 +50,6 @@ RUST_PER_FIELD: Final = 20.0
 """Mean number of stars in a field that ruststartracker looks up; its own example has about as many."""
 RUST_MATCHES: Final = 8
 CEDAR_TIMEOUT_MS: Final = 5000.0
-EVEN_PER_FIELD: Final = 12
-"""Maximum number of evenly spread guide stars in the solid angle of a field around any of them."""
 MIN_SIGMA_PX: Final = 0.1
 """Lowest centroid noise passed to a published algorithm, raw or verified."""
 MIN_FEATURE_FIELD_DEG: Final = 30.0
@@ -241,18 +241,12 @@ def _own(name: str, camera: Camera) -> Solver:
 
 def _classic(name: str, camera: Camera, stars: StarCatalog, *, verify: bool) -> Solver:
     """Make a published algorithm, with the sensor's limit, the magnitude of one unit of flux and the centroid noise."""
-    guide = None
-    if name.endswith(EVEN):
-        if verify:
-            raise UnsuitedError("verification needs all guide stars; use evenly spread ones with --raw")
-        picked = select_pattern_stars(stars.vectors, field_solid_angle(camera), EVEN_PER_FIELD)
-        guide = stars.subset(picked)
     identifier: Any = make_identifier(
         name.removesuffix(EVEN),
         camera,
-        guide,
         limiting_magnitude=float(stars.v[-1]),
         zero_point=0.0,
+        even=name.endswith(EVEN),
         verify=verify,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -9,11 +10,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starid.errors import StaridError
-from starid.lab.classic import grid, oriented_svd, svd
+from starid.jit import compiled_ieee
+from starid.lab.classic import ant_colony, correlation, grid, oriented_svd, svd
 from starid.lab.classic.agreement import largest_group
 from starid.lab.classic.log_polar import _strings
-from starid.lab.classic.neighbours import neighbour_list
+from starid.lab.classic.neighbours import neighbour_list, neighbour_table
 from starid.lab.classic.pairs import MAX_STARS, pair_table, pairs_within
+from starid.lab.classic.radial_dynamic_cyclic import likeness
 from starid.lab.classic.subgraph import simplest_size
 
 
@@ -69,6 +72,60 @@ def test_neighbours_differ_by_one_angle_after_a_rotation(seed: int) -> None:
     a, b = vectors[rows[0]], vectors[rows[1]]
     angle = math.atan2(vectors[0] @ np.cross(a, b), a @ b - (a @ vectors[0]) * (b @ vectors[0]))
     assert math.isclose(math.remainder(polar[1, 1] - polar[0, 1] - angle, math.tau), 0.0, abs_tol=1e-9)
+
+
+def test_a_table_of_neighbours_has_the_list_of_each_star() -> None:
+    vectors = sky(200, 6)
+    start, polar, rows = neighbour_table(vectors, 0.5)
+    for star in range(200):
+        expected, whose = neighbour_list(vectors, star, 0.5)
+        assert np.array_equal(rows[start[star] : start[star + 1]], whose)
+        assert np.allclose(polar[start[star] : start[star + 1]], expected, atol=1e-6)
+
+
+def test_ants_find_the_shortest_path_through_most_circles() -> None:
+    rng, shortest = np.random.default_rng(8), 0
+    for _ in range(30):
+        points = rng.random((7, 2))
+        chord = np.linalg.norm(points[:, None] - points, axis=2) + np.eye(7)
+        path = np.empty(7, dtype=np.int64)
+        length = ant_colony.shortest_path.py_func(chord, 7, path)
+        assert sorted(path) == list(range(7))
+        assert path[0] == 0
+        assert length == pytest.approx(sum(chord[a, b] for a, b in itertools.pairwise(path)))
+        lengths = [
+            sum(chord[a, b] for a, b in itertools.pairwise((0, *others)))
+            for others in itertools.permutations(range(1, 7))
+        ]
+        shortest += length < min(lengths) + 1e-12
+    assert shortest >= 24
+
+
+def test_images_correlate_as_the_integral_of_their_product() -> None:
+    rng, width = np.random.default_rng(2), 0.05
+    one, other = rng.random((6, 2)), rng.random((7, 2))
+    x, y = np.meshgrid(*2 * [np.linspace(-0.5, 1.5, 800)])
+
+    def image(stars):
+        return sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * width**2)) for a, b in stars)
+
+    itself = (image([(0.5, 0.5)]) ** 2).sum()
+    expected = (image(one) * image(other)).sum() / itself
+    assert correlation.correlation.py_func(one, 6, other, width) == pytest.approx(expected, rel=0.01)
+
+
+@compiled_ieee
+def alike(pattern, other, tolerance):
+    return likeness(pattern, pattern.shape[0], other, tolerance, np.empty(100))
+
+
+def test_patterns_are_alike_at_the_angle_between_them() -> None:
+    rng = np.random.default_rng(3)
+    pattern = np.column_stack([np.sort(rng.uniform(0.1, 1.0, 9)), rng.uniform(-3.0, 3.0, 9)])
+    turned = pattern + np.array([0.0, 2.0])
+    assert alike(pattern, turned, 1e-4) == 9
+    assert alike(pattern, turned * [1.0, -1.0], 1e-4) < 5
+    assert alike(pattern, turned + np.array([0.01, 0.0]), 1e-4) == 0
 
 
 def test_the_largest_group_has_the_true_matches() -> None:

@@ -13,10 +13,11 @@ from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.errors import StaridError
-from starid.geometric.pattern_index import resolved_stars
+from starid.geometric.pattern_index import field_solid_angle, resolved_stars
 from starid.interface import StarIdentifier
 from starid.lab.classic.registry import CLASSICS, make_identifier
-from starid.lab.classic.solver import ClassicIdentifier
+from starid.lab.classic.solver import EVEN_PER_FIELD, ClassicIdentifier
+from starid.lab.leaderboard.scenes import SceneMaker, SceneSettings
 from starid.solution import Reason
 
 DEGREE_ARCSEC = 3600.0
@@ -64,6 +65,10 @@ TABLE = {
     "oriented-svd": Rates(98, 97, 97, 97, 97.0),  # 2 px, 0.3 mag
     "pole-star": Rates(98, 90, 96, 96),
     "radial-cyclic": Rates(98, 84, 96, 96),
+    "radial-dynamic-cyclic": Rates(98, 97.5, 98, 98, 97.5),  # 2 px
+    "multi-poles": Rates(99, 98, 98, 98, 100.0),  # six false stars for each true one
+    "ant-colony": Rates(96, 94, 72, 72, 98.0),  # 50″
+    "correlation": Rates(98, 97, 98, 98),
 }  # fmt: skip
 
 
@@ -197,3 +202,28 @@ def test_bad_options_are_rejected_by_name() -> None:
         make_identifier("pyramid", CAMERA, tolerance_px=-1.0)
     with pytest.raises(StaridError, match="limiting_magnitude"):
         make_identifier("grid", CAMERA, limiting_magnitude=-1.0)
+
+
+def test_evenly_spread_guide_stars_are_the_brightest_of_each_neighbourhood() -> None:
+    camera = Camera.from_fov(20.0)
+    made = make_identifier("geometric-voting", camera, limiting_magnitude=5.0, even=True, verify=False)
+    assert isinstance(made, ClassicIdentifier)
+    guide, all_stars = made.guide.vectors, load_catalog().brighter_than(5.0)
+    near = guide @ guide.T > 1.0 - field_solid_angle(camera) / (2.0 * math.pi)
+    assert 0.3 * len(all_stars) < len(guide) < 0.9 * len(all_stars)
+    # of each star's neighbourhood so many are brighter at most: it was selected after them
+    assert np.tril(near, -1).sum(axis=1).max() < EVEN_PER_FIELD
+
+
+def test_many_poles_see_through_six_false_stars_for_each_true_one() -> None:
+    camera = Camera.from_fov(20.0, 1024, 1024)
+    settings = SceneSettings(5.5, 0.2, false_stars=162, magnitude_noise=0.0)
+    options = {"limiting_magnitude": 5.5, "zero_point": 0.0, "even": True, "verify": False}
+    made = make_identifier("multi-poles", camera, **options)
+    maker = SceneMaker(camera, resolved_stars(load_catalog(), 5.5, 2.0 * camera.pixel_scale_rad))
+    rng = np.random.default_rng(6)
+    for _ in range(FRAMES):
+        scene = maker.scene(settings, rng)
+        solution = made.identify(scene.xy_px, scene.flux, np.full(len(scene.flux), scene.sigma_px))
+        assert solution.valid
+        assert solution.attitude.error_to(scene.attitude).total_arcsec < DEGREE_ARCSEC

@@ -166,6 +166,7 @@ def test_the_papers_scenes_match_their_sensors() -> None:
     assert {(round(camera.fov_deg, 6), camera.width) for camera in cameras.values()} == {
         (12.0, 1024),
         (12.0, 2048),
+        (20.0, 1024),
         (8.0, 512),
     }
     assert cameras["8°, V ≤ 7.5, 1, 0.4 mag"].width == 512
@@ -200,23 +201,17 @@ def test_raw_answers_are_not_verified_and_all_know_the_noise(
     assert asked[-1] == 2.0
 
 
-def test_evenly_spread_guide_stars_are_the_brightest_of_each_neighbourhood_and_unverified(
-    monkeypatch,
-) -> None:
-    camera, stars = Camera.from_fov(20.0), load_catalog().brighter_than(5.0)
+@pytest.mark.parametrize(("name", "even"), [("pyramid", False), ("pyramid-even", True)])
+def test_a_suffix_asks_for_evenly_spread_guide_stars(monkeypatch, name: str, even: bool) -> None:
     given = []
     monkeypatch.setattr(
-        peers, "make_identifier", lambda *arguments, **_: given.append(arguments) or Classic()
+        peers, "make_identifier", lambda *words, **options: given.append((*words, options)) or Classic()
     )
-    make_solver("pyramid-even", camera, stars, raw=True)
-    ((name, _, guide),) = given
-    near = guide.vectors @ guide.vectors.T > 1.0 - field_solid_angle(camera) / (2.0 * math.pi)
-    assert name == "pyramid"
-    assert 0.3 * len(stars) < len(guide) < 0.9 * len(stars)
-    # of each star's neighbourhood so many are brighter at most: it was selected after them
-    assert np.tril(near, -1).sum(axis=1).max() < peers.EVEN_PER_FIELD
-    with pytest.raises(peers.UnsuitedError, match="--raw"):
-        make_solver("pyramid-even", camera, stars)
+    make_solver(name, Camera.from_fov(20.0), load_catalog().brighter_than(5.0))
+    ((algorithm, _, options),) = given
+    assert algorithm == "pyramid"
+    assert options["even"] is even
+    assert options["verify"]
 
 
 @pytest.mark.parametrize(

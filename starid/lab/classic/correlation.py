@@ -1,0 +1,114 @@
+"""CA, the correlation approach.
+
+H. Yoon, Y. Lim, H. Bang, "New Star-Pattern Identification Using a Correlation Approach for Spacecraft Attitude
+Determination", Journal of Spacecraft and Rockets 48(1), 182–186, 2011. No published rate was found.
+
+An image is made of each pivot star: the pivot is its centre, its nearest neighbour lies on the horizontal axis, and
+every star is a Gaussian whose width follows from the errors of its position. The image of an observed pivot is
+correlated with those of the guide stars, and that of the greatest correlation is the pivot.
+
+own choice: the correlation is evaluated in closed form, not on pixels by Fourier transforms. The integral of the
+product of two Gaussians of the same width is a Gaussian of their distance, √2 times as wide.
+own choice: a width of 0.015 of the pattern radius, of which an error of the aligned neighbour takes the most; pattern
+radius and buffer as in `starid.lab.classic.grid`. Brightness gives no weight. The greatest correlation must be worth
+at least three coincident stars besides the aligned one.
+"""
+
+from __future__ import annotations
+
+from typing import ClassVar, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starid.arrays import Array, Array32, Indices, Indices32
+from starid.jit import compiled_ieee, inner
+from starid.lab.classic.grid import BUFFER_SHARE, RADIUS_SHARE
+from starid.lab.classic.neighbours import nearest_beyond, neighbour_table, neighbours_of
+from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
+
+Patterns = tuple[Indices32, Array32, NDArray[np.uint16]]
+
+WIDTH_SHARE: Final = 0.015
+"""Standard deviation of a star's Gaussian as a share of the pattern radius."""
+
+MIN_COINCIDENT: Final = 3.0
+
+
+@inner
+def turn(polar: Array, count: int, aligned: int) -> None:
+    """Replace chord and azimuth by x and y, with the aligned neighbour on the x axis."""
+    reference = polar[aligned, 1]
+    for i in range(count):
+        distance, angle = polar[i, 0], polar[i, 1] - reference
+        polar[i, 0], polar[i, 1] = distance * np.cos(angle), distance * np.sin(angle)
+
+
+@compiled_ieee
+def _images(patterns: Patterns, buffer: float) -> Array32:
+    """Turn the neighbours (m, 2) of all stars; NaN for a star without a neighbour to align with."""
+    start, polar, _ = patterns
+    images = np.empty_like(polar)
+    for star in range(start.shape[0] - 1):
+        image = polar[start[star] : start[star + 1]].astype(np.float64)
+        aligned = nearest_beyond(image, image.shape[0], buffer)
+        if aligned >= 0:
+            turn(image, image.shape[0], aligned)
+        else:
+            image[:] = np.nan
+        images[start[star] : start[star + 1]] = image
+    return images
+
+
+@inner
+def correlation(image: Array, count: int, other: Array32, width: float) -> float:
+    """Correlation of two images, in units of that of one star with itself."""
+    total = 0.0
+    reach = 36.0 * width * width
+    for i in range(count):
+        for j in range(other.shape[0]):
+            dx, dy = image[i, 0] - other[j, 0], image[i, 1] - other[j, 1]
+            square = dx * dx + dy * dy
+            if square < reach:
+                total += np.exp(-square / (4.0 * width * width))
+    return total
+
+
+@compiled_ieee
+def _correlate(start: Indices32, images: Array32, seen: Array, radius: float, buffer: float) -> Indices:
+    """Find the guide star of each observed star; −1 without a clear winner."""
+    n = seen.shape[0]
+    image, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
+    matched = np.full(n, -1, dtype=np.int64)
+    for pivot in range(n):
+        count = neighbours_of(seen, pivot, radius, image, rows)
+        aligned = nearest_beyond(image, count, buffer)
+        if aligned < 0:
+            continue
+        turn(image, count, aligned)
+        most = 0.0
+        for star in range(start.shape[0] - 1):
+            value = correlation(image, count, images[start[star] : start[star + 1]], WIDTH_SHARE * radius)
+            if value > most:
+                most, matched[pivot] = value, star
+        if most < MIN_COINCIDENT + 1.0:
+            matched[pivot] = -1
+    return matched
+
+
+class CorrelationIdentifier(ClassicIdentifier):
+    """The correlation approach behind the common interface of all identifiers."""
+
+    stars_per_field: ClassVar[float] = 30.0
+
+    def _build(self) -> Database:
+        self._radius = RADIUS_SHARE * self.width_rad
+        self._buffer = BUFFER_SHARE * self._radius
+        patterns = neighbour_table(self.guide.vectors, self._radius)
+        self.start, self.images = patterns[0], _images(patterns, self._buffer)
+        return (self.start, self.images)
+
+    def _match(self, observed: Observed) -> Indices:
+        matched = _correlate(self.start, self.images, observed.directions, self._radius, self._buffer)
+        rows = np.flatnonzero(matched >= 0)
+        return np.column_stack([rows, matched[rows]])
