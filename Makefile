@@ -43,7 +43,7 @@ demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
 
 test: $(VENV)/.developer
-	-@tools/install_test_packages tshark:tshark chromium:chromium
+	-@tools/install_test_packages tshark:tshark chromium:chromium java:default-jre-headless
 	@tools/test_in_lanes $(BIN)/python
 
 lint: $(VENV)/.developer

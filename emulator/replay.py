@@ -39,7 +39,7 @@ from starhil.emulator.tape import (
     as_json,
     from_json,
 )
-from starhil.emulator.truth.config import FileConfig, Strict, TruthConfig
+from starhil.emulator.truth.config import FileConfig, OrbitFileConfig, Strict, TruthConfig
 from starhil.emulator.truth_log import WALL_TIMES, TruthLog
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.can_framing import CanFrame
@@ -156,6 +156,8 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     if isinstance(profile.truth, FileConfig):
         shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
         values["truth"]["path"] = TRUTH_SOURCE_FILE
+    if isinstance(profile.orbit, OrbitFileConfig):
+        values["orbit"]["path"] = str((profile.folder / profile.orbit.path).absolute())
     state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
     if state is not None and state.is_dir():
         shutil.copytree(state, folder / STATE_FOLDER)

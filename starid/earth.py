@@ -55,13 +55,22 @@ def _leap_seconds() -> tuple[list[float], list[float]]:
     return starts, [float(row[2]) for row in table]
 
 
+def _tai_minus_utc(unix_s: float) -> float:
+    starts, offsets = _leap_seconds()
+    return offsets[max(bisect.bisect_right(starts, unix_s) - 1, 0)]
+
+
+def utc_of_tai(tai_s: float) -> float:
+    """Convert TAI, as seconds since 1970-01-01T00:00:00 TAI, to Unix time."""
+    return tai_s - _tai_minus_utc(tai_s - _tai_minus_utc(tai_s))
+
+
 def terrestrial_time(unix_s: float) -> tuple[float, float]:
     """Julian date of terrestrial time in two parts: an integer plus a half, and the fraction.
 
     Barycentric dynamical time differs by less than 2 ms. Before 1972, TAI − UTC is taken as 10 s.
     """
-    starts, offsets = _leap_seconds()
-    offset_s = offsets[max(bisect.bisect_right(starts, unix_s) - 1, 0)]
+    offset_s = _tai_minus_utc(unix_s)
     days, seconds = divmod(unix_s + offset_s + _TT_MINUS_TAI_S, DAY_S)
     return UNIX_EPOCH_JD + days, seconds / DAY_S
 

@@ -13,7 +13,11 @@ os.environ[CACHE] = str(cache_dir())  # by name: a test may set HOME or XDG_CACH
 
 def _check_environment(event: str, arguments: tuple) -> None:
     """Reject a process without the folder of the kernels: it would compile for a minute, on a fresh machine only."""
-    if event == "subprocess.Popen" and CACHE not in (os.environ if arguments[3] is None else arguments[3]):
+    if (
+        event != "subprocess.Popen" or arguments[0] == "/sbin/ldconfig"
+    ):  # with which ctypes looks for a library
+        return
+    if CACHE not in (os.environ if arguments[3] is None else arguments[3]):
         raise AssertionError(f"environment without {CACHE}; start from os.environ: {arguments[1]}")
 
 

@@ -26,7 +26,7 @@ from starhil.emulator.profile import load_profile
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import render
 from starhil.emulator.sky.view import Sky
-from starhil.emulator.truth.file import BOUNDS
+from starhil.emulator.truth.csv_file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
 from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command

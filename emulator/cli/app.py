@@ -18,6 +18,7 @@ COMMANDS: Final[dict[str, str]] = {
     name: f"starhil.emulator.cli.{name}"
     for name in (
         "icd",
+        "truth",
         "unit",
         "run",
         "replay",

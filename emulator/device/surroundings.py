@@ -84,6 +84,6 @@ def orbit_of(profile: Profile) -> Orbit | None:
     if profile.orbit is None:
         return None
     try:
-        return profile.orbit.build(profile.start_unix_s)
+        return profile.orbit.build(profile.start_unix_s, profile.folder)
     except EmulatorError as error:
         raise EmulatorError(f"profile {profile.source}: {error}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias
@@ -12,7 +13,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from starhil.emulator.truth.feed import Socket
 from starhil.emulator.truth.feed_message import JsonFormat
-from starhil.emulator.truth.file import read_truth_file
+from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.orbit import LARGEST_ECCENTRICITY, KeplerOrbit, Orbit, OrbitState, TleOrbit
 from starhil.emulator.truth.simulator_42 import Format42
@@ -242,14 +243,15 @@ class SlewConfig(Strict):
 
 
 class FileConfig(Strict):
-    """A table of times and attitudes; a relative path refers to the profile's folder."""
+    """A file of attitudes: CSV, CCSDS AEM, STK `.a` or SPICE; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
     """Selects this truth source."""
     path: str
-    """CSV file of times and attitudes; its columns are in files-and-caches.md."""
+    """The file; its content says which format it has, see truth-files.md."""
     start: Literal["run", "now"] = "run"
-    """Time zero of the file: the start of the run, or the time at which the truth is set."""
+    """Time zero of the file, which is the first row of a file with dates: the start of the run, or the time at which
+    the truth is set."""
     repeat: bool = False
     """Whether to start again after the last row."""
     mount: MountConfig | None = None
@@ -258,7 +260,7 @@ class FileConfig(Strict):
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
         start_s = now_s if self.start == "now" else 0.0
-        return read_truth_file(folder / self.path, start_s=start_s, repeat=self.repeat)
+        return replace(read_truth_file(folder / self.path), start_s=start_s, repeat=self.repeat)
 
 
 class LiveConfig(Strict):
@@ -388,7 +390,7 @@ class KeplerConfig(Strict):
     j2: bool = True
     """Whether node and perigee drift at the secular rates due to the Earth's oblateness."""
 
-    def build(self, start_unix_s: float) -> Orbit:
+    def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
         """Make the orbit for a run that starts at a Unix time."""
         return KeplerOrbit(
             start_unix_s if self.date is None else self.date,
@@ -416,7 +418,7 @@ class StateConfig(Strict):
     j2: bool = True
     """Whether node and perigee drift at the secular rates due to the Earth's oblateness."""
 
-    def build(self, start_unix_s: float) -> Orbit:
+    def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
         """Make the orbit for a run that starts at a Unix time."""
         state = OrbitState(np.array(self.position_m), np.array(self.velocity_m_s))
         return KeplerOrbit.from_state(start_unix_s if self.date is None else self.date, state, j2=self.j2)
@@ -432,11 +434,26 @@ class TleConfig(Strict):
     line2: str
     """Second line, 69 characters."""
 
-    def build(self, start_unix_s: float) -> Orbit:
+    def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
         """Make the orbit, which must be valid at the start of the run."""
         orbit = TleOrbit(self.line1, self.line2)
         orbit.state(start_unix_s)
         return orbit
 
 
-OrbitConfig: TypeAlias = Annotated[KeplerConfig | StateConfig | TleConfig, Field(discriminator="kind")]
+class OrbitFileConfig(Strict):
+    """A file of positions and velocities with dates: CCSDS OEM or STK `.e`; a relative path refers to the profile's folder."""
+
+    kind: Literal["file"]
+    """Selects this form of the orbit."""
+    path: str
+    """The file, see truth-files.md."""
+
+    def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)
+        """Read the file."""
+        return read_orbit_file(folder / self.path)
+
+
+OrbitConfig: TypeAlias = Annotated[
+    KeplerConfig | StateConfig | TleConfig | OrbitFileConfig, Field(discriminator="kind")
+]

@@ -154,4 +154,4 @@ class FeedRates:
 
 
 def _degrees(vector: Vector) -> str:
-    return "(" + ", ".join(f"{value:.3g}" for value in np.degrees(vector)) + ")"
+    return "(" + ", ".join(f"{value:.3g}" for value in np.round(np.degrees(vector), 6) + 0.0) + ")"

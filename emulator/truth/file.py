@@ -1,264 +1,62 @@
-"""Truth from a file: a table of times and attitudes, interpolated along the shortest rotation.
+"""Truth and orbit files; the content of a file, not its name, says which format it has.
 
-The file is CSV with one header line. Columns, in any order:
+===============  ==================================================================  =================
+format           begins with                                                         module
+===============  ==================================================================  =================
+CCSDS AEM, OEM   ``CCSDS_AEM_VERS``, ``CCSDS_OEM_VERS``, or an XML element           `ccsds_file`
+STK .a, .e       ``stk.v.``                                                          `stk_file`
+SPICE            ``KPL/MK``, a meta-kernel                                           `spice_file`
+CSV              anything else                                                       `csv_file`
+===============  ==================================================================  =================
 
-- ``t``: simulation time in seconds, increasing from row to row;
-- either ``qx, qy, qz, qw`` (quaternion ICRS→sensor, scalar last) or ``ra_deg, dec_deg, roll_deg``;
-- optional ``wx_deg_s, wy_deg_s, wz_deg_s``: body rate in the sensor frame. Without them, the rate between two rows is
-  constant;
-- optional ``x_m, y_m, z_m, vx_m_s, vy_m_s, vz_m_s``: position and velocity relative to the Earth's centre, GCRS,
-  with cubic interpolation.
-
-A truth log (`starhil run --truth-log`) is accepted too, to repeat a run: the columns ``run_time_s``, ``true_qx`` …
-``true_qw`` and ``true_wx_deg_s`` … are used, the others ignored.
-
-Empty lines and lines that begin with ``#`` are ignored.
+The first row of a file with dates is its time zero. Messages about CSV do not quote the file, because a client of the
+control channel may name files that it must not read; those about the others quote only names of frames and formats.
 """
 
 from __future__ import annotations
 
-import copy
-import csv
-import math
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.truth.orbit import OrbitState, interpolate_orbit
-from starhil.emulator.truth.source import MAX_RATE_DEG_S, ZERO_RATE, TruthState, TruthStatus, Vector
-from starid.attitude import Attitude, interpolate, rate_between
-from starid.files import MEGABYTE, read_number, read_text
-
-QUATERNION_COLUMNS: Final = ("qx", "qy", "qz", "qw")
-ANGLE_COLUMNS: Final = ("ra_deg", "dec_deg", "roll_deg")
-RATE_COLUMNS: Final = ("wx_deg_s", "wy_deg_s", "wz_deg_s")
-POSITION_COLUMNS: Final = ("x_m", "y_m", "z_m")
-VELOCITY_COLUMNS: Final = ("vx_m_s", "vy_m_s", "vz_m_s")
-ORBIT_COLUMNS: Final = (*POSITION_COLUMNS, *VELOCITY_COLUMNS)
-
-LOG_COLUMNS: Final = {
-    "run_time_s": "t",
-    **{f"true_{name}": name for name in (*QUATERNION_COLUMNS, *RATE_COLUMNS)},
-}
-"""Column of a truth log → column of a truth file."""
-
-NORM_TOLERANCE: Final = 0.01
-"""Largest error of the length of a quaternion that is attributed to rounding."""
+from starhil.emulator.truth.ccsds_file import is_ccsds, read_aem, read_oem
+from starhil.emulator.truth.csv_file import read_csv
+from starhil.emulator.truth.spice_file import META_KERNEL, read_kernels
+from starhil.emulator.truth.stk_file import STK, read_attitude, read_ephemeris
+from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starid.files import MEGABYTE, read_text
 
 MAX_BYTES: Final = 500 * MEGABYTE
 """Maximum size of a truth file: a day at 50 rows per second."""
 
-BOUNDS: Final = {
-    "t": 1e9,
-    **dict.fromkeys(QUATERNION_COLUMNS, 1e9),
-    "ra_deg": 1e6,
-    "dec_deg": 90.0,
-    "roll_deg": 1e6,
-    **dict.fromkeys(RATE_COLUMNS, MAX_RATE_DEG_S),
-    **dict.fromkeys(POSITION_COLUMNS, 1e12),
-    **dict.fromkeys(VELOCITY_COLUMNS, 1e5),
-}
-"""Largest absolute value in each column; right ascension and roll may exceed a full turn."""
+
+def read_truth_file(path: Path) -> FileTruth:
+    """Read a truth file."""
+    text = _text("truth file", path)
+    if is_ccsds(text):
+        return read_aem(path, text)
+    if text.startswith(STK):
+        return read_attitude(path, text)
+    if text.startswith(META_KERNEL):
+        return read_kernels(path)
+    return read_csv(path, text)
 
 
-class FileTruth:
-    """Attitudes interpolated in time; at rest before the first row and after the last.
-
-    Parameters
-    ----------
-    times_s
-        Times (n,) of the rows, seconds, increasing.
-    rates_rad_s
-        Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows.
-    start_s
-        Simulation time of the file's time zero.
-    repeat
-        Whether to start again after the last row.
-    orbit
-        Position and velocity of each row; None if the file has none.
-    """
-
-    kind: Final = "file"
-
-    def __init__(
-        self,
-        times_s: NDArray[np.float64],
-        attitudes: list[Attitude],
-        rates_rad_s: NDArray[np.float64] | None = None,
-        *,
-        start_s: float = 0.0,
-        repeat: bool = False,
-        orbit: list[OrbitState] | None = None,
-    ) -> None:
-        if not attitudes:
-            raise EmulatorError("truth: a truth file needs at least one row")
-        self.times_s = times_s
-        self.attitudes = attitudes
-        self.rates_rad_s = rates_rad_s
-        self.start_s = start_s
-        self.repeat = repeat
-        self.orbit = orbit
-
-    def starting_at(self, start_s: float) -> FileTruth:
-        """Return the same truth with another simulation time of the file's time zero."""
-        other = copy.copy(self)
-        other.start_s = start_s
-        return other
-
-    def state(self, t_s: float) -> TruthState:
-        """Return the truth at a simulation time in seconds."""
-        first, last = float(self.times_s[0]), float(self.times_s[-1])
-        t = t_s - self.start_s
-        if self.repeat and t > last > first:
-            t = first + (t - first) % (last - first)
-        if t < first:
-            return TruthState(self.attitudes[0], ZERO_RATE, TruthStatus.BEFORE_START, self._orbit_of_row(0))
-        if t > last:
-            return TruthState(self.attitudes[-1], ZERO_RATE, TruthStatus.AFTER_END, self._orbit_of_row(-1))
-        upper = int(np.searchsorted(self.times_s, t, side="right"))
-        if upper == len(self.attitudes):
-            if upper == 1:
-                return TruthState(
-                    self.attitudes[0], self._rate_of_row(0, ZERO_RATE), orbit=self._orbit_of_row(0)
-                )
-            upper -= 1
-        low = upper - 1
-        span = float(self.times_s[upper] - self.times_s[low])
-        fraction = (t - float(self.times_s[low])) / span
-        before, after = self.attitudes[low], self.attitudes[upper]
-        if self.rates_rad_s is None:
-            rate = rate_between(before, after, span)
-        else:
-            rate = (1.0 - fraction) * self.rates_rad_s[low] + fraction * self.rates_rad_s[upper]
-        orbit = None
-        if self.orbit is not None:
-            orbit = interpolate_orbit(self.orbit[low], self.orbit[upper], fraction, span)
-        return TruthState(interpolate(before, after, fraction), rate, orbit=orbit)
-
-    def _orbit_of_row(self, row: int) -> OrbitState | None:
-        return None if self.orbit is None else self.orbit[row]
-
-    def _rate_of_row(self, row: int, default: Vector) -> Vector:
-        return default if self.rates_rad_s is None else self.rates_rad_s[row]
+def read_orbit_file(path: Path) -> OrbitTable:
+    """Read positions and velocities with dates."""
+    text = _text("orbit file", path)
+    if is_ccsds(text):
+        return read_oem(path, text)
+    if text.startswith(STK):
+        return read_ephemeris(path, text)
+    raise EmulatorError(f"orbit file {path}: must be a CCSDS OEM or an STK ephemeris (.e)")
 
 
-def read_truth_file(path: Path, *, start_s: float = 0.0, repeat: bool = False) -> FileTruth:
-    """Read a truth file.
-
-    Messages do not quote the file, because a client of the control channel may name files that it must not
-    read.
-    """
+def _text(what: str, path: Path) -> str:
     try:
-        text = read_text(path, MAX_BYTES)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else f"not UTF-8, {error.reason}"
-        raise EmulatorError(
-            f"truth file {path}: cannot be read ({reason}); give a CSV file of times and attitudes"
-        ) from None
-    lines = [
-        (n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and line.strip()[0] != "#"
-    ]
-    if not lines:
-        raise EmulatorError(f"truth file {path}: empty; the first line names the columns, e.g. t,qx,qy,qz,qw")
-    columns = [name.strip() for name in _cells(f"truth file {path} line {lines[0][0]}", lines[0][1])]
-    if "run_time_s" in columns and "true_qx" in columns:
-        columns = [LOG_COLUMNS.get(name, "") for name in columns]
-    needed = _attitude_columns(f"truth file {path} line {lines[0][0]}", columns)
-    has_rates, has_orbit = RATE_COLUMNS[0] in columns, POSITION_COLUMNS[0] in columns
-    times: list[float] = []
-    attitudes: list[Attitude] = []
-    rates: list[list[float]] = []
-    orbit: list[OrbitState] = []
-    for number, line in lines[1:]:
-        where = f"truth file {path} line {number}"
-        row = _parse_row(where, columns, line)
-        if times and row["t"] <= times[-1]:
-            raise EmulatorError(f"{where}: t is not later than in the previous row")
-        times.append(row["t"])
-        attitudes.append(_attitude(where, needed, row))
-        if has_orbit:
-            position, velocity = (
-                [row[name] for name in names] for names in (POSITION_COLUMNS, VELOCITY_COLUMNS)
-            )
-            orbit.append(OrbitState(np.array(position), np.array(velocity)))
-        if has_rates:
-            rates.append([math.radians(row[name]) for name in RATE_COLUMNS])
-        elif len(times) > 1:
-            rate = np.degrees(rate_between(attitudes[-2], attitudes[-1], times[-1] - times[-2]))
-            if np.abs(rate).max() > MAX_RATE_DEG_S:
-                raise EmulatorError(
-                    f"{where}: the rotation from the previous row is faster than {MAX_RATE_DEG_S:g} degrees per second; "
-                    f"give {', '.join(RATE_COLUMNS)} if the attitude jumps"
-                )
-    if not times:
-        raise EmulatorError(f"truth file {path}: no rows after the header; add at least one")
-    rate_array = np.array(rates) if has_rates else None
-    return FileTruth(
-        np.array(times),
-        attitudes,
-        rate_array,
-        start_s=start_s,
-        repeat=repeat,
-        orbit=orbit if has_orbit else None,
-    )
-
-
-def _cells(where: str, line: str) -> list[str]:
-    try:
-        return next(csv.reader([line]))
-    except csv.Error as error:
-        raise EmulatorError(f"{where}: not CSV ({error})") from None
-
-
-def _attitude_columns(where: str, columns: list[str]) -> tuple[str, ...]:
-    known = {"t", *QUATERNION_COLUMNS, *ANGLE_COLUMNS, *RATE_COLUMNS, *ORBIT_COLUMNS}
-    unknown = [name for name in columns if name not in known | {""}]
-    if unknown:
-        number = columns.index(unknown[0]) + 1
-        raise EmulatorError(f"{where}: column {number} is unknown; known: {', '.join(sorted(known))}")
-    twice = [name for name in columns if name and columns.count(name) > 1]
-    if twice:
-        raise EmulatorError(f"{where}: column {twice[0]} appears twice; remove one")
-    for group in (RATE_COLUMNS, ORBIT_COLUMNS):
-        missing = [name for name in group if name not in columns]
-        if 0 < len(missing) < len(group):
-            raise EmulatorError(f"{where}: column {missing[0]} is missing; give {', '.join(group)} or none")
-    both = [[name for name in names if name in columns] for names in (QUATERNION_COLUMNS, ANGLE_COLUMNS)]
-    if all(both):
-        raise EmulatorError(
-            f"{where}: columns {', '.join(both[0])} and {', '.join(both[1])} both give the attitude; remove one set"
-        )
-    for needed in (QUATERNION_COLUMNS, ANGLE_COLUMNS):
-        if "t" in columns and all(name in columns for name in needed):
-            return needed
-    raise EmulatorError(f"{where}: must have column t and either qx, qy, qz, qw or ra_deg, dec_deg, roll_deg")
-
-
-def _parse_row(where: str, columns: list[str], line: str) -> dict[str, float]:
-    cells = _cells(where, line)
-    if len(cells) != len(columns):
-        raise EmulatorError(f"{where}: {len(cells)} values for {len(columns)} columns")
-    row: dict[str, float] = {}
-    for name, cell in zip(columns, cells, strict=True):
-        if not name:
-            continue
-        try:
-            row[name] = read_number(cell)
-        except ValueError:
-            raise EmulatorError(f"{where}: {name} is not a number") from None
-        if abs(row[name]) > BOUNDS[name]:
-            raise EmulatorError(f"{where}: {name} is outside ±{BOUNDS[name]:g}")
-    return row
-
-
-def _attitude(where: str, needed: tuple[str, ...], row: dict[str, float]) -> Attitude:
-    values = [row[name] for name in needed]
-    if needed is ANGLE_COLUMNS:
-        return Attitude.from_radec_roll(*values)
-    norm = math.sqrt(sum(v * v for v in values))
-    if abs(norm - 1.0) > NORM_TOLERANCE:
-        raise EmulatorError(f"{where}: the quaternion is not of length 1")
-    return Attitude(np.array(values))
+        return read_text(path, MAX_BYTES)
+    except UnicodeDecodeError as error:
+        reason = f"not UTF-8, {error.reason}; of SPICE, give a meta-kernel"
+    except OSError as error:
+        reason = error.strerror or str(error)
+    raise EmulatorError(f"{what} {path}: cannot be read ({reason})")

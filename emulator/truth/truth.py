@@ -20,10 +20,10 @@ from starhil.emulator.clock import NANOSECONDS, Clock, make_clock
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
 from starhil.emulator.truth.feed import LiveFeed
-from starhil.emulator.truth.file import FileTruth
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.lock_step import Step
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
+from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 
 
@@ -142,7 +142,7 @@ class Truth:
             and isinstance(config, FileConfig)
             and config.start == "now"
         ):
-            source = source.starting_at(host.now_s())  # reading has taken time
+            source = replace(source, start_s=host.now_s())  # reading has taken time
         if not isinstance(config, FeedConfig) or not isinstance(source, LiveTruth):
             return source, config, None, ""
         source.set_clock_speed(make_clock(host.clock_name).speed)

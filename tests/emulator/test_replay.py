@@ -357,3 +357,44 @@ def test_what_is_not_a_file_is_named_without_waiting(recorded, name, make):
     with pytest.raises(EmulatorError) as caught:
         report_of(recorded)
     assert f"{recorded / name}: " in str(caught.value)
+
+
+def test_a_run_with_truth_and_orbit_from_standard_files_is_repeated(record, tmp_path):
+    """The truth is in the recording, the orbit is read from its original place."""
+    quaternions = [f"2026-03-20T12:00:{s:02d} 0.0 0.0 0.0 1.0" for s in (0, 30)]
+    keywords = [
+        "REF_FRAME_A = ICRF",
+        "REF_FRAME_B = SC_BODY_1",
+        "TIME_SYSTEM = UTC",
+        "ATTITUDE_TYPE = QUATERNION",
+    ]
+    aem = [
+        "CCSDS_AEM_VERS = 2.0",
+        "META_START",
+        *keywords,
+        "META_STOP",
+        "DATA_START",
+        *quaternions,
+        "DATA_STOP",
+    ]
+    keywords = ["REF_FRAME = EME2000", "CENTER_NAME = EARTH", "TIME_SYSTEM = UTC"]
+    places = [f"2026-03-20T12:00:{s:02d} 7000.0 0.0 {7.5 * s} 0.0 0.0 7.5" for s in (0, 30)]
+    oem = ["CCSDS_OEM_VERS = 2.0", "META_START", *keywords, "META_STOP", *places]
+    (tmp_path / "truth").write_text("\n".join(aem) + "\n")
+    (tmp_path / "orbit").write_text("\n".join(oem) + "\n")
+    seen = []
+
+    async def scenario(emulation, _line):
+        await talk(emulation, 3)
+        truth = emulation.device.surroundings.state(2_000_000_000)
+        seen.append((truth.unix_s, float(truth.orbit.position_m[2])))
+
+    folder = record(
+        scenario,
+        run={"clock": "stepped"},
+        truth={"kind": "file", "path": str(tmp_path / "truth")},
+        orbit={"kind": "file", "path": str(tmp_path / "orbit")},
+    )
+    (tmp_path / "truth").unlink()
+    assert report_of(folder).differences == []
+    assert seen[0] == (1774008002.0, pytest.approx(15_000.0, abs=1.0))

@@ -13,7 +13,7 @@ import logging
 import struct
 import tomllib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -37,10 +37,12 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.replay import EVENTS_FILE, RUN_FILE, read_events, read_run
 from starhil.emulator.run import Run as EmulatorRun
+from starhil.emulator.truth.ccsds_file import write_aem
 from starhil.emulator.truth.feed_message import JsonFormat
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.simulator_42 import Format42
+from starhil.emulator.truth.table import FileTruth
 from starhil.hil_tests.emulator_process import parse_ready_line
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.images import decode_bmp
@@ -65,6 +67,7 @@ from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
 from starhil.protocol.unit_folders import bundled_units
+from starid.attitude import Attitude
 from starid.camera_file import load_camera
 from starid.errors import StaridError
 from starid.hipparcos import read_hip2
@@ -577,8 +580,18 @@ TRUTH = "t,qx,qy,qz,qw,wx_deg_s,wy_deg_s,wz_deg_s\n0,0,0,0,1,0,0,1\n# text\n1.5,
 LOG = "time_of_exposure_s,true_qx,true_qy,true_qz,true_qw\n0,0,0,0,1\n1,0,0,0.1,0.995\n"
 
 
+def standard_truths() -> list[bytes]:
+    """Return an AEM as KVN and XML, and an attitude file of STK."""
+    file = FileTruth(np.array([0.0, 10.0]), [Attitude.identity()] * 2, np.zeros((2, 3)), start_unix_s=1.7e9)
+    stk = (
+        "stk.v.11.0\nBEGIN Attitude\nScenarioEpoch 1 Jan 2026 00:00:00.0\nCoordinateAxes ICRF\n"
+        "AttitudeTimeQuatAngVels\n0 0 0 0 1 0 0 0.1\n1e1 0 0 0.00872654 0.99996192 0 0 0.1\nEND Attitude\n"
+    )
+    return [*(write_aem(file, "INSTRUMENT_A", xml=xml).encode() for xml in (False, True)), stk.encode()]
+
+
 def _truth(path: Path) -> None:
-    truth = read_truth_file(path, repeat=True)
+    truth = replace(read_truth_file(path), repeat=True)
     for t_s in (-1.0, 0.0, 0.7, 1e6):
         assert np.isfinite(truth.state(t_s).attitude.quaternion_xyzw).all()
 
@@ -586,6 +599,7 @@ def _truth(path: Path) -> None:
 target("truth-file", lambda: [TRUTH.encode(), b"t,ra_deg,dec_deg,roll_deg\n0,10,20,0\n100,10,20,50\n"])(
     of_file("truth.csv", _truth)
 )
+target("standard-truth-file", standard_truths)(of_file("truth", _truth))
 target("truth-log", lambda: [LOG.encode()])(of_file("truth.csv", lambda path: TruthLogReader(path).at(0.5)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -177,7 +178,7 @@ ORBIT = TypeAdapter(OrbitConfig)
 
 def test_orbits_of_a_profile_are_built_from_elements_state_or_tle():
     elements = {"kind": "kepler", "semi_major_axis_km": 7000, "inclination_deg": 98.0, "raan_deg": 10.0}
-    kepler = ORBIT.validate_python(elements).build(NEW_YEAR)
+    kepler = ORBIT.validate_python(elements).build(NEW_YEAR, Path())
     state = kepler.state(NEW_YEAR)
     typed = {
         "kind": "state",
@@ -186,10 +187,12 @@ def test_orbits_of_a_profile_are_built_from_elements_state_or_tle():
         "date": "2026-01-01T00:00:00Z",
     }
     later = NEW_YEAR + 600.0
-    same = ORBIT.validate_python(typed).build(0.0).state(later)
+    same = ORBIT.validate_python(typed).build(0.0, Path()).state(later)
     assert same.position_m == pytest.approx(kepler.state(later).position_m, abs=0.01)
     tle = {"kind": "tle", "line1": VANGUARD[0], "line2": VANGUARD[1]}
-    distance = np.linalg.norm(ORBIT.validate_python(tle).build(962_131_819.0).state(962_131_819.0).position_m)
+    distance = np.linalg.norm(
+        ORBIT.validate_python(tle).build(962_131_819.0, Path()).state(962_131_819.0).position_m
+    )
     assert 7e6 < distance < 1.1e7
 
 
@@ -210,7 +213,7 @@ def test_orbits_of_a_profile_are_built_from_elements_state_or_tle():
 )
 def test_an_impossible_orbit_is_rejected(values, error):
     with pytest.raises(error):
-        ORBIT.validate_python(values).build(NEW_YEAR)
+        ORBIT.validate_python(values).build(NEW_YEAR, Path())
 
 
 @pytest.mark.parametrize("date", ["2026-01-01", "2026-01-01T01:00:00+01:00", 1_767_225_600])

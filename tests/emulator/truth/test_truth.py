@@ -1,6 +1,7 @@
 import itertools
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -128,7 +129,7 @@ def test_file_is_interpolated_on_the_shortest_turn(tmp_path):
 
 def test_file_takes_angles_rates_and_repeats(tmp_path):
     text = "t,ra_deg,dec_deg,roll_deg,wx_deg_s,wy_deg_s,wz_deg_s\n0,10,20,30,1,2,3\n4,10,20,30,3,2,1\n"
-    truth = read_truth_file(write(tmp_path, text), repeat=True)
+    truth = replace(read_truth_file(write(tmp_path, text)), repeat=True)
     state = truth.state(1.0)
     assert (state.attitude.ra_deg, state.attitude.dec_deg) == pytest.approx((10.0, 20.0))
     assert np.degrees(state.rate_rad_s) == pytest.approx([1.5, 2.0, 2.5])

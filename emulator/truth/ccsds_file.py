@@ -1,0 +1,279 @@
+"""CCSDS attitude and orbit ephemerides: AEM (504.0-B, versions 1 and 2) and OEM (502.0-B), as KVN or XML.
+
+Both notations are read into the same segments: a dictionary of keywords, and rows of a date and numbers. A quaternion
+describes the transformation from REF_FRAME_A to REF_FRAME_B as an attitude matrix does, so that the one that rotates
+vectors is its conjugate. One of the two frames must be inertial and known (`standard_frames`), the other is the body.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Final
+from xml.etree import ElementTree as ET
+
+import numpy as np
+
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.feed_message import checked_attitude, checked_rate
+from starhil.emulator.truth.feed_rates import FeedError
+from starhil.emulator.truth.source import Vector
+from starhil.emulator.truth.standard_frames import (
+    NANOSECONDS,
+    Row,
+    body_attitude,
+    euler_turn,
+    icrs_to,
+    inverse,
+    is_inertial,
+    orbit_of_rows,
+    truth_of,
+    unix_ns,
+)
+from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starid.attitude import Attitude
+from starid.files import read_number
+
+RATE_TYPES: Final = ("QUATERNION/ANGVEL", "EULER_ANGLE/ANGVEL")
+TYPES: Final = {"QUATERNION": 4, "EULER_ANGLE": 3, "QUATERNION/ANGVEL": 7, "EULER_ANGLE/ANGVEL": 6}
+"""Attitude types that are read, and the numbers in a row of each."""
+
+XML_ORDER: Final = {"EPOCH": 0, "Q1": 1, "Q2": 2, "Q3": 3, "QC": 4}
+"""Elements that come first in a row, whatever their order in the file."""
+
+
+@dataclass
+class Segment:
+    """Keywords of the metadata, and rows of a date and numbers."""
+
+    keywords: dict[str, str]
+    rows: list[tuple[str, list[float]]]
+
+
+def is_ccsds(text: str) -> bool:
+    """Whether a text is a CCSDS message."""
+    return text.startswith(("CCSDS_", "<"))
+
+
+def read_aem(path: Path, text: str) -> FileTruth:
+    """Read the attitudes of an AEM."""
+    where = f"truth file {path}"
+    version, segments = _segments(where, "AEM", text)
+    blocks = [list(_attitudes(f"{where}, segment {n}", version, each)) for n, each in enumerate(segments, 1)]
+    methods = {segment.keywords.get("INTERPOLATION_METHOD", "").upper() for segment in segments}
+    return truth_of(path, blocks, smooth="LINEAR" not in methods)
+
+
+def read_oem(path: Path, text: str) -> OrbitTable:
+    """Read positions and velocities of an OEM about the Earth."""
+    where = f"orbit file {path}"
+    _, segments = _segments(where, "OEM", text)
+    frames = {_keyword(where, segment, "REF_FRAME") for segment in segments}
+    centres = {_keyword(where, segment, "CENTER_NAME").upper() for segment in segments}
+    if len(frames) != 1 or centres != {"EARTH"}:
+        raise EmulatorError(f"{where}: needs one REF_FRAME, and EARTH as CENTER_NAME")
+    dates: list[int] = []
+    rows: list[list[float]] = []
+    for segment in segments:
+        scale = _keyword(where, segment, "TIME_SYSTEM")
+        for date, numbers in segment.rows:
+            if len(numbers) not in (6, 9):
+                raise EmulatorError(f"{where}: {len(numbers)} numbers in a row; position and velocity are 6")
+            at_ns = unix_ns(where, date, scale)
+            if not dates or at_ns != dates[-1]:
+                dates.append(at_ns)
+                rows.append([1e3 * number for number in numbers[:6]])
+    return orbit_of_rows(path, icrs_to(where, frames.pop()), dates, rows)
+
+
+def write_aem(truth: FileTruth, sensor: str, *, xml: bool) -> str:
+    """Return the rows of a truth with dates as an AEM 2.0, GCRF to the frame named `sensor`."""
+    begin_ns = 1000 * round(1e6 * (truth.start_unix_s or 0.0))  # the resolution of such a float is 0.2 µs
+    dates = [_date(begin_ns + round(t * NANOSECONDS)) for t in truth.times_s.tolist()]
+    with_rates = truth.rates_rad_s is not None
+    meta = {
+        "OBJECT_NAME": "STARHIL",
+        "OBJECT_ID": "UNKNOWN",
+        "REF_FRAME_A": "GCRF",
+        "REF_FRAME_B": sensor,
+        "TIME_SYSTEM": "UTC",
+        "START_TIME": dates[0],
+        "STOP_TIME": dates[-1],
+        "ATTITUDE_TYPE": "QUATERNION/ANGVEL" if with_rates else "QUATERNION",
+        **({"ANGVEL_FRAME": sensor} if with_rates else {}),
+    }
+    header = {"CREATION_DATE": dates[0], "ORIGINATOR": "starhil"}
+    rows = []
+    for index, (date, attitude) in enumerate(zip(dates, truth.attitudes, strict=True)):
+        numbers = inverse(attitude).quaternion_xyzw.tolist()
+        if truth.rates_rad_s is not None:
+            numbers += np.degrees(truth.rates_rad_s[index]).tolist()
+        rows.append((date, [repr(number) for number in numbers]))
+    if not xml:
+        lines = [
+            "CCSDS_AEM_VERS = 2.0",
+            *_lines(header),
+            "META_START",
+            *_lines(meta),
+            "META_STOP",
+            "DATA_START",
+        ]
+        lines += [" ".join((date, *values)) for date, values in rows]
+        return "\n".join((*lines, "DATA_STOP", ""))
+    root = ET.Element("aem", {"id": "CCSDS_AEM_VERS", "version": "2.0"})
+    _add(ET.SubElement(root, "header"), header)
+    segment = ET.SubElement(ET.SubElement(root, "body"), "segment")
+    _add(ET.SubElement(segment, "metadata"), meta)
+    data = ET.SubElement(segment, "data")
+    for date, values in rows:
+        kind = "quaternionAngVel" if with_rates else "quaternionEphemeris"
+        state = ET.SubElement(ET.SubElement(data, "attitudeState"), kind)
+        _add(state, {"EPOCH": date})
+        _add(
+            ET.SubElement(state, "quaternion"),
+            dict(zip(("Q1", "Q2", "Q3", "QC"), values[:4], strict=True)),
+        )
+        if with_rates:
+            names = ("ANGVEL_X", "ANGVEL_Y", "ANGVEL_Z")
+            _add(ET.SubElement(state, "angVel"), dict(zip(names, values[4:], strict=True)))
+    ET.indent(root)
+    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+
+
+def _attitudes(where: str, version: str, segment: Segment) -> Iterator[Row]:
+    kind = _keyword(where, segment, "ATTITUDE_TYPE").upper()
+    if kind not in TYPES or (version == "1" and kind != "QUATERNION"):
+        raise EmulatorError(
+            f"{where}: ATTITUDE_TYPE {kind[:40]!r} of version {version} is not read; known: {', '.join(TYPES)}"
+        )
+    reference, body = (_keyword(where, segment, f"REF_FRAME_{letter}") for letter in "AB")
+    is_inverse = segment.keywords.get("ATTITUDE_DIR", "A2B").upper() == "B2A"
+    inertial = body if is_inertial(body) else reference
+    if is_inertial(body) and is_inertial(reference):
+        raise EmulatorError(f"{where}: both frames are inertial; one must be the body")
+    to_reference = icrs_to(where, inertial)
+    is_inverse ^= inertial == body
+    scale = _keyword(where, segment, "TIME_SYSTEM")
+    scalar_first = segment.keywords.get("QUATERNION_TYPE", "LAST").upper() == "FIRST"
+    size = 4 if kind.startswith("QUATERNION") else 3
+    for date, numbers in segment.rows:
+        if len(numbers) != TYPES[kind]:
+            raise EmulatorError(
+                f"{where}: {len(numbers)} numbers in a row of {kind}, which has {TYPES[kind]}"
+            )
+        values, rate = np.array(numbers[:size]), None
+        try:
+            if size == 4:
+                turn = checked_attitude(
+                    "quaternion", np.roll(values, -1) if scalar_first else values, "attitude"
+                )
+            else:
+                turn = euler_turn(where, _keyword(where, segment, "EULER_ROT_SEQ"), values)
+            if kind in RATE_TYPES:
+                rate = checked_rate("rate", np.radians(numbers[size:]))
+        except FeedError as error:
+            raise EmulatorError(f"{where}: {error}") from None
+        if rate is not None:
+            rate = _rate_of_body(where, segment, rate, turn, reference, body, of_a=is_inverse)
+        turn = inverse(turn) if is_inverse else turn
+        yield Row(unix_ns(where, date, scale), body_attitude(to_reference, turn), rate)
+
+
+def _rate_of_body(
+    where: str, segment: Segment, rate: Vector, turn: Attitude, reference: str, body: str, *, of_a: bool
+) -> Vector:
+    """Return the rate of the body in the frame of the body, from that of frame B relative to A in either frame."""
+    frame = _keyword(where, segment, "ANGVEL_FRAME")
+    if frame not in (reference, body):
+        raise EmulatorError(f"{where}: ANGVEL_FRAME {frame[:40]!r} is neither REF_FRAME_A nor REF_FRAME_B")
+    if of_a:  # A is the body
+        return -(rate if frame == reference else turn.to_icrs(rate))
+    return rate if frame == body else turn.to_sensor(rate)
+
+
+def _segments(where: str, kind: str, text: str) -> tuple[str, list[Segment]]:
+    """Return the first digit of the version, and the segments."""
+    read = _from_xml if text.startswith("<") else _from_kvn
+    version, segments = read(where, kind, text)
+    if version is None:
+        raise EmulatorError(f"{where}: not a CCSDS {kind}")
+    if not segments:
+        raise EmulatorError(f"{where}: has no segment with metadata and data")
+    return version[:1], segments
+
+
+def _from_kvn(where: str, kind: str, text: str) -> tuple[str | None, list[Segment]]:
+    version: str | None = None
+    segments: list[Segment] = []
+    in_covariance = False
+    for number, line in enumerate((each.strip() for each in text.splitlines()), 1):
+        key, equals, value = (part.strip() for part in line.partition("="))
+        if key == f"CCSDS_{kind}_VERS":
+            version = value
+        elif key == "META_START":
+            segments.append(Segment({}, []))
+        elif key.endswith(("_START", "_STOP")):
+            in_covariance = key == "COVARIANCE_START"
+        elif not segments or in_covariance or not line or line.startswith("COMMENT"):
+            continue
+        elif equals:
+            segments[-1].keywords[key] = value
+        else:
+            segments[-1].rows.append(_row(f"{where} line {number}", line.split()))
+    return version, segments
+
+
+def _from_xml(where: str, kind: str, text: str) -> tuple[str | None, list[Segment]]:
+    try:
+        root = ET.fromstring(text)  # noqa: S314 (expat limits the expansion of entities)
+    except (ET.ParseError, ValueError) as error:
+        raise EmulatorError(f"{where}: not XML ({error})") from None
+    found = next((node for node in root.iter() if _name(node) == kind.lower()), None)
+    if found is None:
+        return None, []
+    segments = []
+    for node in found.iter("segment"):
+        keywords = {each.tag: (each.text or "").strip() for each in node.iterfind("metadata/*")}
+        rows = []
+        for state in node.iterfind("data/*"):
+            if state.tag in ("attitudeState", "stateVector"):
+                leaves = [each for each in state.iter() if len(each) == 0 and each.tag != "COMMENT"]
+                leaves.sort(key=lambda leaf: XML_ORDER.get(leaf.tag, len(XML_ORDER)))
+                rows.append(_row(where, [(leaf.text or "").strip() for leaf in leaves]))
+        keywords.pop("QUATERNION_TYPE", None)  # the elements have names
+        segments.append(Segment(keywords, rows))
+    return found.get("version", ""), segments
+
+
+def _name(node: Any) -> str:
+    return re.sub(r"^\{.*\}", "", str(node.tag))
+
+
+def _row(where: str, cells: list[str]) -> tuple[str, list[float]]:
+    try:
+        return cells[0], [read_number(cell) for cell in cells[1:]]
+    except (ValueError, IndexError):
+        raise EmulatorError(f"{where}: must be a date and numbers") from None
+
+
+def _keyword(where: str, segment: Segment, key: str) -> str:
+    if key not in segment.keywords:
+        raise EmulatorError(f"{where}: {key} is missing")
+    return segment.keywords[key]
+
+
+def _lines(keywords: dict[str, str]) -> list[str]:
+    return [f"{key} = {value}" for key, value in keywords.items()]
+
+
+def _add(parent: Any, keywords: dict[str, str]) -> None:
+    for key, value in keywords.items():
+        ET.SubElement(parent, key).text = value
+
+
+def _date(at_ns: int) -> str:
+    whole, rest = divmod(at_ns, NANOSECONDS)
+    return f"{datetime.fromtimestamp(whole, UTC):%Y-%m-%dT%H:%M:%S}.{rest:09d}"
