@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from starhil.protocol.errors import escape_controls
 from starid.errors import plain
 
 MIN_SIMILARITY: Final = 0.55
@@ -33,7 +34,7 @@ def explain(
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])
-        unknown = str(loc[-1])  # _along would drop it if it is also the tag of an alternative
+        unknown = escape_controls(str(loc[-1]))  # _along would drop it if it is also the tag of an alternative
         known = sorted(
             {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
         )
@@ -76,7 +77,7 @@ def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str],
         if tagged:
             models = tagged
             continue
-        keys.append(str(step))
+        keys.append(escape_controls(str(step)))
         if isinstance(step, str):
             fields = [each.model_fields[step] for each in models if step in each.model_fields]
             models = [below for field in fields for below in _models_in(field.annotation)]

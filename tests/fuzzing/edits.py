@@ -14,12 +14,16 @@ HOSTILE: tuple[Any, ...] = (
 )  # fmt: skip
 
 
+MOST_SPOTS = 20_000
+"""Values copied into each other could grow without limit."""
+
+
 def edited(document: Any, data: bytes) -> Any:
     """Return a copy of a document with an edit for each four bytes: path (2), kind, value."""
     document = copy.deepcopy(document)
     for start in range(0, len(data) - 3, 4):
         spots = list(_spots(document))
-        if not spots:
+        if not 0 < len(spots) <= MOST_SPOTS:
             break
         number, kind, value = data[start] << 8 | data[start + 1], data[start + 2], data[start + 3]
         holder, key = spots[number % len(spots)]
