@@ -34,7 +34,9 @@ def explain(
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])
-        unknown = escape_controls(str(loc[-1]))  # _along would drop it if it is also the tag of an alternative
+        unknown = escape_controls(
+            str(loc[-1])
+        )  # _along would drop it if it is also the tag of an alternative
         known = sorted(
             {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
         )
