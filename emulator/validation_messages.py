@@ -8,7 +8,6 @@ from typing import Any, Final, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
-from starhil.protocol.errors import escape_controls
 from starid.errors import plain
 
 MIN_SIMILARITY: Final = 0.55
@@ -34,9 +33,7 @@ def explain(
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])
-        unknown = escape_controls(
-            str(loc[-1])
-        )  # _along would drop it if it is also the tag of an alternative
+        unknown = str(loc[-1])  # _along would drop it if it is also the tag of an alternative
         known = sorted(
             {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
         )
@@ -79,7 +76,7 @@ def _along(model: type[BaseModel], loc: Sequence[int | str]) -> tuple[list[str],
         if tagged:
             models = tagged
             continue
-        keys.append(escape_controls(str(step)))
+        keys.append(str(step))
         if isinstance(step, str):
             fields = [each.model_fields[step] for each in models if step in each.model_fields]
             models = [below for field in fields for below in _models_in(field.annotation)]
