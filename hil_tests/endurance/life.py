@@ -177,6 +177,8 @@ class LifeGenerator:
             for row in self._telecommands
         }
         """Rows that report the effect of a telecommand."""
+        self._results = self._reporting(("request.", "counters."))
+        """Rows that report the result of any telecommand, an unknown one too."""
         self._stream_rows = [
             row for row in self._telecommands if row.action in ("select_unsolicited", "subscribe")
         ]
@@ -224,7 +226,8 @@ class LifeGenerator:
             (maker,) = self._random.choices(self._makers, self._weights)
             step = maker()
             yield step
-            effects = self._effects.get(tuple(step.get("row", ())), [])
+            row = tuple(step.get("row", ()))
+            effects = self._effects.get(row) or (self._results if "telecommand" in row else [])
             if effects and self._random.random() < READ_BACK_SHARE:
                 yield self._request(self._random.choice(effects))
 
