@@ -5,8 +5,10 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from starhil.protocol.errors import OneLineError
 
-class BenchError(Exception):
+
+class BenchError(OneLineError):
     """A script, port or device cannot be used; the text is one line with what, where and remedy."""
 
 

@@ -1,15 +1,19 @@
-"""Base class of the errors of this package, the reason of a failed system call as text, and text for a terminal."""
+"""Base classes of errors, the reason of a failed system call as text, and text for a terminal."""
 
 from __future__ import annotations
 
 import os
 
 
-class ProtocolError(Exception):
-    """Invalid bytes, frames, values or definitions.
+class OneLineError(Exception):
+    """An error whose text is one line that names what and where; controls in what it quotes are escaped."""
 
-    The text is one line that names what and where.
-    """
+    def __str__(self) -> str:
+        return escape_controls(super().__str__())
+
+
+class ProtocolError(OneLineError):
+    """Invalid bytes, frames, values or definitions."""
 
 
 def reason(error: Exception) -> str:

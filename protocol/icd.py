@@ -27,6 +27,7 @@ from starhil.protocol.definition import (
     Names,
 )
 from starhil.protocol.device_model import DeviceModel, device_model, did_you_mean
+from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
@@ -101,13 +102,14 @@ def _load(path: Path) -> InterfaceDefinition:
 
 
 def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDefinition, list[str]]:
-    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors."""
+    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each."""
     files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
     reader = _Reader(path, run_plugin=run_plugin)
     for file in files:
         reader.read(file)
     definition = reader.definition()
-    return definition, reader.errors if files else [f"{path}: no .toml file in this folder"]
+    errors = reader.errors if files else [f"{path}: no .toml file in this folder"]
+    return definition, [escape_controls(error) for error in errors]  # an error may quote any text of the definition
 
 
 def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:

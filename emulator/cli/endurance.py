@@ -188,7 +188,8 @@ def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -
 
 
 def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
-    """Write a life as JSON, as a session, and as the recording of its last time under power."""
+    """Write a life as JSON, as a session, and as the recording of its last time under power, if that can be repeated."""
+    from starhil.hil_tests.endurance.life import UNRECORDED
     from starhil.hil_tests.endurance.session_text import session_of
     from starhil.protocol.icd import load_unit
 
@@ -197,6 +198,8 @@ def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     file, session, recording = folder / f"{name}.json", folder / f"{name}.toml", folder / f"{name}-recording"
     file.write_text(json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n", encoding="utf-8")
     session.write_text(session_of(life, load_unit(life.unit), violation), encoding="utf-8")
+    if UNRECORDED & {step["do"] for step in life.steps}:
+        return [file, session]
     run_once(life, record=recording)
     return [file, session, recording]
 

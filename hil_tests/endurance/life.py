@@ -31,10 +31,13 @@ import math
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any, Final
 
+from starhil.hil_tests.endurance.violation import quantity_of
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.device_model import PARAMETER
 from starhil.protocol.values import Parameter, Value
 
 Step = dict[str, Any]
@@ -51,14 +54,37 @@ MOST_EVENTS_LONG: Final = {False: 40_000, True: 4000}
 LONG_UPDATE_RATE_HZ: Final = (0.01, 0.02)
 FLOOD: Final = (20_000, 40_000)
 """Limits of the number of requests in a flood."""
-USUAL_SHARE: Final = 0.75
+USUAL_SHARE: Final = 0.9
 """Share of values that are set to their default, so that the unit mostly works."""
 COUNTING: Final = ("counters.", "uptime", "clock.", "boot.count")
 """Beginnings of the quantities that count."""
+ACTION_WEIGHTS: Final = {
+    "set_parameter": 6.0,
+    **dict.fromkeys(("save_parameters", "restore_parameters", "default_parameters"), 2.0),
+}
+"""How often telecommands are sent that set any parameter, or all: as often as this many others."""
+ADDRESSES: Final = frozenset({"can_address", "serial_dialect"})
+"""Parameters that the OBC must follow to reach the unit."""
+ADDRESS_SHARE: Final = 0.2
+"""Share of these among the parameters that are set."""
+READ_BACK_SHARE: Final = 0.5
+"""Share of telecommands after which a row that reports their effect is read."""
+EFFECTS: Final = {
+    **dict.fromkeys(("set_parameters", "set_parameter", "select_parameter"), (PARAMETER, "selected.")),
+    **dict.fromkeys(("restore_parameters", "default_parameters"), (PARAMETER, "selected.")),
+    "set_clock": ("clock.",),
+    "set_mode": ("mode",),
+    "clear_counters": ("counters.",),
+}
+"""Beginnings of the quantities that report the effect of an action."""
 NMT_COMMANDS: Final = (0x01, 0x80)
 """Start the node, and enter pre-operational; in both states SDO works."""
 EDGE_CLOCKS_S: Final = (0, 2**31 - 2, 2**31, 2**32 - 2, 2**32, 1_767_225_600)
 """Clock settings next to the wraps of 2038 and 2106."""
+
+
+UNRECORDED: Final = frozenset({"disk", "end_pipeline"})
+"""Steps that a recording does not contain: it would be on the full disk itself, and has no events of the pipeline."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +137,7 @@ def make_life(
     }
     used = tuple(link for link in links if random_of_life.random() < 0.6) or (random_of_life.choice(links),)
     generator = LifeGenerator(icd, used, random_of_life, is_long=is_long)
-    return Life(unit, seed, used, profile, tuple(generator.steps(count)))
+    return Life(unit, seed, used, profile, tuple(islice(generator.steps(), count)))
 
 
 class LifeGenerator:
@@ -145,16 +171,20 @@ class LifeGenerator:
         self._attitude_rows = [
             row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)
         ]
-        self._count_rows = [
-            row
-            for row in self._telemetry
-            if any((field.value or "").startswith(COUNTING) for field in row.fields)
-        ]
+        self._count_rows = self._reporting(COUNTING)
+        self._effects = {
+            (row.klass, row.id, row.kind): self._reporting(EFFECTS.get(row.action or "", ()))
+            for row in self._telecommands
+        }
+        """Rows that report the effect of a telecommand."""
+        self._results = self._reporting(("request.", "counters."))
+        """Rows that report the result of any telecommand, an unknown one too."""
         self._stream_rows = [
             row for row in self._telecommands if row.action in ("select_unsolicited", "subscribe")
         ]
         self._clock_rows = [row for row in self._telecommands if row.action == "set_clock"]
         self._mode_rows = [row for row in self._telecommands if row.action == "set_mode"]
+        self._command_weights = [ACTION_WEIGHTS.get(row.action or "", 1.0) for row in self._telecommands]
         everything: list[tuple[float, Callable[[], Step]]] = [
             (30, self._wait),
             (16, self._read_any),
@@ -169,8 +199,8 @@ class LifeGenerator:
             (1, self._nmt),
             (5, self._truth),
             (4, self._fault),
-            (4, lambda: {"do": "clear"}),
-            (1.5, self._power),
+            (8, lambda: {"do": "clear"}),
+            (3, self._power),
             (0.5, lambda: {"do": "end_pipeline"}),
             (1, lambda: {"do": "disk", "full": self._random.random() < 0.5}),
             (0.5, self._peer),
@@ -190,11 +220,24 @@ class LifeGenerator:
         self._makers = [maker for _, maker in weighted]
         self._weights = [weight for weight, _ in weighted]
 
-    def steps(self, count: int) -> Iterator[Step]:
-        """Generate steps."""
-        for _ in range(count):
+    def steps(self) -> Iterator[Step]:
+        """Generate steps without end; the effect of a telecommand is often read back, as an OBC does."""
+        while True:
             (maker,) = self._random.choices(self._makers, self._weights)
-            yield maker()
+            step = maker()
+            yield step
+            row = tuple(step.get("row", ()))
+            effects = self._effects.get(row) or (self._results if "telecommand" in row else [])
+            if effects and self._random.random() < READ_BACK_SHARE:
+                yield self._request(self._random.choice(effects))
+
+    def _reporting(self, beginnings: tuple[str, ...]) -> list[Row]:
+        """Return the telemetry that reports a quantity with one of these beginnings."""
+        return [
+            row
+            for row in self._telemetry
+            if any(quantity_of(field).startswith(beginnings) for field in row.fields)
+        ]
 
     # --- time and requests ---
 
@@ -222,7 +265,7 @@ class LifeGenerator:
     def _command(self) -> Step:
         if not self._telecommands:
             return self._read_any()
-        row = self._random.choice(self._telecommands)
+        (row,) = self._random.choices(self._telecommands, self._command_weights)
         return self._request(row, row.encode(self._values(row), check=False))
 
     def _mode(self) -> Step:
@@ -302,7 +345,10 @@ class LifeGenerator:
     def _choose_parameter(self, row: Row, values: dict[str, Value]) -> None:
         """Set one parameter of the unit, mostly to a value within its limits."""
         by_argument = {field.argument: field for field in row.named_fields.values()}
-        parameter = self._random.choice(list(self._icd.parameters.values()))
+        parameters = list(self._icd.parameters.values())
+        if self._random.random() < ADDRESS_SHARE:
+            parameters = [known for known in parameters if known.name in ADDRESSES] or parameters
+        parameter = self._random.choice(parameters)
         number, value = by_argument.get("parameter"), by_argument.get("value")
         if number is not None and value is not None:
             values[number.name] = parameter.id
@@ -310,7 +356,7 @@ class LifeGenerator:
 
     def _parameter_value(self, parameter: Parameter) -> float:
         chance = self._random.random()
-        if chance < USUAL_SHARE:
+        if chance < USUAL_SHARE and parameter.name not in ADDRESSES:
             return parameter.to_number(parameter.default)
         if parameter.enum is not None:
             return float(self._random.choice(list(parameter.enum.values.values())))
@@ -426,7 +472,7 @@ class LifeGenerator:
         return {"do": "fault", "fault": self._random.choice(kinds)}
 
     def _power(self) -> Step:
-        return {"do": "power", "factory": self._random.random() < 0.2}
+        return {"do": "power", "factory": self._random.random() < 0.4}
 
     def _peer(self) -> Step:
         return {"do": "peer", "link": self._random.choice(self._links), "reads": self._random.random() < 0.6}

@@ -10,15 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violation import Violation
+from starhil.hil_tests.judge import canopen
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.rows import Row
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen.communication import TPDO_CAN_IDS
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary, in_order, span_of
-from starhil.protocol.canopen_schema import PackedField
-from starhil.protocol.codec import Field, Row
+from starhil.protocol.codec import Field
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import Value
 
@@ -28,34 +28,43 @@ DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes of the error mode (docs/canopen.md)."""
 STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
 """States in a heartbeat: boot-up, stopped, operational, pre-operational."""
+TPDO: Final = 0x1800
+"""Index of the communication record of the first TPDO."""
 
 Readings = dict[str, tuple[Field, Value]]
 
 
 @dataclass(frozen=True)
 class _Mapped:
-    """An entry of a TPDO: its size, and the field that it carries, possibly in a narrower type."""
+    """An entry of a TPDO: its size, and the field that it carries, possibly in a narrower type.
+
+    Attributes
+    ----------
+    fields
+        What the definition says of the fields of the row, by name.
+    """
 
     size: int
     row: Row
-    field: Field
-    packed: PackedField | None
+    name: str
+    packed: Any
+    fields: Mapping[str, Field]
 
     def read(self, data: bytes) -> Readings:
         """Return the quantities that are carried."""
-        packed, field = self.packed, self.field
+        packed, field, place = self.packed, self.fields[self.name], self.row.named[self.name]
         if packed is not None and packed.wrap:
             return {}
-        if packed is not None and field.width == 0:
+        if packed is not None and not place.width:
             raw = int.from_bytes(data, "little", signed=packed.type.startswith("i"))
             return {} if field.value is None else {field.value: (field, raw * packed.scale)}
         content = bytearray(self.row.size)
-        content[span_of(field.slot)] = in_order(field.slot, data)
+        content[place.offset : place.offset + place.size] = canopen.with_byte_order(place, data)
         values = self.row.decode(bytes(content))
         return {
-            other.value: (other, values[name])
-            for name, other in self.row.named_fields.items()
-            if other.slot.index == field.slot.index and other.value is not None
+            other.value: (self.fields[name], values[name])
+            for name, other in self.row.named.items()
+            if other.offset == place.offset and other.value is not None
         }
 
 
@@ -66,18 +75,19 @@ class Node:
     ----------
     icd
         Definition of the unit.
-    dictionary
-        Its object dictionary.
+    unit
+        The same in the judge's types.
     """
 
-    def __init__(self, icd: InterfaceDefinition, dictionary: DeviceDictionary) -> None:
+    def __init__(self, icd: InterfaceDefinition, unit: Unit) -> None:
         self._errors: Mapping[int, str] = icd.enum("device_error").names
         self._tpdos: dict[tuple[int, bool], list[_Mapped]] = {}
         """Entries by CAN ID, and whether the node ID is added to it."""
-        for number, model in enumerate(dictionary.layout.tpdo):
+        mapped = _mapped(icd, unit)
+        for number, model in enumerate(unit.canopen.tpdo):
             if model.enabled:
-                can_id = model.can_id or TPDO_CAN_IDS[number]
-                self._tpdos[can_id, model.relative] = [_mapped(dictionary, name) for name in model.objects]
+                can_id = canopen.pdo_can_id(0, TPDO + number, model)
+                self._tpdos[can_id, model.relative] = [mapped[name.lower()] for name in model.objects]
         self._together: Readings = {}
 
     def judge(self, frame: CanFrame, node: int, oracle: Oracle) -> int:
@@ -121,11 +131,24 @@ class Node:
             raise Violation(f"canopen: EMCY {code:04X}h in {', '.join(sorted(oracle.modes))}")
 
 
-def _mapped(dictionary: DeviceDictionary, name: str) -> _Mapped:
-    """Return the entry of a name as in the mapping of a definition, `INDEX.NAME` or `INDEX`."""
-    key = dictionary.key_of(name)
-    reading = dictionary.readings[key]
-    field, packed = reading.fields[0], reading.packed
-    if packed is not None and field.width == 0:
-        field = field.changed(kind="integer", scale=packed.scale)
-    return _Mapped(dictionary.entries[key].size or 0, reading.row, field, packed)
+def _mapped(icd: InterfaceDefinition, unit: Unit) -> Mapping[str, _Mapped]:
+    """Return the entries that carry a field, by their names in the mapping of a definition: `INDEX.NAME` or `INDEX`."""
+    sources = {
+        f"{placed.index:04x}.{packed.name or packed.source.partition('.')[2]}": packed
+        for placed in unit.canopen.object
+        for packed in placed.packed
+    }
+    found: dict[str, _Mapped] = {}
+    for entry in canopen.entries(unit, unit.canopen):
+        packed = sources.get(entry.name)
+        if packed is not None:
+            row_name, _, name = packed.source.partition(".")
+        elif entry.row is not None and entry.slot is not None:
+            row_name, name = entry.row.name, entry.slot.name
+        else:
+            continue
+        fields = dict(icd.telemetry[row_name].named_fields)
+        if packed is not None and not fields[name].width:
+            fields[name] = fields[name].changed(kind="integer", scale=packed.scale)
+        found[entry.name.lower()] = _Mapped(entry.size, unit.telemetry[row_name], name, packed, fields)
+    return found

@@ -15,7 +15,8 @@ from typing import Any, Final
 
 from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
 from starhil.hil_tests.endurance.truth import Motion
-from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
+from starhil.hil_tests.endurance.violation import Known, Violation, flag, quantity_of, resolution
+from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.device_model import PARAMETER
@@ -54,6 +55,7 @@ class Oracle:
         sigma_arcsec: tuple[float, float],
     ) -> None:
         self._icd = icd
+        self._judged = unit_of(icd)
         self._start_unix_ns = round(start_unix_s * SECOND_NS)
         calibrated = {"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"}
         self._defaults: dict[str, Known | None] = {
@@ -74,7 +76,6 @@ class Oracle:
         self.bursts = False
         """Whether packets of a file may arrive."""
         self.now_s = 0.0
-        self._has_imaged = False
         self._frames: int | None = None
         self._selected: int | None = None
         self._last: tuple[int, ErrorCode] | None = None
@@ -109,7 +110,9 @@ class Oracle:
             "frame.counter": self._check_frames,
             "frame.period": self._check_period,
             "selected.id": self._check_selected,
+            "selected.value": self._check_selected_value,
             "request.last": self._check_last,
+            "request.error": self._check_error,
         }
         self._start(0.0)
 
@@ -139,7 +142,6 @@ class Oracle:
             None if self._boot_count is None or self.disk_full else (self._boot_count + 1) & 0xFFFF
         )
         self._clock: tuple[float, int] | None = (at_s, self._start_unix_ns)
-        self._clock_set_s = at_s
         self._has_imaged = False
         self._frames = None
         self._selected = next(iter(self._icd.parameters_by_id), None)
@@ -196,11 +198,9 @@ class Oracle:
             return ErrorCode.INVALID_LENGTH if data else None if images else ErrorCode.OK
         if len(data) != row.size:
             return ErrorCode.INVALID_LENGTH
-        try:
-            values = row.decode(data)
-        except MessageError as error:
-            return error.code
-        arguments = _by_argument(row, values)
+        if self.is_outside(row, data):
+            return ErrorCode.INVALID_PARAMETER
+        arguments = self._arguments(row, data)
         match row.action:
             case "set_mode":
                 return self._mode_verdict(str(arguments.get("mode")))
@@ -219,6 +219,11 @@ class Oracle:
                 return ErrorCode.OK
             case _:
                 return None
+
+    def is_outside(self, row: Row | None, data: bytes) -> bool:
+        """Return whether a value of a telecommand is outside its limits."""
+        fields = () if row is None else self._judged.telecommands[row.name].named.values()
+        return any(field.fault(field.read(data)) for field in fields)
 
     def _mode_verdict(self, wanted: str) -> ErrorCode | None:
         votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
@@ -243,17 +248,28 @@ class Oracle:
         count = self.counts[name]
         self.counts[name] = None if count is None else (count + 1) & 0xFFFF
 
-    def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode) -> None:
-        """A telecommand was answered with a code."""
-        self._last = (row_id, code)
+    def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode, *, sure: bool) -> None:
+        """A telecommand was answered with a code, which is the one expected or not for sure."""
+        self._last = (row_id, code) if sure else None
         if row is None or code is not ErrorCode.OK:
             return
-        arguments = _by_argument(row, row.decode(data))
+        arguments = self._arguments(row, data)
         action = row.action or "nothing"
         if action in self._effects:
             self._effects[action](row, arguments)
         elif action not in _WITHOUT_EFFECT:
             self.forget()
+
+    def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
+        """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
+        values = self._judged.telecommands[row.name].decode(data)
+        found: dict[str, Any] = dict(row.arguments)
+        for name, field in row.named_fields.items():
+            value = values[name]
+            if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
+                value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)
+            found[field.argument or name] = value
+        return found
 
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
@@ -296,11 +312,11 @@ class Oracle:
         if self._icd.conventions.epoch_ns is None:  # the day is that of the clock
             self._clock = None
         else:
-            scales = {"unix": SECOND_NS, "seconds": SECOND_NS, "milliseconds": 10**6, "microseconds": 10**3}
-            scales["nanoseconds"] = 1
-            total = sum(round(float(arguments.get(name) or 0) * scale) for name, scale in scales.items())
+            total = sum(
+                round(float(arguments.get(name) or 0) * (factor(unit, "ns") or 1.0))
+                for name, unit in _CLOCK.items()
+            )
             self._clock = (self.now_s, total + self._icd.conventions.epoch_ns)
-        self._clock_set_s = self.now_s
 
     def _mode_commanded(self, _row: Row, arguments: Mapping[str, Any]) -> None:
         wanted = str(arguments["mode"])
@@ -319,25 +335,19 @@ class Oracle:
     def _burst_started(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
         self.bursts = True
 
-    def forget_last(self) -> None:
-        """The code with which the last telecommand was refused is not known."""
-        self._last = None
-
     # --- readings ---
 
     def read(self, row: Row, data: bytes) -> None:
         """Judge the telemetry of a row, received now."""
         if len(data) != row.size:
             raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
-        values = row.decode(data)
+        values = self._judged.telemetry[row.name].decode(data)
         by_quantity: dict[str, tuple[Field, Value]] = {}
         for name, value in values.items():
             field = row.named_fields[name]
-            quantity = PARAMETER + field.parameter if field.parameter else field.value
             if isinstance(value, float) and not math.isfinite(value):
                 raise Violation(f"{row.name}.{name}: {value}")
-            if quantity is not None:
-                by_quantity[quantity] = (field, value)
+            by_quantity[quantity_of(field)] = (field, value)
         self.judge(row.name, by_quantity)
         self.judge_attitude(row.name, by_quantity)
 
@@ -363,20 +373,16 @@ class Oracle:
                 self._set({name: (value, resolution(field))})
             return
         expected, tolerance = known
+        wrong = False
         if isinstance(expected, bool) or isinstance(value, bool):
-            if field.kind in ("flag", "integer", "bits", "enum") and flag(value) != flag(expected):
-                raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
+            wrong = field.kind in ("flag", "integer", "bits", "enum") and flag(value) != flag(expected)
         elif isinstance(expected, str) or isinstance(value, str):
-            if (
-                isinstance(value, str)
-                and isinstance(expected, str)
-                and not field.aliases
-                and value != expected
-            ):
-                raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
+            wrong = type(value) is type(expected) and not field.aliases and value != expected
         else:
             unit = self._icd.device_parameters[name].unit
             self._expect(where, field, value, float(expected) * (factor(unit, field.unit) or 1.0), tolerance)
+        if wrong:
+            raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
 
     def _expect(
         self, where: str, field: Field, value: Value, expected: float, tolerance: float = 0.0
@@ -462,39 +468,33 @@ class Oracle:
         if self._selected is not None:
             self._expect(where, field, value, self._selected)
 
+    def _check_selected_value(self, where: str, field: Field, value: Value) -> None:
+        parameter = None if self._selected is None else self._icd.parameters_by_id[self._selected]
+        known = None if parameter is None else self.values[parameter.name]
+        if parameter is not None and known is not None:
+            expected, tolerance = known
+            names = {} if parameter.enum is None else parameter.enum.values
+            self._expect(where, field, value, float(names.get(str(expected), expected)), tolerance)
+
     def _check_last(self, where: str, field: Field, value: Value) -> None:
         if self._last is not None:
             self._expect(where, field, value, self._last[0])
 
-
-def _by_argument(row: Row, values: Mapping[str, Value]) -> dict[str, Any]:
-    """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
-    found: dict[str, Any] = dict(row.arguments)
-    for name, field in row.named_fields.items():
-        value = values[name]
-        if field.argument in _TIME_UNITS and not isinstance(value, (str, bytes)):
-            value = float(value) * (factor(field.unit, _TIME_UNITS[field.argument]) or 1.0)
-        found[field.argument or name] = value
-    return found
+    def _check_error(self, where: str, _field: Field, value: Value) -> None:
+        if self._last is not None and isinstance(value, str) and value != self._last[1].name.lower():
+            raise Violation(f"{where}: {value}, not {self._last[1].name.lower()}")
 
 
 _RUNNING: Final = frozenset({"standby", *IMAGING})
 _COMMANDED: Final[dict[str, frozenset[str]]] = {"boot": frozenset(), "error": frozenset({"standby"})}
 """Modes that can be commanded from a mode; `_RUNNING` from all others."""
 _TIMING: Final = frozenset({"update_rate", "exposure", "delay_time"})
-_PAIRS: Final = frozenset(
-    {"min_star_pixels", "max_star_pixels", "orbit_semi_major_axis", "orbit_eccentricity"}
-)
-_BOUND: Final = _TIMING | _PAIRS
+_ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})
+_BOUND: Final = _TIMING | _ORBIT | {"min_star_pixels", "max_star_pixels"}
 """Parameters that bound each other, so that a value within its limits may be refused."""
 _WITHOUT_EFFECT: Final = frozenset(
     ["nothing", "reset", "save_image", "open_image", "load_image_chunk", "load_file_block", "set_hole_map"]
 )
 """Actions that leave what the oracle knows as it is."""
-_TIME_UNITS: Final = {
-    "unix": "s",
-    "seconds": "s",
-    "milliseconds": "ms",
-    "microseconds": "us",
-    "nanoseconds": "ns",
-}
+_CLOCK: Final = {"unix": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
+"""Units in which the arguments of `set_clock` are understood."""

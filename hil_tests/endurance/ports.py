@@ -1,26 +1,31 @@
-"""The OBC's end of each link of a unit in memory: requests out, answers in, each with the time at which it was sent."""
+"""The OBC's end of each link of a unit in memory: requests out, answers in, each with the time at which it was sent.
+
+Requests are encoded and answers decoded by the judge, not by the product's codecs, so that an error of a codec is seen.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import count
 from typing import Any, Final, Protocol
 
-from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_request_frames
-from starhil.protocol.canopen.abort import SdoAbortError
-from starhil.protocol.canopen.cob import SDO_RECEIVE, SDO_TRANSMIT
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary
-from starhil.protocol.canopen.sdo_client import ERROR_OF_ABORT, row_transfer
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
-from starhil.protocol.serial_stack import SerialStack
+from starhil.hil_tests.endurance.violation import Violation
+from starhil.hil_tests.judge import can, canopen
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Answer, Request
+from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.serial import SerialLine
+from starhil.protocol.can_framing import CanFrame
 
 HOST: Final = 1
 """CAN address of the OBC."""
-UNASKED: Final = frozenset({ReplyKind.UNSOLICITED, ReplyKind.EVENT, ReplyKind.BURST})
-"""Messages that come without a request, or after the answer to one."""
+SDO_RECEIVE, SDO_TRANSMIT = 0x600, 0x580
+"""Bases of the CAN IDs of SDO requests and responses (CiA 301 7.3.5)."""
 
-Heard = tuple[float, Reply | LinkFault]
+SDO_SIZE: Final = 8
+"""Bytes of each SDO request and response."""
+
+Heard = tuple[float, Answer]
 Deliver = Callable[[Any], None]
 Take = Callable[[], Sequence[tuple[float, Any]]]
 
@@ -28,8 +33,8 @@ Take = Callable[[], Sequence[tuple[float, Any]]]
 class Port(Protocol):
     """An OBC on one link."""
 
-    def ask(self, request: Request, reply_size: int) -> None:
-        """Send a request."""
+    def ask(self, *requests: Request) -> None:
+        """Send requests without a pause; raise ValueError for one that cannot be written."""
         ...
 
     def cut(self, request: Request, share: float) -> None:
@@ -42,53 +47,40 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """An OBC on a serial line; `answered` returns whether the unit answers a request there."""
+    """An OBC on a serial line.
 
-    def __init__(
-        self,
-        stack: SerialStack,
-        deliver: Deliver,
-        take: Take,
-        dialect: Dialect | None,
-        answered: Callable[[Request], bool],
-    ) -> None:
-        self._stack = stack
-        self._answered = answered
+    Attributes
+    ----------
+    dialect
+        Dialect of the answers, of a unit that has several.
+    """
+
+    def __init__(self, unit: Unit, deliver: Deliver, take: Take, dialect: str | None) -> None:
+        self._unit = unit
         self._deliver, self._take = deliver, take
-        self._expected: list[tuple[Request, int]] = []
-        self._receiver = stack.host(dialect)
+        self._line = SerialLine(unit, dialect)
+        self.dialect = self._line.dialect
 
-    def ask(self, request: Request, reply_size: int) -> None:
-        """Send a request."""
-        if self._answered(request):
-            self._expected.append((request, reply_size))
-            if len(self._expected) == 1:
-                self._receiver.expect(request, reply_size)
-        self._deliver(self._stack.encode_request(request))
+    def ask(self, *requests: Request) -> None:
+        """Send requests in one piece."""
+        try:
+            data = b"".join(self._line.encode(request) for request in requests)
+        except OverflowError as error:
+            raise ValueError(f"the header has no room: {error}") from None
+        for request in requests:
+            row = self._unit.row(request)
+            if row is None or row.name not in self._unit.unanswered:
+                self._line.expect(request)
+        self._deliver(data)
 
     def cut(self, request: Request, share: float) -> None:
         """Send the first bytes of a request."""
-        data = self._stack.encode_request(request)
+        data = self._line.encode(request)
         self._deliver(data[: max(1, int(share * len(data)))])
 
     def answers(self) -> list[Heard]:
         """Return what has arrived."""
-        found: list[Heard] = []
-        for at_s, chunk in self._take():
-            # byte by byte, because each reply determines what is expected next
-            for byte in chunk:
-                for event in self._receiver.feed(bytes((byte,)), at_s):
-                    found.append((at_s, event))
-                    self._expect_next(event)
-        return found
-
-    def _expect_next(self, event: Reply | LinkFault) -> None:
-        if not isinstance(event, Reply) or event.kind in UNASKED or not event.final:
-            return
-        if self._expected:
-            self._expected.pop(0)
-        if self._expected:
-            self._receiver.expect(*self._expected[0])
+        return [(at_s, answer) for at_s, chunk in self._take() for answer in self._line.feed(chunk)]
 
 
 class CanPort:
@@ -97,22 +89,49 @@ class CanPort:
     def __init__(self, deliver: Deliver, take: Take, device: int) -> None:
         self._deliver, self._take = deliver, take
         self.device = device
-        self._receiver = CanHostReceiver(HOST, device)
 
-    def ask(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 (the same for all)
-        """Send a request."""
-        for frame in encode_request_frames(request, HOST, self.device):
-            self._deliver(frame)
+    def _frames(self, request: Request) -> list[CanFrame]:
+        return [CanFrame(can_id, data) for can_id, data in can.frames_of(request, HOST, self.device)]
+
+    def ask(self, *requests: Request) -> None:
+        """Send requests without a pause."""
+        for request in requests:
+            for frame in self._frames(request):
+                self._deliver(frame)
 
     def cut(self, request: Request, share: float) -> None:
         """Send the first frames of a request, none if it has only one."""
-        frames = encode_request_frames(request, HOST, self.device)
+        frames = self._frames(request)
         for frame in frames[: int(share * len(frames))]:
             self._deliver(frame)
 
     def answers(self) -> list[Heard]:
-        """Return what has arrived."""
-        return [(at_s, event) for at_s, frame in self._take() for event in self._receiver.feed(frame, at_s)]
+        """Return what has arrived; a frame between other addresses is malformed."""
+        taken = list(self._take())
+        asked = iter([item for item in taken if item[1].id >> 24 not in can.UNSOLICITED])
+        found = []
+        for at_s, frame in asked:
+            if frame.id & 0xFFFF == self.device << 8 | HOST:
+                answer = can.read_answer(frame, lambda: next(asked, (0.0, None))[1])
+            else:
+                answer = Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
+            found.append((at_s, answer))
+        for instant in dict.fromkeys(at_s for at_s, _ in taken):
+            frames = [frame for at_s, frame in taken if at_s == instant and frame.id >> 24 in can.UNSOLICITED]
+            found += [(instant, answer) for answer in can.unsolicited(frames)]
+        return found
+
+
+class _TransferEndedError(Exception):
+    """A transfer that the node aborts, or does not answer: code 0."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(code)
+        self.code = code
+
+
+Objects = dict[tuple[str, str], list[canopen.Entry]]
+"""The entries through which each row is read or executed, by kind and name of the row."""
 
 
 class CanopenPort:
@@ -124,41 +143,78 @@ class CanopenPort:
         Node ID of the unit.
     """
 
-    def __init__(
-        self, icd: InterfaceDefinition, dictionary: DeviceDictionary, deliver: Deliver, take: Take, node: int
-    ) -> None:
-        self._icd = icd
-        self._dictionary = dictionary
+    def __init__(self, unit: Unit, objects: Objects, deliver: Deliver, take: Take, node: int) -> None:
+        self._unit, self._objects = unit, objects
         self._deliver, self._take = deliver, take
         self.node = node
         self._answers: list[Heard] = []
         self._others: list[tuple[float, CanFrame]] = []
         self._at_s = 0.0
 
-    def ask(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 (the same for all)
-        """Run the transfers of a request to their end; the node answers each at once."""
-        row = self._icd.rows_by_key[request.klass, request.id]
-        transfer = row_transfer(self._dictionary, row, request.data)
-        try:
-            data = next(transfer)
-            while (response := self._exchange(data)) is not None:
-                data = transfer.send(response)
-        except StopIteration as done:
-            kind = ReplyKind.ACK if row.kind == "telecommand" else ReplyKind.TELEMETRY
-            self._answers.append((self._at_s, Reply(kind, request.id, done.value, klass=request.klass)))
-        except SdoAbortError as abort:
-            code = self._icd.error_number(ERROR_OF_ABORT.get(abort.code, ErrorCode.INTERNAL))
-            self._answers.append(
-                (self._at_s, Reply(ReplyKind.NACK, request.id, code=code, klass=request.klass))
-            )
+    def ask(self, *requests: Request) -> None:
+        """Run the transfers of requests to their end; the node answers each at once."""
+        for request in requests:
+            row = self._unit.row(request)
+            if row is None:
+                raise ValueError(f"{request}: no such row")
+            try:
+                answer = Answer("telemetry", data=self._read(row)) if row.is_telemetry else Answer("ack")
+                if not row.is_telemetry:
+                    (entry,) = self._objects[row.kind, row.name]
+                    self._download(entry, canopen.written(entry, row, request.data))
+            except _TransferEndedError as ended:
+                if not ended.code:
+                    continue
+                answer = Answer("nack", ended.code)
+            self._answers.append((self._at_s, answer))
 
     def cut(self, request: Request, share: float) -> None:
         """Send nothing: the next transfer of a client aborts an incomplete one."""
 
-    def _exchange(self, data: bytes) -> bytes | None:
-        self._deliver(CanFrame(SDO_RECEIVE + self.node, data, extended=False))
+    def _read(self, row: Row) -> bytes:
+        data = bytearray(row.size)
+        for entry in self._objects[row.kind, row.name]:
+            value = self._upload(entry)
+            if entry.slot is None:  # the whole row
+                return value
+            slot = entry.slot
+            piece = canopen.with_byte_order(slot, value).ljust(
+                slot.size, b"\0"
+            )  # a text ends before its NULs
+            data[slot.offset : slot.offset + slot.size] = piece
+        return bytes(data)
+
+    def _upload(self, entry: canopen.Entry) -> bytes:
+        data = canopen.expedited_data(self._exchange(canopen.upload_request(entry.index, entry.subindex)))
+        if data is not None:
+            return data
+        data = b""
+        for number in count():
+            piece, is_last = canopen.segment_data(
+                self._exchange(canopen.segment_request(0x10 * (number % 2)))
+            )
+            data += piece
+            if is_last:
+                break
+        return data
+
+    def _download(self, entry: canopen.Entry, data: bytes) -> None:
+        if len(data) <= canopen.EXPEDITED:
+            self._exchange(canopen.expedited_download(entry.index, entry.subindex, data))
+            return
+        for request in canopen.segmented_download(entry.index, entry.subindex, data):
+            self._exchange(request)
+
+    def _exchange(self, data: bytes) -> bytes:
+        self._deliver(CanFrame(SDO_RECEIVE + self.node, data.ljust(SDO_SIZE, b"\0"), extended=False))
         responses = self._sort()
-        return responses[0].ljust(8, b"\0") if responses else None
+        if not responses:
+            raise _TransferEndedError(0)
+        if len(responses) > 1 or len(responses[0]) != SDO_SIZE:
+            raise Violation(f"canopen: {b' '.join(responses).hex(' ')} in answer to the SDO {data.hex(' ')}")
+        if responses[0][0] == canopen.ABORT:
+            raise _TransferEndedError(canopen.abort_code(responses[0]))
+        return responses[0]
 
     def _sort(self) -> list[bytes]:
         """Return the data of the SDO responses that have arrived, and keep all other frames."""
@@ -185,3 +241,30 @@ class CanopenPort:
     def set_state(self, command: int) -> None:
         """Send an NMT command to the node."""
         self._deliver(CanFrame(0x000, bytes((command, self.node)), extended=False))
+
+
+def objects_of(unit: Unit) -> Objects:
+    """Return the entries of the rows that SDO reaches: one for a whole row, or one for each place of telemetry."""
+    layout = unit.canopen
+    records = [placed.index for placed in layout.object if placed.requests]
+    if records:
+        return {
+            (row.kind, row.name): [
+                canopen.Entry(
+                    records[0], row.id, row.name, row.size, command=None if row.is_telemetry else row
+                )
+            ]
+            for row in unit.rows
+        }
+    every = list(canopen.entries(unit, layout))
+    found: Objects = {}
+    for row in unit.rows:
+        held = {
+            item.slot.offset: item for item in reversed(every) if item.row is row and item.slot is not None
+        }
+        setters = [item for item in every if item.command is row]
+        if row.is_telemetry and held.keys() >= {place.offset for place in canopen.places(row)} and held:
+            found[row.kind, row.name] = list(held.values())
+        elif setters and (setters[0].part is None or len(canopen.places(row)) == 1):
+            found[row.kind, row.name] = setters[:1]
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from starhil.protocol.codec import Field
+from starhil.protocol.device_model import PARAMETER
 from starhil.protocol.values import Value
 
 Known = tuple[Value, float]
@@ -16,6 +17,11 @@ class Violation(Exception):  # noqa: N818 (what it is called)
 def flag(value: Value) -> bool:
     """Return a truth value that may have been sent as a member of an enumeration."""
     return value == "true" if isinstance(value, str) else bool(value)
+
+
+def quantity_of(field: Field) -> str:
+    """Return the quantity that a field reports; empty if it reports none."""
+    return PARAMETER + field.parameter if field.parameter else field.value or ""
 
 
 def resolution(field: Field) -> float:

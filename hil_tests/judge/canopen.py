@@ -44,6 +44,15 @@ def expedited_download(index: int, subindex: int, data: bytes) -> bytes:
     return bytes([0x23 | (EXPEDITED - len(data)) << 2]) + multiplexer(index, subindex) + data
 
 
+def segmented_download(index: int, subindex: int, data: bytes) -> Iterator[bytes]:
+    """Yield the requests that write an object of more than 4 bytes: its size, then 7 bytes at a time."""
+    yield bytes([0x21]) + multiplexer(index, subindex) + len(data).to_bytes(4, "little")
+    pieces = [data[start : start + 7] for start in range(0, len(data), 7)]
+    for number, piece in enumerate(pieces):
+        last = number == len(pieces) - 1
+        yield bytes([0x10 * (number % 2) | 7 - len(piece) << 1 | last]) + piece
+
+
 def expedited_data(answer: bytes) -> bytes | None:
     """Return the data in the answer to a read, or None if segments follow."""
     return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & 0x02 else None

@@ -70,14 +70,20 @@ class Header:
         return sum(_size(model) for model in self._in(klass))
 
     def write(self, values: Mapping[str, int], klass: str, data_size: int) -> bytes:
-        """Return the header of a message; a role without a value has its default."""
+        """Return the header of a message; a role without a value has its default.
+
+        Raises OverflowError for a value that does not fit its field.
+        """
         line = b""
         for model in self._in(klass):
             number = 0
             if model.bits:
                 shift = 0
                 for bit in model.bits:
-                    number |= _sent(bit, values) << shift
+                    value = _sent(bit, values)
+                    if value >> bit.width:
+                        raise OverflowError(f"{bit.role} {value} does not fit {bit.width} bits")
+                    number |= value << shift
                     shift += bit.width
             elif model.role == "length":
                 number = self._counted(model, self.size(klass), data_size)

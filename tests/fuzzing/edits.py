@@ -14,12 +14,17 @@ HOSTILE: tuple[Any, ...] = (
 )  # fmt: skip
 
 
+MOST_SPOTS = 20_000
+DEEPEST = 60
+"""Values copied into each other could grow without limit."""
+
+
 def edited(document: Any, data: bytes) -> Any:
     """Return a copy of a document with an edit for each four bytes: path (2), kind, value."""
     document = copy.deepcopy(document)
     for start in range(0, len(data) - 3, 4):
         spots = list(_spots(document))
-        if not spots:
+        if not 0 < len(spots) <= MOST_SPOTS or _depth(document) > DEEPEST:
             break
         number, kind, value = data[start] << 8 | data[start + 1], data[start + 2], data[start + 3]
         holder, key = spots[number % len(spots)]
@@ -52,6 +57,11 @@ def _spots(document: Any) -> Any:
         yield document, key
         if isinstance(value, (dict, list)):
             yield from _spots(value)
+
+
+def _depth(value: Any) -> int:
+    items = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return 1 + max(map(_depth, items), default=0)
 
 
 def toml(document: dict[str, Any]) -> bytes:

@@ -2,20 +2,23 @@
 
 import asyncio
 from dataclasses import asdict, replace
+from itertools import pairwise
 
 import pytest
 
-from starhil.emulator.cli.endurance import live, read_life, run_once
+from starhil.emulator.cli.endurance import live, read_life, run_once, write_life
 from starhil.emulator.device.counters import Counters
 from starhil.emulator.device.cycle import FrameCycle
+from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.replay import replay
-from starhil.hil_tests.endurance.life import Life, make_life
+from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.shrink import kind_of, shortened
 from starhil.hil_tests.endurance.truth import Error, Motion
+from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
 from starhil.protocol.unit_folders import bundled_units
 
@@ -211,9 +214,86 @@ def test_a_late_exposure_is_no_error_along_the_motion():
     assert abs(error.along(motion.rate_rad_s, 0.1).y) == pytest.approx(0.002)
 
 
+def test_a_life_with_a_full_disk_is_written_without_a_recording(tmp_path):
+    steps = ({"do": "disk", "full": True}, {"do": "power", "factory": False}, READ_MODE)
+    files = write_life(Life("cubestar", 1, ("serial",), {}, steps), "a violation", tmp_path)
+    assert [path.name for path in files] == ["cubestar-1.json", "cubestar-1.toml"]
+    assert read_life(files[0]).steps == steps
+
+
 def test_the_recording_of_a_life_is_repeated_to_the_byte(tmp_path):
-    outcome = run_once(life_of("sagitta", 7, 60), record=tmp_path / "recording")
+    life = life_of("sagitta", 7, 60)
+    life = replace(life, steps=tuple(step for step in life.steps if step["do"] not in UNRECORDED))
+    outcome = run_once(life, record=tmp_path / "recording")
     assert outcome.violation == ""
     report = asyncio.run(replay(tmp_path / "recording"))
     assert report.differences == []
     assert report.sent["serial"] > 0
+
+
+def request_on(link, row, data=""):
+    return {"do": "request", "link": link, "row": ["", row.id, row.kind], "data": data}
+
+
+def violation_of(*steps, links=("serial", "canopen"), profile=None):
+    return run_once(Life("cubestar", 1, links, profile or {}, steps)).violation
+
+
+def test_a_value_that_the_object_dictionary_rejects_is_no_telecommand():
+    icd = load_unit("cubestar")
+    reset = icd.telecommands["reset"]
+    assert (
+        violation_of(
+            request_on("canopen", reset, "e9"),
+            request_on("serial", icd.telemetry["communication_status"]),
+            request_on("serial", icd.telemetry["acknowledge"]),
+        )
+        == ""
+    )
+
+
+def test_one_byte_of_data_is_not_taken_for_a_refusal():
+    row = load_unit("cubestar").telemetry["card_progress"]
+    assert row.size == 1
+    assert violation_of(request_on("serial", row, "be75")) == ""
+
+
+def test_a_parameter_is_followed_by_its_selection(monkeypatch):
+    monkeypatch.setitem(QUANTITIES, "selected.value", lambda _shot: 1.0)
+    icd = load_unit("cubestar")
+    select = icd.telecommands["select_parameter"]
+    data = select.encode({"parameter": icd.parameters["exposure"].id}).hex()
+    found = violation_of(request_on("serial", select, data), request_on("serial", icd.telemetry["parameter"]))
+    assert found == "parameter.value: 1.0, not 100.0"
+
+
+def test_a_result_that_is_not_that_of_the_last_telecommand_is_found(monkeypatch):
+    monkeypatch.setitem(QUANTITIES, "request.error", lambda _shot: "ok")
+    icd = load_unit("cubestar")
+    unknown = {"do": "request", "link": "serial", "row": ["", 60, "telecommand"]}
+    found = violation_of(unknown, request_on("serial", icd.telemetry["acknowledge"]))
+    assert found == "acknowledge.error: ok, not invalid_id"
+
+
+def test_what_a_telecommand_sets_is_often_read_back():
+    icd = load_unit("cubestar")
+    clock = ["", icd.telecommands["set_unix_time"].id, "telecommand"]
+    shown = [
+        ["", row.id, row.kind]
+        for row in icd.telemetry.values()
+        if any((field.value or "").startswith("clock.") for field in row.fields)
+    ]
+    after = [
+        following.get("row") in shown
+        for step, following in pairwise(life_of("cubestar", 1, 4000).steps)
+        if step.get("row") == clock and step["do"] == "request"
+    ]
+    assert sum(after) > 0.3 * len(after) > 0
+
+
+def test_an_error_that_both_ends_of_the_codec_share_is_found(monkeypatch):
+    encode, decode = Row.encode, Row.decode
+    monkeypatch.setattr(Row, "encode", lambda row, *values, **options: encode(row, *values, **options)[::-1])
+    monkeypatch.setattr(Row, "decode", lambda row, data, **options: decode(row, data[::-1], **options))
+    status = load_unit("cubestar").telemetry["device_status"]
+    assert violation_of(request_on("serial", status)).startswith("device_status.")

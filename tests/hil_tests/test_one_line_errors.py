@@ -1,0 +1,16 @@
+"""Each error of a session script is one line, whatever names it quotes."""
+
+import pytest
+
+from starhil.hil_tests.errors import ScriptError
+from starhil.hil_tests.script import load_script
+from starhil.protocol.icd import load_unit
+
+
+@pytest.mark.parametrize("row", ["quater\\nnion", "quaternion\\u2028"])
+def test_an_unknown_row_with_a_line_break_is_named_in_one_line(tmp_path, row):
+    path = tmp_path / "session.toml"
+    path.write_text(f'title = "t"\n[[step]]\nname = "s"\nread = "{row}"\n')
+    with pytest.raises(ScriptError, match="unknown telemetry row") as caught:
+        load_script(path, load_unit("cubestar"))
+    assert len(str(caught.value).splitlines()) == 1
