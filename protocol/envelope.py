@@ -108,7 +108,8 @@ class Header:
             _field(model, byte_order, f"{where}: {number}") for number, model in enumerate(models, 1)
         )
         self._classes = classes
-        self._overhead = overhead
+        self.overhead: Final = overhead
+        """Sizes of `start`, `check` and `end`."""
         self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
         """Roles that the header carries in any class of messages."""
         self.defaults: Final = {
@@ -201,7 +202,7 @@ class Header:
         return data
 
     def _counted(self, field: HeaderField, header_size: int, data_size: int) -> int:
-        sizes = {**self._overhead, "header": header_size, "data": data_size}
+        sizes = {**self.overhead, "header": header_size, "data": data_size}
         return sum(sizes[part] for part in field.includes)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import suppress
 from typing import Final
 
-from starhil.protocol.canopen.abort import ABORT_TEXTS, AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, Key, in_order, span_of
 from starhil.protocol.codec import Row, Slot
 from starhil.protocol.messages import ErrorCode
@@ -111,7 +111,7 @@ def _checked(answer: bytes) -> bytes:
     """Return an answer if it has 8 bytes and is not an abort."""
     if answer[0] == _ABORT:
         number = int.from_bytes(answer[4:], "little")
-        if number in ABORT_TEXTS:
+        if number in set(AbortCode):
             raise SdoAbortError(AbortCode(number))
         raise SdoAbortError(AbortCode.GENERAL, f"code 0x{number:08X}")
     return answer
