@@ -69,10 +69,7 @@ def download(index: int, subindex: int, data: bytes) -> SdoTransfer:
 def row_transfer(dictionary: DeviceDictionary, row: Row, data: bytes = b"") -> SdoTransfer:
     """Execute a telecommand with its data, or read a telemetry row, through the entries that hold it.
 
-    Raises
-    ------
-    IcdError
-        The object dictionary does not hold the row.
+    Raises IcdError: the object dictionary does not hold the row.
     """
     entries = dictionary.entries_of(row)
     if row.kind == "telemetry":
