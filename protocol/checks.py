@@ -44,10 +44,7 @@ def build_check(
 ) -> Check:
     """Return the check that a definition selects; `custom` holds the plugin's checks by name.
 
-    Raises
-    ------
-    IcdError
-        A value does not fit the check's width, or the plugin has no check of that name.
+    Raises IcdError: a value does not fit the check's width, or the plugin has no check of that name.
     """
     if isinstance(model, NoCheck):
         return NO_CHECK

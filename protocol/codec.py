@@ -402,10 +402,7 @@ class Row(RowKeys):
             Whether to clip numbers to the limits, or wrap counters, instead of rejecting them, as a unit does
             in telemetry.
 
-        Raises
-        ------
-        FieldError
-            A value is invalid; the text names row.field, the value and the allowed values.
+        Raises FieldError: a value is invalid; the text names row.field, the value and the allowed values.
         """
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import datetime as dt
 from functools import cached_property
-from typing import Annotated, Final, Literal
+from typing import Final, Literal
 
-from pydantic import Field, Strict, field_validator
+from pydantic import Field, field_validator
 from pydantic_core import PydanticCustomError
 
 from starhil.protocol.values import DefinitionModel
@@ -19,7 +19,7 @@ EPOCHS: Final = {"unix": "1970-01-01", "gps": "1980-01-06", "j2000": "2000-01-01
 
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 Order = Literal["little", "big"]
-SENSOR_AXES: Final[tuple[Axis, ...]] = ("+x", "+y", "+z")
+SENSOR_AXES: Final[list[Axis]] = ["+x", "+y", "+z"]
 
 
 class Conventions(DefinitionModel):
@@ -30,7 +30,7 @@ class Conventions(DefinitionModel):
     scalar_sign: Literal["positive", "any"] = "positive"
     """`positive`: the scalar part is never negative; `any`: the sign that gives the quaternion closer to the
     last reported one."""
-    axes: Annotated[tuple[Axis, ...], Strict(strict=False), Field(min_length=3, max_length=3)] = SENSOR_AXES
+    axes: list[Axis] = Field(default=SENSOR_AXES, min_length=3, max_length=3)
     """Axes of the reported frame in the sensor frame (+x right in the image, +y down, +z boresight)."""
     epoch: str = "unix"
     """Epoch of all times: `unix`, `gps`, `j2000`, `midnight` (of the current day), or a date such as
@@ -43,7 +43,7 @@ class Conventions(DefinitionModel):
 
     @field_validator("axes")
     @classmethod
-    def _right_handed(cls, axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
+    def _right_handed(cls, axes: list[Axis]) -> list[Axis]:
         (a, b, c), (d, e, f), (g, h, i) = (_row(axis) for axis in axes)
         if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) != 1:
             raise PydanticCustomError(

@@ -13,10 +13,7 @@ def replace_durably(path: Path, data: bytes) -> None:
     Only one process at a time may do so: the temporary file has a fixed name, so that interrupted calls leave
     at most one.
 
-    Raises
-    ------
-    OSError
-        The file cannot be written; the old one remains.
+    Raises OSError: the file cannot be written; the old one remains.
     """
     temporary = path.with_name(f"{path.name}.new")
     try:

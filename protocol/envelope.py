@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import accumulate
 from typing import Final
 
 from starhil.protocol.conventions import Order
@@ -20,29 +22,34 @@ class HeaderError(ProtocolError):
     """A header that is invalid for this unit."""
 
 
-@dataclass(frozen=True)
-class _Bit:
-    role: str | None
+class HeaderBit(HeaderBitModel):
+    """Bits of a header field: their keys and their place."""
+
+    default: int
     shift: int
-    mask: int
-    const: int | None
+
+    @property
+    def mask(self) -> int:
+        """Highest value."""
+        return (1 << self.width) - 1
+
+
+class HeaderField(HeaderFieldModel):
+    """One field of a header: its keys, with the defaults of the unit."""
+
     default: int
-
-
-@dataclass(frozen=True)
-class HeaderField:
-    """One field of a header."""
-
-    role: str | None
-    size: int
     order: Order
-    signed: bool
-    const: int | None
-    default: int
-    scale: float
-    includes: frozenset[str]
-    classes: frozenset[str] | None
-    bits: tuple[_Bit, ...]
+    bits: list[HeaderBit]  # type: ignore[assignment]  # read only
+
+    @cached_property
+    def size(self) -> int:
+        """Number of bytes."""
+        return SCALAR_SIZES[self.type.replace("bits", "u")]
+
+    @property
+    def signed(self) -> bool:
+        """Whether the type is signed."""
+        return self.type.startswith("i")
 
     @property
     def roles(self) -> tuple[str, ...]:
@@ -108,7 +115,8 @@ class Header:
             _field(model, byte_order, f"{where}: {number}") for number, model in enumerate(models, 1)
         )
         self._classes = classes
-        self._overhead = overhead
+        self.overhead: Final = overhead
+        """Sizes of `start`, `check` and `end`."""
         self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
         """Roles that the header carries in any class of messages."""
         self.defaults: Final = {
@@ -201,48 +209,39 @@ class Header:
         return data
 
     def _counted(self, field: HeaderField, header_size: int, data_size: int) -> int:
-        sizes = {**self._overhead, "header": header_size, "data": data_size}
+        sizes = {**self.overhead, "header": header_size, "data": data_size}
         return sum(sizes[part] for part in field.includes)
 
 
-def _bit_value(bit: _Bit, values: Mapping[str, int]) -> int:
+def _bit_value(bit: HeaderBit, values: Mapping[str, int]) -> int:
     value = bit.default if bit.role is None else values.get(bit.role, bit.default)
     if not 0 <= value <= bit.mask:
-        raise ProtocolError(
-            f"header: {bit.role or 'constant'} {value} does not fit {bit.mask.bit_length()} bits"
-        )
+        raise ProtocolError(f"header: {bit.role or 'constant'} {value} does not fit {bit.width} bits")
     return value
 
 
 def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderField:
-    size = SCALAR_SIZES[model.type.replace("bits", "u")]
     if bool(model.bits) != model.type.startswith("bits"):
         raise IcdError(f"{where}: types bits8, bits16 and bits32 have `bits`, the other types have none")
     if model.role in ("ticks", "time") and round(model.scale * NANOSECONDS) < 1:
         raise IcdError(f"{where}: scale {model.scale:g} s is below a nanosecond")
     if model.role is None and model.const is None and model.default is None and not model.bits:
         raise IcdError(f"{where}: needs a role, or `const` or `default`")
-    return HeaderField(
-        role=model.role,
-        size=size,
-        order=model.order or byte_order,
-        signed=model.type.startswith("i"),
-        const=model.const,
-        default=model.const if model.const is not None else model.default or 0,
-        scale=model.scale,
-        includes=frozenset(model.includes),
-        classes=None if model.classes is None else frozenset(model.classes),
-        bits=_bits(model.bits, 8 * size, where),
-    )
+    given = {"default": _default(model), "order": model.order or byte_order}
+    field = HeaderField.model_construct(**dict(model) | given | {"bits": _bits(model.bits)})
+    width = sum(bit.width for bit in field.bits)
+    if field.bits and width != 8 * field.size:
+        raise IcdError(f"{where}: the bits add up to {width}, must be {8 * field.size}")
+    return field
 
 
-def _bits(models: Sequence[HeaderBitModel], width: int, where: str) -> tuple[_Bit, ...]:
-    bits = []
-    shift = 0
-    for model in models:
-        default = model.const if model.const is not None else model.default or 0
-        bits.append(_Bit(model.role, shift, (1 << model.width) - 1, model.const, default))
-        shift += model.width
-    if models and shift != width:
-        raise IcdError(f"{where}: the bits add up to {shift}, must be {width}")
-    return tuple(bits)
+def _bits(models: Sequence[HeaderBitModel]) -> list[HeaderBit]:
+    shifts = accumulate((model.width for model in models), initial=0)
+    return [
+        HeaderBit.model_construct(**dict(model) | {"default": _default(model), "shift": shift})
+        for model, shift in zip(models, shifts, strict=False)
+    ]
+
+
+def _default(model: HeaderFieldModel | HeaderBitModel) -> int:
+    return model.const if model.const is not None else model.default or 0

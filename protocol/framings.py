@@ -95,19 +95,21 @@ class _Collector(Deframer[_Message]):
     def flush(self, now: float) -> list[LinkFault]:
         if now - self._last_time < self._timeout_s:
             return []
-        size = self._abandon()
-        if not size:
-            return []
+        fault = self._abandon()
+        return [] if fault is None else [fault]
+
+    def _incomplete(self, size: int) -> LinkFault:
+        """Return the fault of an incomplete message with this number of bytes."""
         text = f"message of {size} bytes without end after {self._timeout_s:g} s of silence"
-        return [LinkFault(FaultKind.UART_INCOMPLETE, text)]
+        return LinkFault(FaultKind.UART_INCOMPLETE, text)
 
     @abstractmethod
     def _consume(self, data: bytes) -> None:
         """Process bytes and add the messages and faults that they complete."""
 
     @abstractmethod
-    def _abandon(self) -> int:
-        """Drop the buffer; return the number of bytes of an incomplete message that has not been reported."""
+    def _abandon(self) -> LinkFault | None:
+        """Drop the buffer; return the fault of an incomplete message that has not been reported."""
 
     def _add(self, result: _Message | LinkFault | None) -> None:
         if result is not None:
@@ -220,11 +222,11 @@ class _SlipDeframer(_Collector[_Message]):
         else:
             self._add(body)
 
-    def _abandon(self) -> int:
+    def _abandon(self) -> LinkFault | None:
         size = len(self._frame)
         self._frame.clear()
         self._skipping = False
-        return size
+        return self._incomplete(size) if size else None
 
 
 class Escaped(Framing):
@@ -277,17 +279,14 @@ class _State(Enum):
     BODY_ESCAPED = auto()
 
 
-class EscapedDeframer(Deframer[_Message]):
+class EscapedDeframer(_Collector[_Message]):
     """Finds bodies between starts and ends; each run of junk yields one fault.
 
     A run of junk ends at the next start of a message or after a silence of the timeout.
     """
 
     def __init__(self, receiving: Receiving[_Message], framing: Escaped) -> None:
-        check_receiver_limits(receiving.max_size, receiving.timeout_s)
-        self._interpret = receiving.interpret
-        self._max_size = receiving.max_size
-        self._timeout_s = receiving.timeout_s
+        super().__init__(receiving)
         self._several = bool(framing.starts)
         self._starts = framing.starts or frozenset(framing.start[1:])
         self._escape = framing.escape[0]
@@ -297,40 +296,23 @@ class EscapedDeframer(Deframer[_Message]):
         self._start = 0
         self._body = bytearray()
         self._in_junk = False
-        self._last_time = float("-inf")
-        self._events: list[_Message | LinkFault] = []
 
     @property
     def busy(self) -> bool:
         """Whether a message is incomplete."""
         return self._state not in (_State.IDLE, _State.IDLE_ESCAPED)
 
-    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
-        self._events = list(self.flush(now))
-        if data:
-            self._last_time = now
+    def _consume(self, data: bytes) -> None:
         position = 0
         while position < len(data):
             position = self._advance(data, position)
-        return self._events
 
-    def flush(self, now: float) -> list[LinkFault]:
-        """Abandon an incomplete message after a silence of the timeout."""
-        if now - self._last_time < self._timeout_s:
-            return []
+    def _abandon(self) -> LinkFault | None:
         state, in_junk, size = self._state, self._in_junk, len(self._body)
         self._reset(in_junk=False)
-        if state is _State.IDLE:
-            return []
-        if state is _State.IDLE_ESCAPED:
-            return (
-                []
-                if in_junk
-                else [LinkFault(FaultKind.UART_PROTOCOL, f"escape byte {self._escape:02X} outside a message")]
-            )
-        text = f"message of {size} bytes without end after {self._timeout_s:g} s of silence"
-        return [LinkFault(FaultKind.UART_INCOMPLETE, text)]
+        if state is _State.IDLE_ESCAPED and not in_junk:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"escape byte {self._escape:02X} outside a message")
+        return None if state in (_State.IDLE, _State.IDLE_ESCAPED) else self._incomplete(size)
 
     def _advance(self, data: bytes, position: int) -> int:
         """Process one byte, or all up to the next escape byte; return the position after it."""
@@ -361,7 +343,7 @@ class EscapedDeframer(Deframer[_Message]):
         if self.busy:
             self._body += run
             if len(self._body) > self._max_size:
-                self._abandon(FaultKind.UART_OVERLONG, f"message longer than {self._max_size} bytes")
+                self._drop_message(self._overlong())
         else:
             self._report_junk(run[0])
 
@@ -390,18 +372,17 @@ class EscapedDeframer(Deframer[_Message]):
             self._deliver(body)
         elif byte in self._starts:
             text = f"message of {len(self._body)} bytes interrupted by the start of another"
-            self._events.append(LinkFault(FaultKind.UART_INCOMPLETE, text))
+            self._fault(FaultKind.UART_INCOMPLETE, text)
             self._start_message(byte)
         else:
-            self._abandon(FaultKind.UART_PROTOCOL, f"byte {byte:02X} after an escape byte within a message")
+            text = f"byte {byte:02X} after an escape byte within a message"
+            self._drop_message(LinkFault(FaultKind.UART_PROTOCOL, text))
 
     def _deliver(self, body: bytes) -> None:
         if not body:
-            self._events.append(LinkFault(FaultKind.UART_PROTOCOL, "message without an ID"))
-            return
-        message = self._interpret(bytes((self._start,)) + body if self._several else body)
-        if message is not None:
-            self._events.append(message)
+            self._fault(FaultKind.UART_PROTOCOL, "message without an ID")
+        else:
+            self._add(self._interpret(bytes((self._start,)) + body if self._several else body))
 
     def _start_message(self, start: int) -> None:
         self._reset(in_junk=False)
@@ -413,14 +394,14 @@ class EscapedDeframer(Deframer[_Message]):
         self._in_junk = in_junk
         self._body.clear()
 
-    def _abandon(self, kind: FaultKind, text: str) -> None:
+    def _drop_message(self, fault: LinkFault) -> None:
         """Drop the message; its remaining bytes belong to the same run of junk."""
-        self._events.append(LinkFault(kind, text))
+        self._add(fault)
         self._reset(in_junk=True)
 
     def _report_junk(self, byte: int) -> None:
         if not self._in_junk:
-            self._events.append(LinkFault(FaultKind.UART_PROTOCOL, f"byte {byte:02X} outside a message"))
+            self._fault(FaultKind.UART_PROTOCOL, f"byte {byte:02X} outside a message")
         self._in_junk = True
 
 
@@ -527,12 +508,12 @@ class _CountedDeframer(_Collector[_Message]):
         del self._buffer[:size]
         self._reported -= size
 
-    def _abandon(self) -> int:
+    def _abandon(self) -> LinkFault | None:
         size, reported = len(self._buffer), self._reported
         self._buffer.clear()
         self._reported = 0
         self._in_junk = False
-        return size if reported <= 0 else 0
+        return self._incomplete(size) if size and reported <= 0 else None
 
 
 class Delimited(Framing):
@@ -617,11 +598,11 @@ class _DelimitedDeframer(_Collector[_Message]):
         body = self._framing.decode(text)
         self._add(self._interpret(body) if isinstance(body, bytes) else body)
 
-    def _abandon(self) -> int:
+    def _abandon(self) -> LinkFault | None:
         size = 0 if self._skipping else len(self._text)
         self._text.clear()
         self._skipping = False
-        return size
+        return self._incomplete(size) if size else None
 
 
 class _PluginFraming(Framing):

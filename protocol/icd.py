@@ -131,7 +131,7 @@ def _texts(file: Path, document: Any, error: ValidationError) -> Iterator[str]:
         if item["type"] == "extra_forbidden":
             yield f"{where}: unknown key{did_you_mean(str(location[-1]), _known_keys(location))}"
         else:
-            yield f"{where}: {item['msg'].replace('Tuple', 'List').replace('tuple', 'list')}"  # TOML's word
+            yield f"{where}: {item['msg']}"
 
 
 def _place(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:

@@ -137,6 +137,11 @@ def xtce_name(text: str) -> str:
     return re.sub(r"[./:\[\] ]", "_", one_line(text)) or "_"
 
 
+def xtce_text(text: str) -> str:
+    """Return text as one line in an element or attribute of XML."""
+    return html.escape(one_line(text)).replace("&#x27;", "'")
+
+
 def html_text(text: str) -> str:
     """Return text with its markup escaped, and what is between backticks as code."""
     return re.sub("`([^`]*)`", r"<code>\1</code>", html.escape(one_line(text)))

@@ -613,10 +613,7 @@ def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | No
     wanted
         The user's choice; None for the default: the only dialect of the unit, otherwise b.
 
-    Raises
-    ------
-    IcdError
-        The unit does not have this dialect.
+    Raises IcdError: the unit does not have this dialect.
     """
     dialects = dialects_of(icd.link.serial)
     if not dialects and wanted is not None:
@@ -636,10 +633,7 @@ def serial_answers(icd: InterfaceDefinition, row: Row) -> tuple[str, ...]:
 def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
     """Return the serial link of a definition.
 
-    Raises
-    ------
-    IcdError
-        The unit has none, or parts of it are incompatible.
+    Raises IcdError: the unit has none, or parts of it are incompatible.
     """
     link = icd.link.serial
     if link is None:

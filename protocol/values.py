@@ -12,7 +12,7 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from starhil.protocol.errors import ProtocolError
@@ -145,9 +145,9 @@ class Section(DefinitionModel):
     """A section of documentation: paragraphs and a table."""
 
     heading: Annotated[str, Field(min_length=1)]
-    paragraphs: Annotated[tuple[str, ...], Strict(strict=False)] = ()
-    columns: Annotated[tuple[str, ...], Strict(strict=False), Field(min_length=1)]
-    rows: Annotated[tuple[Annotated[tuple[str, ...], Strict(strict=False)], ...], Strict(strict=False)]
+    paragraphs: list[str] = []
+    columns: list[str] = Field(min_length=1)
+    rows: list[list[str]]
 
     @model_validator(mode="after")
     def _full_rows(self) -> Section:

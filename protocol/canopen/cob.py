@@ -39,10 +39,7 @@ CAN-IDs)."""
 def check_can_id(cob_id: int) -> None:
     """Reject a COB-ID whose frame format or CAN ID a configurable object may not have.
 
-    Raises
-    ------
-    SdoAbortError
-        VALUE_RANGE for the extended frame format, a CAN ID over 11 bits or a restricted one.
+    Raises SdoAbortError: VALUE_RANGE for the extended frame format, a CAN ID over 11 bits or a restricted one.
     """
     can_id = cob_id & ID_MASK
     if cob_id & EXTENDED or can_id > 0x7FF:

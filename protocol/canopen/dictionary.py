@@ -92,10 +92,7 @@ def type_size(data_type: int | None) -> int | None:
 def encode(data_type: int, value: Value) -> bytes:
     """Pack a raw (unscaled) value; `bytes` pass unchanged.
 
-    Raises
-    ------
-    SdoAbortError
-        VALUE_RANGE if the value does not fit the type.
+    Raises SdoAbortError: VALUE_RANGE if the value does not fit the type.
     """
     if isinstance(value, bytes):
         return value

@@ -58,11 +58,8 @@ class MappedObject:
 def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedObject:
     """Return the object of a mapping entry, as in `MAPPING_ENTRY`.
 
-    Raises
-    ------
-    SdoAbortError
-        NO_OBJECT for an object that does not exist, NOT_MAPPABLE for one that cannot be mapped in this
-        direction or in this length.
+    Raises SdoAbortError: NO_OBJECT for an object that does not exist, NOT_MAPPABLE for one that cannot be mapped in
+    this direction or in this length.
     """
     entry_bits = MAPPING_ENTRY.parse(value.to_bytes(4, "big"))
     index, subindex, bits = entry_bits.index, entry_bits.subindex, entry_bits.bits

@@ -7,7 +7,7 @@ from collections.abc import Generator, Sequence
 from contextlib import suppress
 from typing import Final
 
-from starhil.protocol.canopen.abort import ABORT_TEXTS, AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, Key, in_order, span_of
 from starhil.protocol.codec import Row, Slot
 from starhil.protocol.messages import ErrorCode
@@ -69,10 +69,7 @@ def download(index: int, subindex: int, data: bytes) -> SdoTransfer:
 def row_transfer(dictionary: DeviceDictionary, row: Row, data: bytes = b"") -> SdoTransfer:
     """Execute a telecommand with its data, or read a telemetry row, through the entries that hold it.
 
-    Raises
-    ------
-    IcdError
-        The object dictionary does not hold the row.
+    Raises IcdError: the object dictionary does not hold the row.
     """
     entries = dictionary.entries_of(row)
     if row.kind == "telemetry":
@@ -111,7 +108,7 @@ def _checked(answer: bytes) -> bytes:
     """Return an answer if it has 8 bytes and is not an abort."""
     if answer[0] == _ABORT:
         number = int.from_bytes(answer[4:], "little")
-        if number in ABORT_TEXTS:
+        if number in set(AbortCode):
             raise SdoAbortError(AbortCode(number))
         raise SdoAbortError(AbortCode.GENERAL, f"code 0x{number:08X}")
     return answer

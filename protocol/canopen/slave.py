@@ -61,10 +61,7 @@ class CanopenSlave:
         Called to reset the application when NMT resets the node; a returned node ID applies unless LSS has
         stored one.
 
-    Raises
-    ------
-    ProtocolError
-        The node ID is invalid.
+    Raises ProtocolError: the node ID is invalid.
     """
 
     def __init__(

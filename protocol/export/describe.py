@@ -11,7 +11,7 @@ from starhil.protocol.unit_examples import Exchange, exchanges
 from starhil.protocol.values import EnumDefinition, Parameter, Section, Value
 
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning", "Example")
-PARAMETER_COLUMNS: Final = ("ID", "Parameter", "Type", "Unit", "Range", "Default", "Meaning")
+PARAMETER_COLUMNS: Final = ["ID", "Parameter", "Type", "Unit", "Range", "Default", "Meaning"]
 
 _BEHAVIOUR: Final = (
     (
@@ -129,7 +129,7 @@ def field_cells(row: Row) -> Iterator[tuple[str, ...]]:
         )
 
 
-def parameter_cells(parameter: Parameter) -> tuple[str, ...]:
+def parameter_cells(parameter: Parameter) -> list[str]:
     """Cells of a parameter under PARAMETER_COLUMNS."""
     limits = f"{number(parameter.minimum)} to {number(parameter.maximum)}"
     if parameter.enum is not None:
@@ -137,7 +137,7 @@ def parameter_cells(parameter: Parameter) -> tuple[str, ...]:
     elif parameter.type == "bool":
         limits = "0 or 1"
     default = parameter.default
-    return (
+    return [
         str(parameter.id),
         parameter.name,
         parameter.type,
@@ -145,7 +145,7 @@ def parameter_cells(parameter: Parameter) -> tuple[str, ...]:
         limits,
         str(default) if isinstance(default, str) else number(float(default)),
         parameter.doc,
-    )
+    ]
 
 
 def enum_text(enum: EnumDefinition) -> str:
@@ -155,10 +155,10 @@ def enum_text(enum: EnumDefinition) -> str:
 
 def reference(icd: InterfaceDefinition) -> Iterator[Section]:
     """The parameters and the enumerations."""
-    parameters = tuple(parameter_cells(parameter) for parameter in icd.parameters.values())
-    yield Section(heading="Parameters", paragraphs=(), columns=PARAMETER_COLUMNS, rows=parameters)
-    enums = tuple((enum.name, enum_text(enum), enum.doc) for enum in icd.enums.values())
-    yield Section(heading="Enumerations", paragraphs=(), columns=("Name", "Numbers", "Meaning"), rows=enums)
+    parameters = [parameter_cells(parameter) for parameter in icd.parameters.values()]
+    yield Section(heading="Parameters", columns=PARAMETER_COLUMNS, rows=parameters)
+    enums = [[enum.name, enum_text(enum), enum.doc] for enum in icd.enums.values()]
+    yield Section(heading="Enumerations", columns=["Name", "Numbers", "Meaning"], rows=enums)
 
 
 def sections(icd: InterfaceDefinition) -> Iterator[tuple[str, list[Row]]]:

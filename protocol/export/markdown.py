@@ -2,71 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from typing import Final
 
+from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export import describe, wire
+from starhil.protocol.export.templates import fill
 from starhil.protocol.quoting import markdown, one_line
-from starhil.protocol.values import Section
+
+_ROW_COLUMNS: Final = ("ID", "Name", "Bytes", "Source", "Meaning")
 
 
 def render(icd: InterfaceDefinition) -> str:
     """Return the definition as Markdown: rows, parameters, enumerations, links."""
-    return "\n".join(_lines(icd)) + "\n"
-
-
-def _lines(icd: InterfaceDefinition) -> Iterator[str]:
-    yield f"# {markdown(f'Interface definition {icd.name} {icd.version}')}"
-    for paragraph in (icd.doc, *describe.introduction(icd)):
-        yield from ("", markdown(paragraph))
-    yield ""
+    groups = list(describe.sections(icd))
     after = (*describe.reference(icd), *wire.sections(icd))
-    headings = [section.heading for section in icd.sections]
-    headings += [heading for heading, _ in describe.sections(icd)]
-    for heading in [*headings, *(section.heading for section in after)]:
-        yield f"- {_link(heading, heading)}"
-    for section in icd.sections:
-        yield from _section(section)
-    examples = describe.examples(icd)
-    for heading, rows in describe.sections(icd):
-        yield from ("", f"## {heading}", "")
-        yield from _table(
-            ("ID", "Name", "Bytes", "Source", "Meaning"),
-            (
-                (
-                    str(row.id),
-                    _link(row.name, describe.title(row)),
-                    str(row.size),
-                    row.provenance,
-                    markdown(row.doc),
-                )
-                for row in rows
-            ),
-        )
-        for row in rows:
-            yield from (
-                "",
-                f"### {describe.title(row)}",
-                "",
-                markdown(row.doc),
-                "",
-                f"{markdown(describe.facts(row))}.",
-            )
-            if row.fields:
-                yield ""
-                yield from _text_table(describe.FIELD_COLUMNS, describe.field_cells(row))
-            for example in examples[row.name]:
-                yield from ("", markdown(describe.example_text(example)))
-    for section in after:
-        yield from _section(section)
+    headings = [section.heading for section in icd.sections] + [heading for heading, _ in groups]
+    return fill(
+        "tables.md.j2",
+        icd=icd,
+        paragraphs=(icd.doc, *describe.introduction(icd)),
+        headings=[*headings, *(section.heading for section in after)],
+        groups=groups,
+        after=after,
+        examples=describe.examples(icd),
+        describe=describe,
+        quoted=markdown,
+        link=_link,
+        index=_index,
+        table=lambda columns, rows: _table(map(markdown, columns), (map(markdown, row) for row in rows)),
+    )
 
 
-def _section(section: Section) -> Iterator[str]:
-    yield from ("", f"## {markdown(section.heading)}")
-    for paragraph in section.paragraphs:
-        yield from ("", markdown(paragraph))
-    yield ""
-    yield from _text_table(section.columns, section.rows)
+def _index(rows: Sequence[Row]) -> str:
+    """Return the table of a group of rows, with links to each."""
+    cells = (
+        (str(row.id), _link(row.name, describe.title(row)), str(row.size), row.provenance, markdown(row.doc))
+        for row in rows
+    )
+    return _table(_ROW_COLUMNS, cells)
 
 
 def _link(text: str, heading: str) -> str:
@@ -75,16 +50,8 @@ def _link(text: str, heading: str) -> str:
     return f"[{markdown(text)}](#{anchor.replace(' ', '-')})"
 
 
-def _text_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    yield from _table([markdown(column) for column in columns], (map(markdown, row) for row in rows))
-
-
-def _table(columns: Sequence[str], rows: Iterable[Iterable[str]]) -> Iterator[str]:
-    """Yield a table of cells that are Markdown already."""
-    yield _row(columns)
-    yield _row(["---"] * len(columns))
-    yield from map(_row, rows)
-
-
-def _row(cells: Iterable[str]) -> str:
-    return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+def _table(columns: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """Return a table of cells that are Markdown already."""
+    head = list(columns)
+    lines = (head, ["---"] * len(head), *rows)
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |" for cells in lines)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import Final
+import tomllib
+from collections.abc import Iterable, Iterator
+from functools import cache
+from typing import Any, Final
 
 from pydantic import BaseModel
 
-from starhil.protocol.can_framing import SEGMENT_DATA, MessageType
+from starhil.protocol.can_framing import MessageType
 from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.export.templates import text_of
 from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
@@ -29,22 +32,27 @@ _PLACEHOLDERS: Final = {
 """Placeholder names for bytes of the example messages."""
 
 
-_MEANINGS: Final = {
-    "address": "address of the unit",
-    "source": "address of the OBC",
-    "destination": "address of the OBC",
-    "class": "code of the class",
-    "id": "ID of the row",
-    "sequence": "any number; a reply repeats that of its request",
-    "length": "number of bytes of data",
-    "status": "error code",
-    "ack": "0 in a refusal, otherwise 1",
-    "final": "1 in the last reply to a request",
-    "flags": "a reply repeats those of its request",
-    "ticks": "time since start",
-    "time": "time of the unit's clock",
-}
-"""Meaning of the header fields, by role."""
+def _text(table: str) -> dict[str, Any]:
+    """Return a table of the texts."""
+    texts: dict[str, Any] = _texts()[table]
+    return texts
+
+
+@cache
+def _texts() -> dict[str, Any]:
+    return tomllib.loads(text_of("wire.toml"))
+
+
+def _section(name: str, rows: Iterable[tuple[str, ...]], **values: object) -> Section:
+    """Return a section with its texts filled in; a paragraph that is empty then is left out."""
+    texts = _text(name)
+    paragraphs = [paragraph.format(**values) for paragraph in texts.get("paragraphs", ())]
+    return Section(
+        heading=texts["heading"],
+        paragraphs=[paragraph for paragraph in paragraphs if paragraph],
+        columns=texts["columns"],
+        rows=[list(row) for row in rows],
+    )
 
 
 def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
@@ -67,20 +75,11 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
 
 def _conventions(icd: InterfaceDefinition) -> Section:
     conventions = icd.conventions
-    turn, conjugate = "v_reported = q ⊗ v_ICRS ⊗ q*", "v_reported = q* ⊗ v_ICRS ⊗ q"
-    quaternion = {
-        "rotation": f"{turn} (Hamilton's product, q* = (-x, -y, -z, w)): q turns vectors from ICRS into the reported frame",
-        "attitude": f"{conjugate} (Hamilton's product, q* = (-x, -y, -z, w)): the q of the attitude matrix A(q)",
-    }
-    sign = {
-        "positive": "the scalar part w is never negative",
-        "any": "of q and -q, the one closer to the last reported quaternion",
-    }
     epoch = conventions.epoch
     start = "midnight of the current day" if epoch == "midnight" else EPOCHS.get(epoch, epoch)
     rows = [
-        ("quaternion", quaternion[conventions.quaternion]),
-        ("sign", sign[conventions.scalar_sign]),
+        ("quaternion", _text("quaternion")[conventions.quaternion]),
+        ("sign", _text("sign")[conventions.scalar_sign]),
         (
             "axes x, y, z of the reported frame",
             f"{', '.join(conventions.axes)} of the sensor frame (+x right in the image, +y down, +z boresight)",
@@ -92,7 +91,7 @@ def _conventions(icd: InterfaceDefinition) -> Section:
     if commands and icd.device_parameters["start_mode"].default == "standby":
         text = "the unit boots to standby, in which no attitude is valid: send a mode that takes images with"
         rows.append(("first attitude", f"{text} {' or '.join(commands)}"))
-    return Section(heading="Conventions", paragraphs=(), columns=("Convention", "Value"), rows=tuple(rows))
+    return _section("conventions", rows)
 
 
 def _classes(icd: InterfaceDefinition) -> Section:
@@ -104,13 +103,7 @@ def _classes(icd: InterfaceDefinition) -> Section:
         reply = item.code if item.reply is None else item.reply
         unsolicited = reply if item.unsolicited is None else item.unsolicited
         rows.append((item.name, item.kind.value, code(item.code), code(reply), code(unsolicited)))
-    columns = ("Class", "Rows", "Code in a request", "In a reply", "In unsolicited telemetry")
-    return Section(
-        heading="Classes",
-        paragraphs=("Class and ID together select a row.",),
-        columns=columns,
-        rows=tuple(rows),
-    )
+    return _section("classes", rows)
 
 
 def _has_error_codes(icd: InterfaceDefinition) -> bool:
@@ -126,27 +119,18 @@ def _has_error_codes(icd: InterfaceDefinition) -> bool:
 
 def _errors(icd: InterfaceDefinition) -> Section:
     numbers = {code.name.lower(): int(icd.error_number(code)) for code in ErrorCode}
-    rows = tuple((f"{number} ({number:02X}h)", name) for name, number in numbers.items())
-    return Section(heading="Error codes", paragraphs=(), columns=("Code", "Error"), rows=rows)
+    return _section("errors", ((f"{number} ({number:02X}h)", name) for name, number in numbers.items()))
 
 
 def _composed(link: SerialLinkModel, order: Order) -> Section:
-    messages = (("request", link.request_header), ("reply", link.reply_header))
-    text = (
-        f"{link.baud} bit/s, 8 data bits, no parity, 1 stop bit. A message consists of header, data of the row and check; the framing marks "
-        f"where it begins and ends. Framing: {_settings(link.framing)}. Check: {_settings(link.check)}."
+    rows = (
+        (message, *cells)
+        for message, header in (("request", link.request_header), ("reply", link.reply_header))
+        for field in header
+        for cells in _header_cells(field, order)
     )
-    return Section(
-        heading="Serial line",
-        paragraphs=(text,),
-        columns=("Message", "Header field", "Type", "Value", "Meaning"),
-        rows=tuple(
-            (message, *cells)
-            for message, header in messages
-            for field in header
-            for cells in _header_cells(field, order)
-        ),
-    )
+    framing, check = _settings(link.framing), _settings(link.check)
+    return _section("composed", rows, baud=link.baud, framing=framing, check=check)
 
 
 def _settings(model: BaseModel) -> str:
@@ -177,11 +161,11 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
             bit.role or "constant",
             f"{type_}, bits {bits} to {bits + bit.width - 1}",
             _fixed_value(bit.const, bit.default),
-            _MEANINGS.get(bit.role or "", ""),
+            _text("role").get(bit.role or "", ""),
         )
         bits += bit.width
     if not field.bits:
-        meaning = _MEANINGS.get(field.role or "", "")
+        meaning = _text("role").get(field.role or "", "")
         if field.role == "length":
             meaning = f"number of bytes of {', '.join(field.includes) or 'nothing'}"
         elif field.role in ("ticks", "time"):
@@ -207,26 +191,13 @@ def _serial(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
         Reply(ReplyKind.EVENT, _TELEMETRY, data),
     )
     request = _format_message(stack.encode_request(Request.of(_TELECOMMAND, data)))
-    text = (
-        f"A request is {request}, with every byte 1F of the data doubled; 8 data bits, no parity, 1 stop bit. "
-        "The parameter serial_dialect selects the format of the replies; the code is a number of the enumeration error_code."
-    )
-    choice = (
-        "Dialect a is for OBC software written for the CubeComputer: a reply repeats the ID. Dialect b is for software that "
-        "talks to a stand-alone node: a reply begins with the data and can only be interpreted with its request. Dialect c is "
-        "generation 2. The dialect cannot be recognised from a message: with b instead of a, each value is shifted by one byte and "
-        "telecommands seem unanswered."
-    )
     rows = sorted(icd.telecommands_by_id.values(), key=lambda row: row.id)
-    silent = [f"`{row.name}` ({row.id})" for row in rows if not serial_answers(icd, row)]
-    silence = f"On this line, {' or '.join(silent)} is neither acknowledged nor refused."
-    return Section(
-        heading="Serial line",
-        paragraphs=(text, choice, silence) if silent else (text, choice),
-        columns=("Dialect", "Telemetry", "Telecommand accepted", "Refused", "Unsolicited telemetry", "Event"),
-        rows=tuple(
-            (dialect.value, *(_reply(stack, reply, dialect) for reply in kinds)) for dialect in Dialect
-        ),
+    silent = " or ".join(f"`{row.name}` ({row.id})" for row in rows if not serial_answers(icd, row))
+    return _section(
+        "cubespace",
+        ((dialect.value, *(_reply(stack, reply, dialect) for reply in kinds)) for dialect in Dialect),
+        request=request,
+        silence=f"On this line, {silent} is neither acknowledged nor refused." if silent else "",
     )
 
 
@@ -242,36 +213,14 @@ def _format_message(message: bytes) -> str:
 
 
 def _can() -> Section:
-    return Section(
-        heading="CAN",
-        paragraphs=(
-            (
-                "29-bit CAN IDs: type (bits 28 to 24), row ID (23 to 16), source address (15 to 8), destination "
-                "address (7 to 0). By default the device has address 4 and the OBC 1 (parameters can_address and host_address)."
-            ),
-            f"A message of more than 8 bytes is sent in segments: up to {SEGMENT_DATA} bytes of data, then the number of remaining segments.",
-        ),
-        columns=("Type", "Message"),
-        rows=tuple(
-            (str(int(kind)), kind.name.lower().replace("_", " ").replace("extended", "segment"))
-            for kind in MessageType
-            if kind
-        ),
-    )
+    kinds = (kind for kind in MessageType if kind)
+    names = ((kind, kind.name.lower().replace("_", " ").replace("extended", "segment")) for kind in kinds)
+    return _section("can", ((str(int(kind)), name) for kind, name in names))
 
 
 def _objects(layout: CanopenModel) -> Section:
-    return Section(
-        heading="CANopen objects",
-        paragraphs=(
-            (
-                "The rows, fields and parameters of this definition as objects; types, sub-indices and limits are in the EDS. "
-                "Objects below 2000h are defined by CiA 301."
-            ),
-        ),
-        columns=("Index", "Name", "Content"),
-        rows=tuple((f"{placed.index:04X}h", placed.name, _content(placed)) for placed in layout.object),
-    )
+    rows = ((f"{placed.index:04X}h", placed.name, _content(placed)) for placed in layout.object)
+    return _section("objects", rows)
 
 
 def _content(placed: PlacedObject) -> str:
@@ -300,14 +249,9 @@ def _content(placed: PlacedObject) -> str:
 
 
 def _pdos(layout: CanopenModel) -> Section:
-    rows = [("TPDO", number, pdo) for number, pdo in enumerate(layout.tpdo, 1)]
-    rows += [("RPDO", number, pdo) for number, pdo in enumerate(layout.rpdo, 1)]
-    return Section(
-        heading="CANopen PDOs",
-        paragraphs=("The default mapping; all PDOs can be remapped while the node is running.",),
-        columns=("PDO", "Name", "At start", "Transmission type", "Mapped"),
-        rows=tuple((f"{kind} {number}", *_pdo(pdo)) for kind, number, pdo in rows),
-    )
+    pdos = [("TPDO", number, pdo) for number, pdo in enumerate(layout.tpdo, 1)]
+    pdos += [("RPDO", number, pdo) for number, pdo in enumerate(layout.rpdo, 1)]
+    return _section("pdos", ((f"{kind} {number}", *_pdo(pdo)) for kind, number, pdo in pdos))
 
 
 def _pdo(pdo: PdoModel) -> tuple[str, str, str, str]:

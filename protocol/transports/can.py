@@ -64,10 +64,7 @@ def open_can(
     bitrate:
         Bit rate (bit/s) of adapters that the transport configures (slcan).
 
-    Raises
-    ------
-    TransportError
-        The specification is invalid.
+    Raises TransportError: the specification is invalid.
     """
     if spec == "auto":
         if kernel_can_is_up(DEFAULT_BUS):

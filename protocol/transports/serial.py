@@ -52,10 +52,7 @@ def open_serial(
         Whether a message is passed on, whole, only when its last byte would have arrived at the bit rate; true
         by default, except for a real tty, which is paced by its hardware.
 
-    Raises
-    ------
-    TransportError
-        The specification is invalid.
+    Raises TransportError: the specification is invalid.
     """
     schedule = PacingSchedule(baud)
     pace = schedule if paced is None or paced else None

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-import textwrap
-from collections.abc import Iterable, Iterator
-from typing import Final
+from collections.abc import Iterator
+from typing import Any, Final
 
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning
+from starhil.protocol.export.packets import key_of
+from starhil.protocol.export.templates import fill
 from starhil.protocol.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
 from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, Value, to_f32
 
@@ -55,12 +56,25 @@ class RowCode:
             self._scope.claim(self._constant(name, member), f"{owner}: {one_line(member)!r}")
         self.enumerations[name] = enum
 
-    def enumeration(self, name: str) -> Iterator[str]:
-        """Yield the constants of an enumeration."""
-        yield from filter(None, [c_comment(self.enumerations[name].doc)])
-        for member, value in self.enumerations[name].values.items():
-            yield f"#define {self._constant(name, member)} {_integer(value, signed=value < 0)}"
-        yield ""
+    def fill(self, icd: InterfaceDefinition, key_type: str) -> tuple[str, str]:
+        """Return declarations and codecs of all rows."""
+        values: dict[str, Any] = {
+            "prefix": self._prefix.upper(),
+            "rows": [(row, self._name(row), key_of(icd, row)) for row in icd.rows],
+            "telemetry": [self._name(row) for row in icd.telemetry.values()],
+            "enumerations": self.enumerations,
+            "constant": self._constant,
+            "integer": lambda value: _integer(value, signed=value < 0),
+            "comment": c_comment,
+            "about": lambda row, field: c_comment(": ".join(filter(None, (field.unit, meaning(row, field))))),
+            "declarator": _declarator,
+            "initial": self._initials,
+            "checks": _checks,
+            "encoded": lambda row: [line for slot in row.slots for line in _encode(row, slot)],
+            "decoded": _decode,
+            "key_type": key_type,
+        }
+        return fill("c/rows.h.j2", **values), fill("c/rows.c.j2", **values)
 
     def membership(self, name: str) -> str:
         """Return a function that tests whether a number is in an enumeration."""
@@ -70,74 +84,17 @@ class RowCode:
             "    default:\n        return false;\n    }\n}"
         )
 
-    def declaration(self, row: Row, key: int) -> Iterator[str]:
-        """Yield the declarations of a row: ID, size, structure and functions."""
-        name = self._name(row)
-        yield c_comment(f"{row.kind.capitalize()} {row.id}. {row.doc}")
-        yield f"#define {name.upper()}_ID {key}u"
-        yield f"#define {name.upper()}_SIZE {row.size}u"
-        if row.named_fields:
-            yield "typedef struct {"
-            for field in row.named_fields.values():
-                about = c_comment(": ".join(filter(None, (field.unit, meaning(row, field)))))
-                yield from filter(None, [textwrap.indent(about, "    ")])
-                yield f"    {_declarator(field)};"
-            yield f"}} {name}_t;"
-            if row.kind == "telecommand":
-                values = ", ".join(
-                    f".{c_member(field.name)} = {self._initial(row, field, row.example()[key])}"
-                    for key, field in row.named_fields.items()
-                )
-                yield f"#define {name.upper()}_INIT {{ {values} }}"
-            yield f"int {name}_encode(const {name}_t *values, uint8_t data[{name.upper()}_SIZE]);"
-            yield f"int {name}_decode(const uint8_t *data, size_t size, {name}_t *values);"
-        yield ""
-
-    def definition(self, row: Row) -> Iterator[str]:
-        """Yield the codec of a row."""
-        if not row.named_fields:
-            return
-        name = self._name(row)
-        ok, bad_length = (f"{self._prefix.upper()}_{result}" for result in ("OK", "BAD_LENGTH"))
-        checks = [
-            line
-            for index, field in enumerate(row.named_fields.values(), 1)
-            for line in _check(row, field, index)
-        ]
-        if checks:
-            yield f"static int check_{name}(const {name}_t *values)\n{{"
-            if any("&raw" in line for line in checks):
-                yield "    uint64_t raw;"
-            yield from checks
-            yield f"    return {ok};\n}}\n"
-        checked = f"check_{name}(values)"
-        encoded = [line for slot in row.slots for line in _encode(row, slot)]
-        yield f"int {name}_encode(const {name}_t *values, uint8_t data[{name.upper()}_SIZE])\n{{"
-        if any("&raw" in line for line in encoded):
-            yield "    uint64_t raw;"
-        if checks:
-            yield f"    const int result = {checked};"
-            yield f"    if (result != {ok}) {{\n        return result;\n    }}"
-        yield from encoded
-        yield f"    return {ok};\n}}\n"
-        yield f"int {name}_decode(const uint8_t *data, size_t size, {name}_t *values)\n{{"
-        yield f"    if (size != {name.upper()}_SIZE) {{\n        return {bad_length};\n    }}"
-        yield from (f"    {_decode(field)}" for field in row.named_fields.values())
-        yield f"    return {checked if checks and row.kind == 'telecommand' else ok};\n}}\n"
-
-    def telemetry_size(self, telemetry: Iterable[Row], key_type: str) -> Iterator[str]:
-        """Yield a function that returns the size of a telemetry row."""
-        yield f"int {self._prefix}_telemetry_size({key_type} id)\n{{\n    switch (id) {{"
-        for row in telemetry:
-            name = self._name(row).upper()
-            yield f"    case {name}_ID:\n        return (int){name}_SIZE;"
-        yield "    default:\n        return -1;\n    }\n}\n"
-
     def _name(self, row: Row) -> str:
         return f"{self._prefix}_{'tc' if row.kind == 'telecommand' else 'tlm'}_{row.name}"
 
     def _constant(self, enum: str, member: str) -> str:
         return identifier(f"{self._prefix}_{enum}_{member}").upper()
+
+    def _initials(self, row: Row) -> str:
+        return ", ".join(
+            f".{c_member(name)} = {self._initial(row, field, row.example()[name])}"
+            for name, field in row.named_fields.items()
+        )
 
     def _initial(self, row: Row, field: Field, value: Value) -> str:
         if field.enum is not None and isinstance(value, str):
@@ -194,30 +151,31 @@ def _integer(value: int, *, signed: bool) -> str:
 # --- checks ---
 
 
-def _check(row: Row, field: Field, index: int) -> Iterator[str]:
-    """Yield the test of a member against its limits; none if its type cannot exceed them."""
+def _checks(row: Row) -> list[tuple[int, str]]:
+    """Return the tests of the members against their limits, each with the number of its member."""
+    tests = ((index, _check(row, field)) for index, field in enumerate(row.named_fields.values(), 1))
+    return [(index, test) for index, test in tests if test]
+
+
+def _check(row: Row, field: Field) -> str:
+    """Return the test whether a member exceeds its limits; empty if its type cannot."""
     value = f"values->{c_member(field.name)}"
-    test = ""
     match field.kind:
         case "enum" if field.enum is not None:
-            test = f"!is_in_{enum_name(row, field)}({value})"
+            return f"!is_in_{enum_name(row, field)}({value})"
         case "float":
-            test = _check_float(row, field, value)
+            return _check_float(row, field, value)
         case "integer" | "bits" if field.scaled:
-            test = f"!{_to_raw(field, value)}"
+            return f"!{_to_raw(field, value)}"
         case "integer" | "bits":
             low, high = field.raw_limits
-            least, greatest = INTEGER_RANGES[
-                _declarator(field).split("_t ")[0].replace("int", "i").replace("ui", "u")
-            ]
-            tests = []
-            if low > least:
-                tests.append(f"{value} < {_integer(low, signed=_signed(field))}")
-            if high < greatest:
-                tests.append(f"{value} > {_integer(high, signed=_signed(field))}")
-            test = " || ".join(tests)
-    if test:
-        yield f"    if ({test}) {{\n        return {index};\n    }}"
+            type_ = _declarator(field).split("_t ")[0].replace("int", "i").replace("ui", "u")
+            least, greatest = INTEGER_RANGES[type_]
+            tests = [f"{value} < {_integer(low, signed=_signed(field))}"] * (low > least)
+            tests += [f"{value} > {_integer(high, signed=_signed(field))}"] * (high < greatest)
+            return " || ".join(tests)
+        case _:
+            return ""
 
 
 def _check_float(row: Row, field: Field, value: str) -> str:
@@ -247,28 +205,29 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
     fields = [field for field in row.fields if field.slot is slot and field.name]
     where = f"data + {slot.offset}"
     if not fields:
-        yield f"    memset({where}, 0, {slot.size}u);"
+        yield f"memset({where}, 0, {slot.size}u);"
         return
     if fields[0].width:
         bits = " | ".join(f"(uint64_t)values->{c_member(field.name)} << {field.shift}" for field in fields)
-        yield f"    {_put_statement(slot, bits)}"
+        yield _put_statement(slot, bits)
         return
     (field,) = fields
     value = f"values->{c_member(field.name)}"
     match field.kind:
         case "bytes":
-            yield f"    memcpy({where}, {value}, {slot.size}u);"
+            yield f"memcpy({where}, {value}, {slot.size}u);"
         case "text":
             index = list(row.named_fields).index(field.name) + 1
-            yield f"    if (!put_text({where}, {slot.size}u, {value})) {{\n        return {index};\n    }}"
+            yield f"if (!put_text({where}, {slot.size}u, {value})) {{\n    return {index};\n}}"
         case "float":
             raw = _unscaled(field, value) if field.scaled else value
             convert = "float_bits((float)({}))" if field.type == "f32" else "double_bits({})"
-            yield f"    {_put_statement(slot, convert.format(raw))}"
+            yield _put_statement(slot, convert.format(raw))
         case _ if field.scaled:
-            yield f"    (void){_to_raw(field, value)};\n    {_put_statement(slot, 'raw')}"
+            yield f"(void){_to_raw(field, value)};"
+            yield _put_statement(slot, "raw")
         case _:
-            yield f"    {_put_statement(slot, f'(uint64_t){value}')}"
+            yield _put_statement(slot, f"(uint64_t){value}")
 
 
 def _put_statement(slot: Slot, value: str) -> str:

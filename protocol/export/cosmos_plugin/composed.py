@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from pathlib import Path
 from pprint import pformat
 from typing import Any
 
 from starhil.protocol.envelope import Header
 from starhil.protocol.export.packets import CLASS_SHIFT, row_key
+from starhil.protocol.export.templates import part_of, text_of
 from starhil.protocol.link_schema import (
     CrcCheck,
     CustomCheck,
@@ -43,7 +43,11 @@ def link_text(stack: SerialStack) -> str:
         **_framing(stack), **_check(stack), **_headers(stack), "ROWS": dict(_rows(stack)),
         "LONGEST": 2 * stack.max_size + 16,
     }  # fmt: skip
-    functions = (_snippet("checks", check.kind), _snippet("framings", kind), _template("composed_link"))
+    functions = (
+        part_of("cosmos_plugin/checks.py.in", check.kind),
+        part_of("cosmos_plugin/framings.py.in", kind),
+        text_of("cosmos_plugin/composed_link.py.in"),
+    )
     used = {
         name: value
         for name, value in constants.items()
@@ -140,15 +144,3 @@ def _rows(stack: SerialStack) -> Iterator[tuple[int, dict[str, Any]]]:
                 "answers": [answer for answer in row.answers if answer in ("echo", "reply")],
             },
         )
-
-
-def _template(name: str) -> str:
-    return (Path(__file__).parent / f"{name}.py.in").read_text(encoding="utf-8")
-
-
-def _snippet(name: str, kind: str) -> str:
-    """Return the part of a file under a heading."""
-    found = re.search(rf"^# {kind}\n(.*?)(?=^# \w+$|\Z)", _template(name), re.MULTILINE | re.DOTALL)
-    if found is None:
-        raise IcdError(f"link.serial: {name} of kind {kind!r} cannot be exported")
-    return found[1]
