@@ -9,6 +9,7 @@ from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
+from starhil.hil_tests.conformance.attitude_cases import TruthSource
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_equal
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
@@ -34,6 +35,8 @@ PRE_OPERATIONAL: Final = 128
 RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
+TEXTS: Final = {"name": 0x1008, "hardware": 0x1009, "software": 0x100A}
+"""Objects that describe the node."""
 ANSWER_S: Final = 0.5
 """Maximum time for an answer."""
 BOOT_S: Final = 3.0
@@ -104,17 +107,29 @@ class CanopenProbe:
         Text of the EDS; empty if there is none.
     """
 
+    link = "canopen"
+
     def __init__(self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "") -> None:
         self.port = port
         self.node = node
         self.od = od
         self.eds = eds
         self.log: list[str] = []
+        self.truth: TruthSource | None = None
         self._boots = True
         self._multiplexer = bytes(3)
         self._found: dict[tuple[int, int], bytes] = {}
 
     # Around a run
+
+    def identity(self) -> str:
+        """Return names, versions and numbers of the node, as far as it has them."""
+        texts = {what: self.try_read(index) for what, index in TEXTS.items() if index in self.od}
+        found = {what: text.decode("latin-1") for what, text in texts.items() if isinstance(text, bytes)}
+        for subindex, what in enumerate(("vendor", "product", "revision", "serial number"), 1):
+            if isinstance(number := self.try_read(0x1018, subindex), bytes):
+                found[what] = f"0x{int.from_bytes(number, 'little'):08X}"
+        return ", ".join(f"{what} {text}" for what, text in found.items())
 
     def silence(self, *, booting: bool) -> str | None:
         """Return `nothing` if the node does not answer a read of its device type, None if it does.

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal, rule
+from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode, identifying_stars
+from starhil.hil_tests.conformance.case import Case, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -16,19 +16,16 @@ from starhil.hil_tests.conformance.link_probe import (
     checked_values,
 )
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
 
 FLOOD: Final = 200
 SUBSCRIBED_S: Final = 3.0
-ATTITUDE_S: Final = 20.0
 SETTLING_S: Final = 1.0
 """Time after which a unit that identifies stars has an attitude."""
 RESTING: Final = 5
 """Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
-QUATERNION: Final = ("attitude.x", "attitude.y", "attitude.z", "attitude.w")
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
 
 Run = Callable[[LinkProbe], None]
@@ -148,67 +145,19 @@ def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run
 
 
 def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
+    attitude = AttitudeRow.of(row)
+
     def read_twice(probe: LinkProbe) -> None:
         for _ in range(2):
-            probe.values(row)
+            seen = probe.values(row)
+            if attitude is not None:
+                attitude.check(probe, seen)
 
     title = f"{row.name} has {row.size} bytes and values within their limits"
     yield _case("telemetry", row.name, title, read_twice, row)
-    bound = {item.value: name for name, item in row.named.items() if item.value}
-    if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
-        title = f"{row.name} has a quaternion of length 1 if it is valid"
-        changes_mode = any(item.action == "set_mode" for item in unit.telecommands.values())
-        yield _case("attitude", row.name, title, _unit_length(unit, row, bound), row, intrusive=changes_mode)
-
-
-def _unit_length(unit: Unit, row: Row, bound: dict[str, str]) -> Run:
-    def run(probe: LinkProbe) -> None:
-        with identifying_stars(probe, unit):
-            end = probe.now() + ATTITUDE_S
-            while not is_valid((seen := probe.values(row))[bound["attitude.valid"]]):
-                if probe.now() > end:
-                    raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
-                probe.sleep(0.1)
-        check_unit_length(row, seen, bound)
-
-    return run
-
-
-def check_unit_length(row: Row, seen: dict[str, Value], bound: dict[str, str]) -> None:
-    """Fail the case unless the quaternion of a row has length 1, to the resolution of its fields."""
-    step = max(abs(row.named[bound[name]].scale) for name in QUATERNION)
-    length = sum(float(seen[bound[name]]) ** 2 for name in QUATERNION) ** 0.5
-    tolerance = 1e-5 + (2.0 * step if step < 1.0 else 0.0)
-    check(abs(length - 1.0) < tolerance, "a quaternion of length 1", f"{length:.7f}")
-
-
-def is_valid(value: Value) -> bool:
-    """Return whether a field reports a valid attitude: a flag or a number."""
-    return str(value).lower() in ("true", "1")
-
-
-@contextmanager
-def identifying_stars(probe: LinkProbe, unit: Unit) -> Iterator[None]:
-    """Have the unit identify stars, if a telecommand starts this; restore the mode afterwards."""
-    found = [
-        (row, name, str(reported.name), key)
-        for row in unit.telecommands.values()
-        for name, item in row.named.items()
-        if row.action == "set_mode" and item.argument == "mode"
-        for reported in unit.telemetry.values()
-        for key, field in reported.named.items()
-        if field.value == "mode"
-    ]
-    if not found:
-        yield
-        return
-    command, field_name, reporting, key = found[0]
-    before = probe.telemetry(reporting)[key]
-    probe.command(command.name, **{field_name: "lost_in_space"})
-    try:
-        yield
-    finally:
-        probe.command(command.name, **{field_name: "lost_in_space" if before == "tracking" else before})
+    if attitude is not None:
+        intrusive = changes_mode(unit.telecommands.values())
+        yield _case("attitude", row.name, attitude.title, attitude.becomes_valid, row, intrusive=intrusive)
 
 
 # --- quantities in several rows ---
@@ -228,7 +177,7 @@ def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
         return
 
     def run(probe: LinkProbe) -> None:
-        with identifying_stars(probe, unit):
+        with identifying_stars(probe):
             probe.sleep(SETTLING_S)
             for (quantity, _unit), (first, *others) in shared.items():
                 for other in others:

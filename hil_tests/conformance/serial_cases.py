@@ -22,7 +22,7 @@ from starhil.hil_tests.conformance.case import (
 )
 from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
 from starhil.hil_tests.conformance.row_cases import CLOCK_S, clause_of, row_cases
-from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
 from starhil.hil_tests.conformance.wire_tables import Exchange, add_exchange_cases, filled
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.headers import Header
@@ -83,10 +83,10 @@ def _highest_id(unit: Unit) -> int:
 
 def _asked(probe: SerialProbe, times: int = 1) -> bytes:
     """Return the bytes of a request for the lively row, which is expected to be answered."""
-    request = probe.unit.request(probe.lively)
-    for _ in range(times):
+    requests = [probe.line.numbered(probe.unit.request(probe.lively)) for _ in range(times)]
+    for request in requests:
         probe.line.expect(request)
-    return probe.line.encode(request) * times
+    return b"".join(probe.line.encode(request) for request in requests)
 
 
 def _answered(probe: SerialProbe, times: int = 1) -> None:
@@ -372,8 +372,8 @@ def _echoes(unit: Unit) -> Iterator[Case[SerialProbe]]:
 def _echoed(row: Row) -> Run:
     def run(probe: SerialProbe) -> None:
         data = b"" if row.is_telemetry else row.encode()
-        sent = probe.line.encode(probe.unit.request(row, data))
         probe.ask(row, data)
+        sent = probe.sent
         check_equal(probe.raw[: len(sent)] or None, sent, "the echo")
 
     return run
@@ -387,7 +387,7 @@ def pace(probe: SerialProbe) -> None:
     probe.post(row)
     probe.expect_telemetry(row)
     seconds = probe.now() - begin
-    least = len(probe.raw) * 10 / probe.baud
+    least = len(probe.raw) * BITS_A_BYTE / probe.baud
     if seconds < least - CLOCK_GRAIN_S:
         raise CaseFailed(f"at least {least * 1e3:.2f} ms at {probe.baud} baud", f"{seconds * 1e3:.2f} ms")
 

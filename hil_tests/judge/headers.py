@@ -59,6 +59,12 @@ class Header:
         models = self._models if klass is None else self._in(klass)
         return {part.role for model in models for part in (model, *model.bits) if part.role is not None}
 
+    def width(self, role: str) -> int:
+        """Return the bits that hold a role; 0 if the header does not have it."""
+        fields = [8 * _size(model) for model in self._models if model.role == role]
+        bits = [bit.width for model in self._models for bit in model.bits if bit.role == role]
+        return max(fields + bits, default=0)
+
     def place(self, model: Any, klass: str) -> tuple[int, int]:
         """Return offset and size of a field in messages of a class."""
         before = [_size(item) for item in self._in(klass)]
