@@ -101,10 +101,7 @@ async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
 async def download_by_frames(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image and download it in frames of 128 bytes, each with a checksum.
 
-    Raises
-    ------
-    BadReplyError
-        The number or checksum of a frame stays wrong.
+    Raises BadReplyError: the number or checksum of a frame stays wrong.
     """
     edge = int(size.removeprefix("size_"))
     await save_image(client, size, within_s=within_s)
@@ -159,10 +156,7 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image, and download the newest file of the list in bursts of up to 1024 numbered packets.
 
-    Raises
-    ------
-    BadReplyError
-        The list is empty, or the file does not have the checksum in the list.
+    Raises BadReplyError: the list is empty, or the file does not have the checksum in the list.
     """
     await save_image(client, size, within_s=within_s)
     begin = time.monotonic()
@@ -265,10 +259,7 @@ async def _send_hole_map(client: Downloader, packets: dict[int, bytes]) -> None:
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     """Return pixels (row by row from the top), width and height of an 8-bit grey BMP file.
 
-    Raises
-    ------
-    BadReplyError
-        The data are not such a file, or are truncated.
+    Raises BadReplyError: the data are not such a file, or are truncated.
     """
     if len(data) < BMP_HEADER_SIZE or data[:2] != b"BM":
         raise BadReplyError(f"the downloaded file of {len(data)} bytes is not a BMP image")

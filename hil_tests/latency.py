@@ -219,20 +219,8 @@ def measure(
 ) -> tuple[list[LatencyRow], ProcessRow]:
     """Measure the latency of the links of a unit at rest and at each update rate.
 
-    Parameters
-    ----------
-    unit
-        Name or folder of the unit.
-    rates_hz
-        Update rates, Hz; 0 is standby.
-    seconds
-        Time for each rate.
-    worker
-        `process` or `thread`.
-    report
-        Called with progress messages.
-    viewers
-        Number of viewers of the console; each rate is measured alternately without and with them.
+    A rate of 0 Hz is standby; `worker` is `process` or `thread`; with `viewers` of the console, each rate is measured
+    alternately without and with them.
     """
     icd = load_unit(unit)
     rows: list[LatencyRow] = []

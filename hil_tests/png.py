@@ -11,17 +11,9 @@ from starid.files import write_atomically
 def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
     """Write a grey image atomically.
 
-    Parameters
-    ----------
-    pixels : bytes
-        `width * height` bytes of 8 bits per pixel, row by row from the top.
-    width, height : int
-        Size in pixels.
+    `pixels` has 8 bits per pixel, row by row from the top.
 
-    Raises
-    ------
-    BenchError
-        The number of bytes does not match the size.
+    Raises BenchError: the number of bytes does not match the size.
     """
     import cv2
     import numpy as np

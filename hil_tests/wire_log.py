@@ -15,12 +15,7 @@ from starhil.protocol.candump import format_candump
 class WireLog(ABC):
     """A text log of sent and received items, written line by line.
 
-    Parameters
-    ----------
-    path : Path
-        File to write; an existing file is replaced.
-    now : callable
-        Seconds since 1970-01-01 UTC.
+    An existing file is replaced; `now` returns seconds since 1970-01-01 UTC.
     """
 
     def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:

@@ -95,16 +95,7 @@ WATCHED_NODE: Final = 0x05
 class CanopenProbe:
     """Talks to one node.
 
-    Parameters
-    ----------
-    port
-        The bus of the node.
-    node
-        Node ID.
-    od
-        Object dictionary, from the EDS.
-    eds
-        Text of the EDS; empty if there is none.
+    `od` is the object dictionary of the EDS, whose text is `eds`; empty if there is none.
     """
 
     link = "canopen"
@@ -159,10 +150,7 @@ class CanopenProbe:
     def restore(self) -> None:
         """Restore the values that `prepare` recorded, and store them.
 
-        Raises
-        ------
-        CaseFailed
-            The node does not accept them.
+        Raises CaseFailed: the node does not accept them.
         """
         if not self._found:
             return

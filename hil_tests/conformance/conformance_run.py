@@ -71,10 +71,7 @@ class ConformanceRequest:
 def all_cases(request: ConformanceRequest) -> list[Case[Any]]:
     """Return the cases of all requested links, selected by pattern and safety.
 
-    Raises
-    ------
-    BenchError
-        No link is given, the unit does not have the dialect, or a pattern matches no case.
+    Raises BenchError: no link is given, the unit does not have the dialect, or a pattern matches no case.
     """
     unit = read_unit(request.unit or DEFAULT_UNIT)
     cases: list[Case[Any]] = []
@@ -137,10 +134,7 @@ def run_conformance(
 
     After an interruption, the remaining cases are marked as not run.
 
-    Raises
-    ------
-    BenchError, ProtocolError
-        A port, a bus or the emulator is not available.
+    Raises BenchError, ProtocolError: a port, a bus or the emulator is not available.
     """
     unit = read_unit(request.unit or DEFAULT_UNIT)
     cases = all_cases(request)

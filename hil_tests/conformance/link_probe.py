@@ -93,14 +93,7 @@ class ReadableSettings:
 class LinkProbe(ABC):
     """Talks to a unit over a link.
 
-    Parameters
-    ----------
-    port
-        Port with its clock.
-    unit
-        Definition of the unit.
-    settings
-        What a run restores; default: the settings that can be read.
+    `settings` are what a run restores; by default, those that can be read.
 
     Attributes
     ----------

@@ -36,16 +36,8 @@ def row_cases(
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
-    Parameters
-    ----------
-    unit
-        Definition of the unit.
-    lengths
-        Whether a message of a wrong length can be sent on the link.
-    marks
-        Bytes that are special on the link; settings are made of them.
-    highest_id
-        Highest ID that a message can carry.
+    `lengths`: whether a message of a wrong length can be sent on the link. `marks`: bytes that are special on it, of which settings
+    are made. `highest_id`: the highest that a message can carry.
     """
     yield from _identifiers(unit, highest_id)
     if lengths:

@@ -72,10 +72,7 @@ def select_cases(
 ) -> list[Case[Any]]:
     """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
 
-    Raises
-    ------
-    BenchError
-        A pattern matches no case.
+    Raises BenchError: a pattern matches no case.
     """
     chosen = list(cases)
     if patterns:

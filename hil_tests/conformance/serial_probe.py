@@ -25,16 +25,7 @@ SHOWN_BYTES: Final = 48
 class SerialProbe(LinkProbe):
     """Talks to a unit over a serial port.
 
-    Parameters
-    ----------
-    port
-        The port.
-    unit
-        Definition of the unit.
-    dialect
-        Dialect of the answers, of a unit that has several.
-    baud
-        Bit rate of the line, for the case on its pace; None if unknown.
+    `dialect` is that of the answers, of a unit that has several; `baud` the bit rate of the line, None if unknown.
 
     Attributes
     ----------

@@ -26,10 +26,7 @@ from starhil.hil_tests.judge.definition import Unit
 def serial_suite(unit: Unit) -> tuple[Case[Any], ...]:
     """Return the cases for a unit on a serial line.
 
-    Raises
-    ------
-    BenchError
-        The unit has no serial link.
+    Raises BenchError: the unit has no serial link.
     """
     if unit.serial is None:
         raise BenchError(f"unit {unit.name}: has no serial link")
@@ -39,10 +36,7 @@ def serial_suite(unit: Unit) -> tuple[Case[Any], ...]:
 def can_suite(unit: Unit) -> tuple[Case[Any], ...]:
     """Return the cases for a unit on CAN.
 
-    Raises
-    ------
-    BenchError
-        The unit has no CAN link.
+    Raises BenchError: the unit has no CAN link.
     """
     if unit.can is None:
         raise BenchError(f"unit {unit.name}: has no CAN link")
@@ -76,10 +70,7 @@ def _suite(unit: Unit, link: str, derived: Iterable[Case[Any]]) -> tuple[Case[An
 def _own_files(folder: Path | None) -> tuple[dict[str, Any], ...]:
     """Run the files with a unit's own cases.
 
-    Raises
-    ------
-    BenchError
-        A file fails; the text names it.
+    Raises BenchError: a file fails; the text names it.
     """
     found = []
     for path in sorted(folder.glob("*_cases.py")) if folder is not None else ():

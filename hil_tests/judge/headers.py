@@ -29,16 +29,8 @@ class Opened:
 class Header:
     """The header of requests or of replies.
 
-    Parameters
-    ----------
-    models
-        Fields as in the definition.
-    order
-        Byte order of the unit.
-    codes
-        Code of each class in messages of this direction; several codes may name one class.
-    sizes
-        Bytes of `start`, `check` and `end`, which a length may include.
+    `models` are the fields as in the definition; `codes` the code of each class in this direction, several of which may name
+    one class; `sizes` the bytes of `start`, `check` and `end`, which a length may include.
     """
 
     def __init__(

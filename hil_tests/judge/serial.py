@@ -69,12 +69,7 @@ class Envelope(Protocol):
 class SerialLine:
     """The host's end of a unit's serial line.
 
-    Parameters
-    ----------
-    unit
-        Definition of the unit.
-    dialect
-        Dialect of the answers, of a unit that has several; default: b.
+    `dialect` is that of the answers, of a unit that has several; b by default.
     """
 
     def __init__(self, unit: Unit, dialect: str | None = None) -> None:
