@@ -1,4 +1,4 @@
-"""Image download: frame by frame with checksums, or in bursts with hole maps."""
+"""Image download, frame by frame with checksums or in bursts with hole maps, and PNG files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
@@ -23,6 +24,7 @@ from starhil.protocol.image_transfer import (
 )
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
+from starid.files import write_atomically
 
 
 class Downloader(Protocol):
@@ -275,3 +277,19 @@ def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     if signed_height > 0:
         rows.reverse()
     return b"".join(rows), width, height
+
+
+def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
+    """Write a grey image atomically.
+
+    `pixels` has 8 bits per pixel, row by row from the top.
+
+    Raises BenchError: the number of bytes does not match the size.
+    """
+    import cv2
+    import numpy as np
+
+    if width < 1 or height < 1 or len(pixels) != width * height:
+        raise BenchError(f"an image of {width}x{height} needs {width * height} bytes, not {len(pixels)}")
+    _, data = cv2.imencode(".png", np.frombuffer(pixels, np.uint8).reshape(height, width))
+    write_atomically(path, lambda part: part.write_bytes(data.tobytes()))

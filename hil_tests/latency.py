@@ -22,6 +22,7 @@ from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.load_figures import Spread
 from starhil.protocol.can_framing import CanId, encode_request_frames
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
@@ -301,7 +302,7 @@ def _measure_rate(
                 time.sleep(SETTLE_S if count else 0.0)
                 _measure_links(probes, names, seconds / turns, rng, taken[count], lost[count])
     return [
-        _row(link, worker, rate, count, sorted(values), lost[count][link])
+        _row(link, worker, rate, count, values, lost[count][link])
         for count in counts
         for link, values in taken[count].items()
     ]
@@ -315,7 +316,7 @@ def _measure_links(
     taken: Mapping[str, list[float]],
     lost: dict[str, int],
 ) -> None:
-    """Send requests on each link in turn for some time, and add latencies in ms and losses."""
+    """Send requests on each link in turn for some time, and add latencies in s and losses."""
     end = time.monotonic() + seconds
     count = 0
     while time.monotonic() < end:
@@ -326,12 +327,11 @@ def _measure_links(
             if latency is None:
                 lost[link] += 1
             else:
-                taken[link].append(latency * 1000.0)
+                taken[link].append(latency)
             time.sleep(rng.expovariate(1.0 / PAUSE_S))
 
 
-def _row(link: str, worker: str, rate: float, viewers: int, values: list[float], lost: int) -> LatencyRow:
-    if not values:
-        return LatencyRow(link, worker, rate, viewers, 0, float("nan"), float("nan"), float("nan"), lost)
-    p50, p99 = (values[min(len(values) - 1, int(share * len(values)))] for share in (0.5, 0.99))
-    return LatencyRow(link, worker, rate, viewers, len(values), p50, p99, values[-1], lost)
+def _row(link: str, worker: str, rate: float, viewers: int, seconds: list[float], lost: int) -> LatencyRow:
+    figures = Spread.of(seconds)
+    counts = (rate, viewers, len(seconds))
+    return LatencyRow(link, worker, *counts, figures.p50_ms, figures.p99_ms, figures.max_ms, lost)

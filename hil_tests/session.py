@@ -13,8 +13,8 @@ from starhil.hil_tests.bench import Bench
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.expect import resolve, show, show_angle
+from starhil.hil_tests.images import write_png
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.png import write_png
 from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
 from starhil.hil_tests.results import (
     FAILED,

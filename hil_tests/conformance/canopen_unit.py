@@ -22,9 +22,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     VALUE_ABORTS,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, check, check_equal
+from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
-from starhil.hil_tests.conformance.row_cases import CLOCK_S, clause_of
+from starhil.hil_tests.conformance.row_cases import CLOCK_S
 from starhil.hil_tests.judge.canopen import (
     EXPEDITED,
     Entry,
@@ -57,10 +57,9 @@ def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
 
 
 def _case(
-    area: str, name: str, title: str, run: Run, clause: str = CLAUSE, *, safe: bool = False
+    area: str, name: str, title: str, run: Run, clause: str | Row = CLAUSE, *, safe: bool = False
 ) -> Case[CanopenProbe]:
-    area = f"canopen.{area}"
-    return Case(f"{area}.{name}", area, title, clause, run, intrusive=not safe)
+    return case_in(f"canopen.{area}", name, title, run, clause, intrusive=not safe)
 
 
 # --- reading and writing ---
@@ -142,10 +141,10 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             continue
         attitude = AttitudeRow.of(row)
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
-        yield _case("rows", row.name, title, _values(row, attitude, found), clause_of(row), safe=True)
+        yield _case("rows", row.name, title, _values(row, attitude, found), row, safe=True)
         if attitude is not None:
             run = partial(_becomes_valid, attitude, found)
-            yield _case("attitude", row.name, attitude.title, run, clause_of(row))
+            yield _case("attitude", row.name, attitude.title, run, row)
 
 
 def _values(row: Row, attitude: AttitudeRow | None, found: list[Entry]) -> Run:
@@ -180,7 +179,7 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             title, run = f"{command.name} is accepted", _accepted(entry, command)
         else:
             continue
-        yield _case("commands", command.name, title, run, clause_of(command))
+        yield _case("commands", command.name, title, run, command)
 
 
 def _accepted(entry: Entry, command: Row) -> Run:
@@ -242,7 +241,7 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
-        yield _case("records", command.name, title, _keeps_values(command, members), clause_of(command))
+        yield _case("records", command.name, title, _keeps_values(command, members), command)
 
 
 def _keeps_values(command: Row, members: list[Entry]) -> Run:
@@ -280,7 +279,7 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             for why, data in command.bad_values(field):
                 title = f"{entry.name}h with {name} {why} is refused"
                 run = _refused(entry, written(entry, command, data))
-                yield _case("limits", f"{command.name}.{name}.{why}", title, run, clause_of(command))
+                yield _case("limits", f"{command.name}.{name}.{why}", title, run, command)
 
 
 def _refused(entry: Entry, data: bytes) -> Run:
@@ -406,4 +405,4 @@ def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> I
         check(0 <= seen - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", seen)
 
     title = f"RPDO {(index & 0x1FF) + 1} ({model.name}) sets the clock"
-    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, clause_of(command))
+    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, command)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Final
 
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode, identifying_stars
-from starhil.hil_tests.conformance.case import Case, check, check_equal, rule
+from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -49,30 +49,12 @@ def row_cases(
             for why, data in row.bad_values(item):
                 title = f"{row.name} with {name} {why} is refused, and the refused field named"
                 run = _refused(row, data, INVALID_PARAMETER, index)
-                yield _case("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
+                yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
     yield from _subscriptions(unit)
-    yield _case(
+    yield case_in(
         "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
-    )
-
-
-def clause_of(row: Row) -> str:
-    """Return the source of a row."""
-    return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
-
-
-def _case(
-    area: str, name: str, title: str, run: Run, clause: str | Row, *, intrusive: bool = False
-) -> Case[LinkProbe]:
-    return Case(
-        f"{area}.{name}",
-        area,
-        title,
-        clause_of(clause) if isinstance(clause, Row) else clause,
-        run,
-        intrusive,
     )
 
 
@@ -99,7 +81,7 @@ def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
                 probe.expect_refusal(row_id, b"", INVALID_ID, klass)
 
         title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
-        yield _case("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
+        yield case_in("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
 def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
@@ -109,7 +91,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
                 probe.expect_refusal(row, b"\x00", INVALID_LENGTH)
 
     title = "a telemetry request with data is refused for its length"
-    yield _case("identifiers", "telemetry-with-data", title, with_data, rule(5))
+    yield case_in("identifiers", "telemetry-with-data", title, with_data, rule(5))
     beyond = b"\0\0" if unit.telecommand_crc else b"\0"
     for row in unit.telecommands.values():
         whole = row.encode()
@@ -122,7 +104,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
             if data is not None:
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
                 run = _refused(row, data, INVALID_LENGTH)
-                yield _case("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
+                yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
 
 
 def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run:
@@ -146,10 +128,10 @@ def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
                 attitude.check(probe, seen)
 
     title = f"{row.name} has {row.size} bytes and values within their limits"
-    yield _case("telemetry", row.name, title, read_twice, row)
+    yield case_in("telemetry", row.name, title, read_twice, row)
     if attitude is not None:
         intrusive = changes_mode(unit.telecommands.values())
-        yield _case("attitude", row.name, attitude.title, attitude.becomes_valid, row, intrusive=intrusive)
+        yield case_in("attitude", row.name, attitude.title, attitude.becomes_valid, row, intrusive=intrusive)
 
 
 # --- quantities in several rows ---
@@ -176,7 +158,7 @@ def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
                     _compare(probe, quantity, first, other)
 
     title = "numbers that several fields report agree within the resolution of the fields"
-    yield _case(
+    yield case_in(
         "agreement", "rows", title, run, "[[telemetry]]: fields with the same `value`", intrusive=True
     )
 
@@ -220,13 +202,13 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
-            yield _case("commands", row.name, title, _accepted(row), row, intrusive=True)
+            yield case_in("commands", row.name, title, _accepted(row), row, intrusive=True)
     for row in unit.telemetry.values():
         source = next((item.telecommand for item in row.named.values() if item.telecommand), None)
         if source is not None and unit.telecommands[source].action in (None, "nothing"):
             title = f"{row.name} reports the bytes set by {source}"
             run = _read_back(unit.telecommands[source], row, marks)
-            yield _case("settings", row.name, title, run, row, intrusive=True)
+            yield case_in("settings", row.name, title, run, row, intrusive=True)
 
 
 def _accepted(row: Row) -> Run:
@@ -271,7 +253,7 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
         offered = [item for item in unit.telemetry.values() if klass in ("", item.klass)][:2]
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
-            yield _case(
+            yield case_in(
                 "subscriptions", row.name, title, _subscribed(row, fields, offered), row, intrusive=True
             )
 

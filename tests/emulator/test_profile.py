@@ -5,6 +5,7 @@ import pytest
 
 from starhil.emulator.control.scenario import Scenario
 from starhil.emulator.device.device import profile_defaults
+from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
@@ -236,7 +237,7 @@ def test_an_impossible_parameter_is_named_with_its_option(override, why):
     """Parameters are compared with the definition of the unit, after the profile has been read."""
     profile = load_profile("cubestar", ["parameters.update_rate=2", override])
     with pytest.raises(EmulatorError) as caught:
-        profile_defaults(profile, load_unit())
+        Parameters(load_unit(), profile_defaults(profile, load_unit()), lambda _changes: None)
     assert f"{profile.source_of(caught.value)}: {caught.value}".startswith(f"--set {override}: {why}")
     with pytest.raises(EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"):
         load_profile("cubestar", ["parameters.serial_baud=5"])
