@@ -75,18 +75,29 @@ class ProcessRow:
     memory_mb: float
 
 
-class SerialRequester:
+class _Port:
+    """A serial port without a loop around it."""
+
+    def __init__(self, fd: int, icd: InterfaceDefinition) -> None:
+        self._icd = icd
+        self._stack = build_serial_stack(icd)
+        self._fd = fd
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+
+    def close(self) -> None:
+        """Close the port."""
+        os.close(self._fd)
+
+
+class SerialRequester(_Port):
     """A minimal OBC on a serial line."""
 
     def __init__(self, path: str, icd: InterfaceDefinition) -> None:
-        self._icd = icd
-        self._stack = build_serial_stack(icd)
+        super().__init__(os.open(path, os.O_RDWR | os.O_NOCTTY), icd)
         self._host = self._stack.host()
-        self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._fd)
         os.set_blocking(self._fd, False)
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
         """Request a row; return the time until the last byte of the reply in s, or None without a reply."""
@@ -103,10 +114,6 @@ class SerialRequester:
                 return arrived - begin
         self._host = self._stack.host()
         return None
-
-    def close(self) -> None:
-        """Close the port."""
-        os.close(self._fd)
 
 
 class HubRequester:
@@ -162,18 +169,15 @@ class HubRequester:
         self._socket.close()
 
 
-class EchoRequester:
+class EchoRequester(_Port):
     """A process that echoes requests over a pty, for the latency of the machine."""
 
     def __init__(self, icd: InterfaceDefinition) -> None:
-        self._icd = icd
-        self._stack = build_serial_stack(icd)
-        self._fd, other = os.openpty()
+        fd, other = os.openpty()
+        super().__init__(fd, icd)
         tty.setraw(other)
         self._process = subprocess.Popen([sys.executable, "-c", ECHO, str(other)], pass_fds=[other])  # noqa: S603
         os.close(other)
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
         """Send the bytes of a request; return the time until their echo in s, or None without an echo."""
@@ -187,7 +191,7 @@ class EchoRequester:
 
     def close(self) -> None:
         """End the process."""
-        os.close(self._fd)
+        super().close()
         self._process.kill()
         self._process.wait()
 

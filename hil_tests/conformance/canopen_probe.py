@@ -22,6 +22,7 @@ from starhil.hil_tests.judge.canopen import (
     segment_request,
     upload_request,
 )
+from starhil.hil_tests.raw_traffic import format_frame
 
 NMT: Final = 0x000
 SYNC: Final = 0x080
@@ -187,14 +188,14 @@ class CanopenProbe:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
         frame = CanFrame(can_id, payload, extended=extended, remote=remote)
-        self.log.append(f"{self.port.now():.4f} -> {_frame_text(frame)}")
+        self.log.append(f"{self.port.now():.4f} -> {format_frame(frame)}")
         self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, or None if none arrives in time."""
         frame = self.port.receive(timeout_s)
         if frame is not None:
-            self.log.append(f"{self.port.now():.4f} <- {_frame_text(frame)}")
+            self.log.append(f"{self.port.now():.4f} <- {format_frame(frame)}")
         return frame
 
     def drain(self) -> None:
@@ -474,11 +475,6 @@ def is_integer(item: ODVariable) -> bool:
 
 def _is_boot_up(data: bytes) -> bool:
     return data == b"\0"
-
-
-def _frame_text(frame: CanFrame) -> str:
-    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    return f"{can_id}#{'R' if frame.remote else frame.data.hex().upper()}"
 
 
 def _seen(data: bytes | None) -> str:
