@@ -355,6 +355,12 @@ class CanopenProbe:
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
 
+    def state(self) -> int:
+        """Return the state in the next heartbeat, after frames in transit have arrived."""
+        self.wait_for(NOBODY, SETTLING_S)
+        self.drain()
+        return self.expect(0x700 + self.node, "heartbeat", 1.0)[0]
+
     def send_watched_heartbeat(self) -> None:
         """Send a heartbeat of the watched node, in OPERATIONAL."""
         self.send(0x700 + WATCHED_NODE, b"\x05")
