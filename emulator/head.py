@@ -209,7 +209,7 @@ class Head:
             self.pipeline_ready(warm)
         except EmulatorError as error:
             device.withdraw_start()
-            raise EmulatorError(f"profile {self.profile.source}: {error}") from None
+            raise EmulatorError(f"{self.profile.source_of(error)}: {error}") from None
         except ProtocolError as error:  # a camera constant is outside the limits of its parameter
             device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None

@@ -305,6 +305,7 @@ class Profile(Strict):
     """Defaults of device parameters, named as in the interface definition."""
 
     _source: Path | None = PrivateAttr(default=None)
+    _overrides: tuple[str, ...] = PrivateAttr(default=())
 
     @field_validator("sky")
     @classmethod
@@ -323,10 +324,15 @@ class Profile(Strict):
             return self.catalog.epoch
         return round(2000.0 + (self.start_unix_s - _J2000_UNIX_S) / _JULIAN_YEAR_S, 1)
 
-    def read_from(self, path: Path) -> Self:
-        """Note the file of the profile, to whose folder its relative paths refer; return the profile."""
+    def read_from(self, path: Path, overrides: Sequence[str] = ()) -> Self:
+        """Note the file of the profile, to whose folder its relative paths refer, and `--set`; return the profile."""
         self._source = path
+        self._overrides = tuple(overrides)
         return self
+
+    def source_of(self, error: object) -> str:
+        """Return the source of the key that an error names: an option `--set`, or the file of the profile."""
+        return _source_of_key(self.source, self._overrides, str(error))
 
     @property
     def source(self) -> str:
@@ -405,8 +411,9 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
         raise EmulatorError(f"{_source_of_key(path, overrides, why)}: {why}") from None
     for name in profile.parameters:
         if name in LINK_PARAMETERS:
-            raise EmulatorError(f"profile {path}: parameters.{name}: set {LINK_PARAMETERS[name]} instead")
-    return profile.read_from(path)
+            why = f"parameters.{name}: set {LINK_PARAMETERS[name]} instead"
+            raise EmulatorError(f"{_source_of_key(path, overrides, why)}: {why}")
+    return profile.read_from(path, overrides)
 
 
 def camera_of(name_or_path: str) -> Camera:
@@ -416,12 +423,13 @@ def camera_of(name_or_path: str) -> Camera:
     return Camera.from_dict(load_profile(name_or_path).camera.values())
 
 
-def _source_of_key(path: Path, overrides: Sequence[str], why: str) -> str:
-    """Return the source of the key with which `why` begins: an override, or else the file."""
+def _source_of_key(path: Path | str, overrides: Sequence[str], why: str) -> str:
+    """Return the source of the key with which `why` begins, or that it quotes: an override, or else the file."""
     wrong = why.partition(": ")[0]
     for override in reversed(overrides):
         key = override.partition("=")[0].strip()
-        if f"{wrong}.".startswith(f"{key}."):
+        section, _, name = key.rpartition(".")
+        if f"{wrong}.".startswith(f"{key}.") or (wrong == section and f"'{name}'" in why):
             return f"--set {override}"
     return f"profile {path}"
 

@@ -32,16 +32,7 @@ SETTLE_S: Final = 0.05
 class AsyncObcClient:
     """An OBC on one link to one device, with one request at a time.
 
-    Parameters
-    ----------
-    link : HostLink
-        A serial line or a CAN bus.
-    icd : InterfaceDefinition
-        Names and layouts of the unit.
-    timeout_s : float
-        Default time-out of a reply, s.
-    retries : int
-        Default number of repeats after a time-out; with 0, the bench sees every lost reply.
+    `timeout_s` and `retries` (after a time-out) are defaults; with no retries, the bench sees every lost reply.
     """
 
     def __init__(
@@ -80,9 +71,7 @@ class AsyncObcClient:
     async def read(self, name: str, *, timeout_s: float | None = None, retries: int | None = None) -> Reading:
         """Read a telemetry row.
 
-        Raises
-        ------
-        NackError, NoReplyError, BadReplyError, LinkLostError
+        Raises NackError, NoReplyError, BadReplyError, LinkLostError.
         """
         row = self.icd.telemetry[name]
         request = self.icd.request(row)
@@ -112,18 +101,10 @@ class AsyncObcClient:
 
         A telecommand that the link does not answer, such as `reset` on the serial line of CubeStar, counts as accepted.
 
-        Parameters
-        ----------
-        checked
-            If false, values outside the limits of the interface definition are sent too, for the device to
-            refuse.
+        With `checked` false, values outside the limits of the interface definition are sent too, for the device to refuse.
 
-        Raises
-        ------
-        FieldError
-            A value violates the definition; nothing is sent.
-        NackError
-            The device refused the telecommand; has the error code.
+        Raises FieldError: a value violates the definition; nothing is sent. Raises NackError: the device
+        refused the telecommand; has the error code.
         """
         data = self.icd.telecommands[name].encode({**(values or {}), **fields}, check=checked)
         return await self.command_raw(name, data, timeout_s=timeout_s, retries=retries)
@@ -184,10 +165,7 @@ class AsyncObcClient:
     ) -> Reading:
         """Read a row until the condition holds.
 
-        Raises
-        ------
-        BenchError
-            The condition did not hold in time.
+        Raises BenchError: the condition did not hold in time.
         """
         deadline = time.monotonic() + within_s
         while True:
@@ -205,10 +183,7 @@ class AsyncObcClient:
     ) -> Reading:
         """Return the next unsolicited telemetry of a row; other rows are dropped.
 
-        Parameters
-        ----------
-        since_s
-            Time on `time.monotonic`; messages received earlier are dropped too.
+        Messages received before `since_s` (on `time.monotonic`) are dropped too.
         """
         wanted = self.icd.telemetry[name].name
         limit = self.timeout_s if timeout_s is None else timeout_s

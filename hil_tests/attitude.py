@@ -43,10 +43,7 @@ class AttitudeError:
 def unit(values: Sequence[float]) -> Quaternion:
     """Return `values` as a unit quaternion.
 
-    Raises
-    ------
-    BenchError
-        The values are not four finite numbers of about unit length.
+    Raises BenchError: the values are not four finite numbers of about unit length.
     """
     if len(values) != 4:
         raise BenchError(f"a quaternion must have four parts (x, y, z, w), not {len(values)}")

@@ -46,16 +46,7 @@ class Bench:
 
     On exit it raises `EmulatorProcessError` if the emulator ended unexpectedly or does not end cleanly.
 
-    Parameters
-    ----------
-    options : LinkOptions
-        The links.
-    icd : InterfaceDefinition
-        Names and layouts.
-    emulator : EmulatorProcess, optional
-        Process that has not been started; the bench starts and ends it.
-    log_folder : Path, optional
-        Folder for `serial.log` and `can.log`.
+    The bench starts and ends `emulator`, a process that has not been started; `log_folder` gets `serial.log` and `can.log`.
     """
 
     def __init__(
@@ -133,10 +124,7 @@ class Bench:
     def restart(self, how: str) -> None:
         """End the emulator by SIGTERM (`term`) or SIGKILL (`kill`) and start it again.
 
-        Raises
-        ------
-        BenchError
-            The unit is not an emulator that the bench started.
+        Raises BenchError: the unit is not an emulator that the bench started.
         """
         if self.emulator is None:
             raise BenchError("only an emulator that the bench started can be restarted: use --start")

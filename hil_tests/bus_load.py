@@ -194,20 +194,8 @@ async def load_can(
 ) -> CanLoad:
     """Request telemetry from a device while other nodes load the bus.
 
-    Parameters
-    ----------
-    icd
-        Interface definition of CubeStar.
-    spec
-        The bus, as for `open_can`.
-    seconds
-        Duration.
-    rate
-        Frames per second of the other traffic.
-    device
-        CAN address of the device.
-    realtime
-        Whether the process of the other traffic gets real-time priority.
+    `spec` is a bus as for `open_can`, `rate` the frames per second of the other traffic, whose process gets real-time
+    priority with `realtime`; `device` is the CAN address of the device.
     """
     transport = open_can(spec)
     asker, echo = _CanAsker(device, transport.send), _CanAsker(ECHO, transport.send)

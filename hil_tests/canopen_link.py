@@ -19,16 +19,7 @@ from starhil.protocol.values import IcdError
 class CanopenHostLink(HostLink[CanFrame]):
     """A CANopen bus with one node.
 
-    Parameters
-    ----------
-    icd : InterfaceDefinition
-        The unit; its rows must be in its object dictionary.
-    spec : str
-        A channel for `open_can`.
-    node : int, optional
-        Node ID of the device; default: the unit's.
-    log : WireLog, optional
-        Log of every frame.
+    The rows of the unit must be in its object dictionary. `node` is the unit's by default.
     """
 
     name = "can"
@@ -46,10 +37,7 @@ class CanopenHostLink(HostLink[CanFrame]):
     def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- an upload has its own length
         """Start the transfers of a request.
 
-        Raises
-        ------
-        BenchError
-            The object dictionary does not hold the row.
+        Raises BenchError: the object dictionary does not hold the row.
         """
         row = self._icd.rows_by_key.get((request.klass, request.id))
         if row is None:

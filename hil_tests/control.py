@@ -24,10 +24,7 @@ POLL_S: Final = 0.02
 class ControlClient:
     """A client of the control channel; a context manager.
 
-    Parameters
-    ----------
-    address : str
-        Address from the ready line: unix:/PATH or HOST:PORT.
+    The address is on the ready line: unix:/PATH or HOST:PORT.
     """
 
     def __init__(self, address: str) -> None:
@@ -47,10 +44,7 @@ class ControlClient:
     def do(self, action: str, **keys: Any) -> dict[str, Any]:
         """Send a request and return the answer.
 
-        Raises
-        ------
-        BenchError
-            The request was rejected, or the channel does not answer.
+        Raises BenchError: the request was rejected, or the channel does not answer.
         """
         try:
             self._lines.write(json.dumps({"do": action, **keys}) + "\n")
@@ -92,13 +86,7 @@ class ControlClient:
 
 
 class Truth:
-    """The true attitude of the emulated sensor.
-
-    Parameters
-    ----------
-    control : ControlClient
-        The control channel.
-    """
+    """The true attitude of the emulated sensor."""
 
     def __init__(self, control: ControlClient) -> None:
         self._control = control

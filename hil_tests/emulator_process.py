@@ -67,10 +67,7 @@ def hub_command(*, log: Path | None = None) -> list[str]:
 def installed_command() -> str:
     """Return the path of the command `starhil`: beside the Python interpreter, or else on PATH.
 
-    Raises
-    ------
-    EmulatorProcessError
-        The command is not installed.
+    Raises EmulatorProcessError: the command is not installed.
     """
     beside_python = Path(sys.executable).with_name("starhil")
     if os.access(beside_python, os.X_OK):
@@ -91,10 +88,7 @@ def _starhil_command() -> list[str]:
 def parse_ready_line(line: str) -> dict[str, str]:
     """Return the `key=value` fields of a ready line.
 
-    Raises
-    ------
-    EmulatorProcessError
-        Not a ready line.
+    Raises EmulatorProcessError: not a ready line.
     """
     fields = line.split()
     if not fields or fields[0] != "ready":
@@ -105,17 +99,7 @@ def parse_ready_line(line: str) -> dict[str, str]:
 class EmulatorProcess:
     """A running emulator; it also ends with the thread that called `start`.
 
-    Parameters
-    ----------
-    command : sequence of str
-        Command line, from `emulator_command`.
-    ready_within_s : float
-        Time-out of the ready line, s.
-
-    Attributes
-    ----------
-    ready : dict
-        The ready line by key: serial, can, control, seed …
+    The command line is that of `emulator_command`; `ready` has the fields of the ready line: serial, can, control, seed …
     """
 
     def __init__(self, command: Sequence[str], *, ready_within_s: float = READY_WITHIN_S) -> None:
@@ -135,10 +119,7 @@ class EmulatorProcess:
     def check_unit(self, unit: str | None) -> None:
         """Check that emulator and bench have the same unit.
 
-        Raises
-        ------
-        BenchError
-            The emulator has another unit, selected in its profile.
+        Raises BenchError: the emulator has another unit, selected in its profile.
         """
         if unit is None and self.unit != DEFAULT_UNIT:
             raise BenchError(f"the profile's unit is {self.unit}: add --unit {self.unit}")
@@ -146,10 +127,8 @@ class EmulatorProcess:
     def start(self) -> Self:
         """Start the process and wait for its ready line.
 
-        Raises
-        ------
-        EmulatorProcessError
-            The process ended or was not ready in time; the text quotes the last lines of stderr.
+        Raises EmulatorProcessError: the process ended or was not ready in time; the text quotes the last
+        lines of stderr.
         """
         begin = time.monotonic()
         self._lines = queue.Queue()
@@ -217,10 +196,7 @@ class EmulatorProcess:
     def process(self) -> subprocess.Popen[str]:
         """The process itself.
 
-        Raises
-        ------
-        EmulatorProcessError
-            The process has not been started.
+        Raises EmulatorProcessError: the process has not been started.
         """
         if self._process is None:
             raise EmulatorProcessError("the emulator has not been started")
@@ -234,10 +210,8 @@ class EmulatorProcess:
     def stop(self) -> None:
         """End the process by SIGTERM and check that it ends with status 0.
 
-        Raises
-        ------
-        EmulatorProcessError
-            The process had already ended, does not end, or ends with another status.
+        Raises EmulatorProcessError: the process had already ended, does not end, or ends with another
+        status.
         """
         process = self.process
         if process.poll() is not None:

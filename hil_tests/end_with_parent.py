@@ -20,10 +20,7 @@ PR_SET_PDEATHSIG: Final = 1
 def exec_with_death_signal(parent: int, command: list[str]) -> None:
     """Replace this process by a command that receives SIGTERM when `parent` ends.
 
-    Raises
-    ------
-    OSError
-        The kernel rejects the request, or the command cannot be executed.
+    Raises OSError: the kernel rejects the request, or the command cannot be executed.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, int(signal.SIGTERM)) != 0:

@@ -282,10 +282,7 @@ def describe(attitude: Quaternion) -> str:
 def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
     """Return the attitude in a telemetry row that has q_x, q_y, q_z and optionally q_w.
 
-    Raises
-    ------
-    BenchError
-        The attitude in the row is flagged invalid, or there is none.
+    Raises BenchError: the attitude in the row is flagged invalid, or there is none.
     """
     if values.get("valid") is False:
         raise BenchError(f"the attitude is not valid (reason {show(values.get('reason', '?'))})")

@@ -1,4 +1,4 @@
-"""Image download: frame by frame with checksums, or in bursts with hole maps."""
+"""Image download, frame by frame with checksums or in bursts with hole maps, and PNG files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 from starhil.hil_tests.errors import BadReplyError, BenchError, NackError
@@ -23,6 +24,7 @@ from starhil.protocol.image_transfer import (
 )
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Value
+from starid.files import write_atomically
 
 
 class Downloader(Protocol):
@@ -101,10 +103,7 @@ async def save_image(client: Downloader, size: str, *, within_s: float) -> None:
 async def download_by_frames(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image and download it in frames of 128 bytes, each with a checksum.
 
-    Raises
-    ------
-    BadReplyError
-        The number or checksum of a frame stays wrong.
+    Raises BadReplyError: the number or checksum of a frame stays wrong.
     """
     edge = int(size.removeprefix("size_"))
     await save_image(client, size, within_s=within_s)
@@ -159,10 +158,7 @@ async def _when_not_busy(client: Downloader, name: str, within_s: float, values:
 async def download_by_bursts(client: Downloader, size: str, *, within_s: float) -> Image:
     """Save an image, and download the newest file of the list in bursts of up to 1024 numbered packets.
 
-    Raises
-    ------
-    BadReplyError
-        The list is empty, or the file does not have the checksum in the list.
+    Raises BadReplyError: the list is empty, or the file does not have the checksum in the list.
     """
     await save_image(client, size, within_s=within_s)
     begin = time.monotonic()
@@ -265,10 +261,7 @@ async def _send_hole_map(client: Downloader, packets: dict[int, bytes]) -> None:
 def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     """Return pixels (row by row from the top), width and height of an 8-bit grey BMP file.
 
-    Raises
-    ------
-    BadReplyError
-        The data are not such a file, or are truncated.
+    Raises BadReplyError: the data are not such a file, or are truncated.
     """
     if len(data) < BMP_HEADER_SIZE or data[:2] != b"BM":
         raise BadReplyError(f"the downloaded file of {len(data)} bytes is not a BMP image")
@@ -284,3 +277,19 @@ def decode_bmp(data: bytes) -> tuple[bytes, int, int]:
     if signed_height > 0:
         rows.reverse()
     return b"".join(rows), width, height
+
+
+def write_png(path: Path, pixels: bytes, width: int, height: int) -> None:
+    """Write a grey image atomically.
+
+    `pixels` has 8 bits per pixel, row by row from the top.
+
+    Raises BenchError: the number of bytes does not match the size.
+    """
+    import cv2
+    import numpy as np
+
+    if width < 1 or height < 1 or len(pixels) != width * height:
+        raise BenchError(f"an image of {width}x{height} needs {width * height} bytes, not {len(pixels)}")
+    _, data = cv2.imencode(".png", np.frombuffer(pixels, np.uint8).reshape(height, width))
+    write_atomically(path, lambda part: part.write_bytes(data.tobytes()))

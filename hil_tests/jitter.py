@@ -11,14 +11,15 @@ from math import inf
 from statistics import fmean
 from typing import Final
 
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
+from starhil.hil_tests.links import CanHostLink
 from starhil.hil_tests.load_figures import Jitter, Spread
-from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame, CanHostReceiver, encode_request_frames
+from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.messages import Reply, ReplyKind, Request
+from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.transports import CanTransport, open_can
 
-HOST: Final = 1
 WARM_UP: Final = 3
 """Number of messages that are ignored at the start."""
 ANSWER_S: Final = 2.0
@@ -72,43 +73,30 @@ async def unsolicited_jitter(
 ) -> Jitter:
     """Have a device send its clock unsolicited at a rate, and measure the intervals."""
     row = icd.telemetry["unix_time"]
-    receiver = CanHostReceiver(HOST, device)
-    answers: asyncio.Queue[Reply] = asyncio.Queue()
-    arrivals = _Arrivals(lambda _frame: True)
+    link = CanHostLink(spec, device_address=device)
+    client = AsyncObcClient(link, icd, timeout_s=ANSWER_S)
+    arrivals, on_reply = _Arrivals(lambda _frame: True), link.on_reply
 
-    def take(frame: CanFrame) -> None:
-        for event in receiver.feed(frame, time.monotonic()):
-            if isinstance(event, Reply) and event.kind is ReplyKind.UNSOLICITED and event.id == row.id:
-                arrivals.on_frame(frame)
-            elif isinstance(event, Reply):
-                answers.put_nowait(event)
+    def take(reply: Reply) -> None:
+        if reply.kind is ReplyKind.UNSOLICITED and reply.id == row.id:
+            arrivals.times.append(time.perf_counter())
+        on_reply(reply)
 
-    transport = open_can(spec)
-    await transport.start(take)
-    command = icd.telecommands["set_unsolicited"]
+    link.on_reply = take
+    await client.start()
     try:
         for rate, pause_s in ((rate_hz, seconds), (0.0, 0.0)):
-            data = command.encode({"telemetry": row.id, "rate": rate})
-            await _command(transport, answers, Request.of(command.id, data), device)
+            await client.command("set_unsolicited", telemetry=row.id, rate=rate)
             await asyncio.sleep(pause_s)
-    finally:
-        await transport.close()
-    return arrivals.jitter(f"unsolicited telemetry at {rate_hz:g} Hz")
-
-
-async def _command(
-    transport: CanTransport, answers: asyncio.Queue[Reply], request: Request, device: int
-) -> None:
-    for frame in encode_request_frames(request, HOST, device):
-        transport.send(frame)
-    try:
-        answer = await asyncio.wait_for(answers.get(), ANSWER_S)
-    except TimeoutError:
+    except NoReplyError:
         raise BenchError(
             f"jitter: the device at address {device} does not answer; is it on this bus?"
         ) from None
-    if answer.kind is not ReplyKind.ACK:
-        raise BenchError(f"jitter: the device refuses set_unsolicited with code {int(answer.code)}")
+    except NackError as error:
+        raise BenchError(f"jitter: the device refuses set_unsolicited with code {error.code}") from None
+    finally:
+        await client.close()
+    return arrivals.jitter(f"unsolicited telemetry at {rate_hz:g} Hz")
 
 
 class _Node:

@@ -22,6 +22,7 @@ from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.load_figures import Spread
 from starhil.protocol.can_framing import CanId, encode_request_frames
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
@@ -74,18 +75,29 @@ class ProcessRow:
     memory_mb: float
 
 
-class SerialRequester:
+class _Port:
+    """A serial port without a loop around it."""
+
+    def __init__(self, fd: int, icd: InterfaceDefinition) -> None:
+        self._icd = icd
+        self._stack = build_serial_stack(icd)
+        self._fd = fd
+        self._poll = select.poll()
+        self._poll.register(fd, select.POLLIN)
+
+    def close(self) -> None:
+        """Close the port."""
+        os.close(self._fd)
+
+
+class SerialRequester(_Port):
     """A minimal OBC on a serial line."""
 
     def __init__(self, path: str, icd: InterfaceDefinition) -> None:
-        self._icd = icd
-        self._stack = build_serial_stack(icd)
+        super().__init__(os.open(path, os.O_RDWR | os.O_NOCTTY), icd)
         self._host = self._stack.host()
-        self._fd = os.open(path, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._fd)
         os.set_blocking(self._fd, False)
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
         """Request a row; return the time until the last byte of the reply in s, or None without a reply."""
@@ -102,10 +114,6 @@ class SerialRequester:
                 return arrived - begin
         self._host = self._stack.host()
         return None
-
-    def close(self) -> None:
-        """Close the port."""
-        os.close(self._fd)
 
 
 class HubRequester:
@@ -161,18 +169,15 @@ class HubRequester:
         self._socket.close()
 
 
-class EchoRequester:
+class EchoRequester(_Port):
     """A process that echoes requests over a pty, for the latency of the machine."""
 
     def __init__(self, icd: InterfaceDefinition) -> None:
-        self._icd = icd
-        self._stack = build_serial_stack(icd)
-        self._fd, other = os.openpty()
+        fd, other = os.openpty()
+        super().__init__(fd, icd)
         tty.setraw(other)
         self._process = subprocess.Popen([sys.executable, "-c", ECHO, str(other)], pass_fds=[other])  # noqa: S603
         os.close(other)
-        self._poll = select.poll()
-        self._poll.register(self._fd, select.POLLIN)
 
     def ask(self, name: str) -> float | None:
         """Send the bytes of a request; return the time until their echo in s, or None without an echo."""
@@ -186,7 +191,7 @@ class EchoRequester:
 
     def close(self) -> None:
         """End the process."""
-        os.close(self._fd)
+        super().close()
         self._process.kill()
         self._process.wait()
 
@@ -219,20 +224,8 @@ def measure(
 ) -> tuple[list[LatencyRow], ProcessRow]:
     """Measure the latency of the links of a unit at rest and at each update rate.
 
-    Parameters
-    ----------
-    unit
-        Name or folder of the unit.
-    rates_hz
-        Update rates, Hz; 0 is standby.
-    seconds
-        Time for each rate.
-    worker
-        `process` or `thread`.
-    report
-        Called with progress messages.
-    viewers
-        Number of viewers of the console; each rate is measured alternately without and with them.
+    A rate of 0 Hz is standby; `worker` is `process` or `thread`; with `viewers` of the console, each rate is measured
+    alternately without and with them.
     """
     icd = load_unit(unit)
     rows: list[LatencyRow] = []
@@ -313,7 +306,7 @@ def _measure_rate(
                 time.sleep(SETTLE_S if count else 0.0)
                 _measure_links(probes, names, seconds / turns, rng, taken[count], lost[count])
     return [
-        _row(link, worker, rate, count, sorted(values), lost[count][link])
+        _row(link, worker, rate, count, values, lost[count][link])
         for count in counts
         for link, values in taken[count].items()
     ]
@@ -327,7 +320,7 @@ def _measure_links(
     taken: Mapping[str, list[float]],
     lost: dict[str, int],
 ) -> None:
-    """Send requests on each link in turn for some time, and add latencies in ms and losses."""
+    """Send requests on each link in turn for some time, and add latencies in s and losses."""
     end = time.monotonic() + seconds
     count = 0
     while time.monotonic() < end:
@@ -338,12 +331,11 @@ def _measure_links(
             if latency is None:
                 lost[link] += 1
             else:
-                taken[link].append(latency * 1000.0)
+                taken[link].append(latency)
             time.sleep(rng.expovariate(1.0 / PAUSE_S))
 
 
-def _row(link: str, worker: str, rate: float, viewers: int, values: list[float], lost: int) -> LatencyRow:
-    if not values:
-        return LatencyRow(link, worker, rate, viewers, 0, float("nan"), float("nan"), float("nan"), lost)
-    p50, p99 = (values[min(len(values) - 1, int(share * len(values)))] for share in (0.5, 0.99))
-    return LatencyRow(link, worker, rate, viewers, len(values), p50, p99, values[-1], lost)
+def _row(link: str, worker: str, rate: float, viewers: int, seconds: list[float], lost: int) -> LatencyRow:
+    figures = Spread.of(seconds)
+    counts = (rate, viewers, len(seconds))
+    return LatencyRow(link, worker, *counts, figures.p50_ms, figures.p99_ms, figures.max_ms, lost)

@@ -32,15 +32,6 @@ Item = TypeVar("Item", bytes, CanFrame)
 class HostLink(ABC, Generic[Item]):
     """Sends requests, and passes on replies, faults and raw items.
 
-    Parameters
-    ----------
-    transport : Transport
-        Port or bus.
-    description : str
-        Name of the port or bus, for error messages.
-    log : WireLog, optional
-        Log of all items.
-
     Attributes
     ----------
     on_reply : callable
@@ -94,10 +85,7 @@ class HostLink(ABC, Generic[Item]):
     def send(self, item: Item) -> None:
         """Send bytes or a frame unchanged.
 
-        Raises
-        ------
-        LinkLostError
-            The port or bus accepts no data.
+        Raises LinkLostError: the port or bus accepts no data.
         """
         if self._log is not None:
             self._log.sent(item)
@@ -135,18 +123,7 @@ class HostLink(ABC, Generic[Item]):
 class SerialHostLink(HostLink[bytes]):
     """A serial line with the framing of the unit's definition.
 
-    Parameters
-    ----------
-    icd : InterfaceDefinition
-        The unit.
-    spec : str
-        `/dev/…` or `socket://host:port`.
-    dialect : str, optional
-        Format of replies, if the unit has several; default: `b`.
-    baud : int
-        Bit rate of a real line.
-    log : WireLog, optional
-        Log of every byte.
+    `spec` is `/dev/…` or `socket://host:port`; `dialect` the format of replies, of a unit that has several, `b` by default.
     """
 
     name = "serial"
@@ -184,14 +161,7 @@ class SerialHostLink(HostLink[bytes]):
 class CanHostLink(HostLink[CanFrame]):
     """A CAN bus with the CubeSpace layout of CAN IDs.
 
-    Parameters
-    ----------
-    spec : str
-        A channel for `open_can`, such as `vcan0` or `socketcand:127.0.0.1:29536/vcan0`.
-    host_address, device_address : int
-        CAN addresses of this OBC and of the device.
-    log : WireLog, optional
-        Log of every frame.
+    `spec` is a channel for `open_can`, such as `vcan0` or `socketcand:127.0.0.1:29536/vcan0`.
     """
 
     name = "can"

@@ -21,10 +21,7 @@ _BYTES: Final = re.compile(r"(?:[0-9A-F]{2}|\.\.)*")
 def parse_frame(text: str) -> CanFrame:
     """Parse a frame in the format of `cansend`: `07360104#0001020304050601`, `123#R`.
 
-    Raises
-    ------
-    BenchError
-        The text is not in this format.
+    Raises BenchError: the text is not in this format.
     """
     compact = text.replace(" ", "")
     match = _FRAME.fullmatch(compact)
@@ -48,10 +45,7 @@ def format_frame(frame: CanFrame) -> str:
 def pattern(text: str) -> str:
     """Normalise the pattern of an answer: capitals without blanks; `..` matches any byte.
 
-    Raises
-    ------
-    BenchError
-        The text is neither hexadecimal bytes nor a frame.
+    Raises BenchError: the text is neither hexadecimal bytes nor a frame.
     """
     compact = text.replace(" ", "").upper()
     if _BYTES.fullmatch(compact) is None and _FRAME.fullmatch(compact) is None:
@@ -73,18 +67,8 @@ def send_and_listen(
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.
 
-    Parameters
-    ----------
-    client
-        The open link.
-    data
-        Data to send, in hexadecimal or in the format of `cansend`.
-    listen_s
-        Minimum time to listen, s.
-    wanted
-        Patterns of the answer.
-    timeout_s
-        Maximum time to wait for such an answer, s; None: the time-out of the client.
+    The data are in hexadecimal or in the format of `cansend`. Listens for `listen_s`, and for up to `timeout_s` (default: that of
+    the client) until as much has arrived as the patterns in `wanted` have.
     """
     return client.run(_send_and_listen(client, data, listen_s, wanted, timeout_s))
 

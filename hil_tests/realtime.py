@@ -12,10 +12,7 @@ PRIORITY = 1
 def set_realtime_priority(process: int = 0) -> None:
     """Give a process (0: this one) real-time priority, which its later children do not inherit.
 
-    Raises
-    ------
-    BenchError
-        The system does not permit it.
+    Raises BenchError: the system does not permit it.
     """
     policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
     try:

@@ -132,10 +132,7 @@ class TestCase:
 def prepare_report(path: Path) -> None:
     """Create the folder of a report; called before the run, so that its results are not lost.
 
-    Raises
-    ------
-    BenchError
-        No file can be written there.
+    Raises BenchError: no file can be written there.
     """
     if path.is_dir():
         raise BenchError(f"{path}: is a folder; name the file of the report")
@@ -150,10 +147,7 @@ def prepare_report(path: Path) -> None:
 def write_report(path: Path, data: bytes) -> None:
     """Write a report atomically, or to a device or standard output; create its folder if needed.
 
-    Raises
-    ------
-    BenchError
-        No file can be written there.
+    Raises BenchError: no file can be written there.
     """
     prepare_report(path)
     try:

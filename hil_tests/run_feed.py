@@ -28,21 +28,10 @@ ENDED_WITHIN_S: Final = 10.0
 class RunFeed:
     """Sends results in a separate thread; a console that fails or ends does not delay the run.
 
-    Parameters
-    ----------
-    address
-        Address of the console's page, as on the ready line of `starhil run --view`.
-    kind
-        `session` or `conformance`.
-    title, unit
-        Name of the run, and the unit under test.
-    planned
-        Expected number of results; 0 if unknown.
+    `address` is on the ready line of `starhil run --view`; `kind` is `session` or `conformance`; `planned` is the expected
+    number of results, 0 if unknown.
 
-    Raises
-    ------
-    BenchError
-        No console answers at the address.
+    Raises BenchError: no console answers at the address.
     """
 
     def __init__(self, address: str, *, kind: str, title: str, unit: str, planned: int) -> None:
@@ -130,10 +119,7 @@ class RunFeed:
 def console_address(view: str, emulator: EmulatorProcess | None) -> str:
     """Return the address of the console; for `auto`, print and return the started emulator's.
 
-    Raises
-    ------
-    BenchError
-        `auto` was given, but no emulator was started.
+    Raises BenchError: `auto` was given, but no emulator was started.
     """
     if view != "auto":
         return view

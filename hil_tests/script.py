@@ -463,10 +463,8 @@ class Script(Keys):
 def load_script(path: Path, icd: InterfaceDefinition) -> Script:
     """Read and check a session script.
 
-    Raises
-    ------
-    ScriptError
-        The file cannot be read, is not TOML, or does not match the interface definition; one line for each error.
+    Raises ScriptError: the file cannot be read, is not TOML, or does not match the interface definition;
+    one line for each error.
     """
     try:
         document = tomllib.loads(read_user_text(path))

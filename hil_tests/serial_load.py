@@ -104,16 +104,7 @@ async def load_serial(
 ) -> SerialLoad:
     """Keep a serial line busy in both directions and check every reply.
 
-    Parameters
-    ----------
-    icd
-        Interface definition of CubeStar.
-    spec
-        The port, as for `open_serial`.
-    seconds
-        Duration.
-    baud, dialect
-        Bit rate and dialect of the device.
+    `spec` is a port as for `open_serial`; `baud` and `dialect` are those of the device.
     """
     pipeline = _SerialPipeline(icd, dialect)
     transport = open_serial(spec, baud)

@@ -13,8 +13,8 @@ from starhil.hil_tests.bench import Bench
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.expect import resolve, show, show_angle
+from starhil.hil_tests.images import write_png
 from starhil.hil_tests.interruption import Interrupted
-from starhil.hil_tests.png import write_png
 from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
 from starhil.hil_tests.results import (
     FAILED,
@@ -76,18 +76,8 @@ class Outcome:
 class SessionRunner:
     """Runs a script on a bench.
 
-    Parameters
-    ----------
-    script : Script
-        Script from `load_script`.
-    bench : Bench
-        Bench whose emulator has been started.
-    folder : Path
-        Folder for CSV and image files.
-    on_result : callable
-        Called with each result.
-    truth_path : Path, optional
-        File of true attitudes instead of the one in the script.
+    The emulator of the bench has been started; `folder` gets CSV and image files; `truth_path` is a file of true
+    attitudes instead of the script's.
     """
 
     def __init__(

@@ -62,10 +62,7 @@ class SessionRequest:
 def find_script(path: Path) -> Path:
     """Return the script file; a plain name refers to a bundled script.
 
-    Raises
-    ------
-    ScriptError
-        There is no such script; the text suggests similar names.
+    Raises ScriptError: there is no such script; the text suggests similar names.
     """
     if path.is_file():
         return path
@@ -80,10 +77,7 @@ def find_script(path: Path) -> Path:
 def run_session(request: SessionRequest) -> SessionResult:
     """Run a session and return its result.
 
-    Raises
-    ------
-    BenchError
-        The script is invalid, a port is not available, or the emulator does not start.
+    Raises BenchError: the script is invalid, a port is not available, or the emulator does not start.
     """
     icd = load_unit(request.unit or DEFAULT_UNIT)
     path = find_script(request.script)

@@ -19,12 +19,7 @@ LOCK_NAME: Final = "owner.lock"
 def temporary_folder(prefix: str, base: Path | None = None) -> Iterator[Path]:
     """Create a temporary folder and remove it at the end, together with folders whose owner was killed.
 
-    Parameters
-    ----------
-    prefix
-        Prefix of its name; abandoned folders with the same prefix are removed.
-    base
-        Parent folder; default: the system's temporary folder.
+    Abandoned folders with the same prefix are removed; `base` is the system's temporary folder by default.
     """
     root = Path(tempfile.gettempdir()) if base is None else base
     for folder in root.glob(f"{prefix}*"):

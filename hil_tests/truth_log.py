@@ -23,11 +23,7 @@ SLACK_S: Final = 0.0005
 class TruthLogReader:
     """True attitudes over device time.
 
-    Parameters
-    ----------
-    path : Path
-        A CSV file with a column of times (device clock, seconds since 1970-01-01 UTC) and four columns of the
-        quaternion.
+    The file is CSV, with a column of times (device clock, seconds since 1970-01-01 UTC) and four of the quaternion.
     """
 
     def __init__(self, path: Path) -> None:
@@ -38,10 +34,7 @@ class TruthLogReader:
     def at(self, time_s: float) -> Quaternion:
         """Return the attitude at a device time, interpolated by the shortest rotation.
 
-        Raises
-        ------
-        BenchError
-            The file cannot be read, lacks a column, or does not cover the time.
+        Raises BenchError: the file cannot be read, lacks a column, or does not cover the time.
         """
         if not self._covers(time_s):
             self._read()

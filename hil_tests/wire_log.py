@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Self
@@ -12,46 +11,34 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import format_candump
 
 
-class WireLog(ABC):
+class WireLog:
     """A text log of sent and received items, written line by line.
 
-    Parameters
-    ----------
-    path : Path
-        File to write; an existing file is replaced.
-    now : callable
-        Seconds since 1970-01-01 UTC.
+    An existing file is replaced; `now` returns seconds since 1970-01-01 UTC.
     """
 
     def __init__(self, path: Path, *, now: Callable[[], float] = time.time) -> None:
         self._now = now
         self._file = path.open("w", encoding="utf-8", buffering=1)
 
-    @abstractmethod
     def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:
         """Format one line, without the newline."""
+        raise NotImplementedError
+
+    def _write(self, line: str) -> None:
+        if not self._file.closed:
+            self._file.write(line + "\n")
 
     def sent(self, item: bytes | CanFrame) -> None:
         """Log an item that is passed to the transport."""
-        self._write("TX", item)
+        self._write(self._line(self._now(), "TX", item))
 
     def received(self, item: bytes | CanFrame) -> None:
         """Log an item that the transport has received."""
-        self._write("RX", item)
+        self._write(self._line(self._now(), "RX", item))
 
     def note(self, text: str) -> None:
         """Write a comment line; a format without comments drops it."""
-        line = self._comment(self._now(), text)
-        if line is not None and not self._file.closed:
-            self._file.write(line + "\n")
-
-    def _comment(self, time_s: float, text: str) -> str | None:  # noqa: ARG002 -- no comments by default
-        """Return a comment line, or None if the format has no comments."""
-        return None
-
-    def _write(self, direction: str, item: bytes | CanFrame) -> None:
-        if not self._file.closed:
-            self._file.write(self._line(self._now(), direction, item) + "\n")
 
     def close(self) -> None:
         """Close the file; later items are not logged."""
@@ -75,8 +62,9 @@ class SerialLog(WireLog):
         super().__init__(path, now=now)
         self._file.write("# (seconds since 1970-01-01 UTC) TX = to the device, RX = from the device\n")
 
-    def _comment(self, time_s: float, text: str) -> str:
-        return f"# ({time_s:.6f}) {text}"
+    def note(self, text: str) -> None:
+        """Write a comment line."""
+        self._write(f"# ({self._now():.6f}) {text}")
 
     def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:
         data = item.data if isinstance(item, CanFrame) else item

@@ -51,6 +51,12 @@ def command(
     ] = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this run.")] = False,
     profile: Annotated[str | None, typer.Option(help="With --start: device profile.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", help="With --start: override a key of the profile: section.key=value. Repeatable."
+        ),
+    ] = None,
     speed: Annotated[
         float,
         typer.Option(
@@ -106,6 +112,8 @@ def command(
         one_of("--dialect", dialect, DIALECTS)
     if (start or list_only) and serial is None and can is None:
         serial, can, canopen = links_of(load_unit(unit or DEFAULT_UNIT), canopen)
+    if settings and not start:
+        raise BenchError("--set needs --start: it overrides a key of the emulator's profile")
     if canopen is not None and can is None:
         raise BenchError("--canopen needs --can: give the channel of the node")
     if not start and not list_only and serial == "auto":
@@ -118,6 +126,7 @@ def command(
         eds=eds,
         start=start,
         profile=profile,
+        settings=tuple(settings or ()),
         dialect=dialect,
         baud=baud,
         host_address=host_address,
@@ -137,12 +146,6 @@ def command(
     for path in (junit, html):
         if path is not None:
             prepare_report(path)
-    links = (
-        serial and f"serial {serial}" + (f" (dialect {dialect})" if dialect else ""),
-        can and f"CAN {can}",
-        canopen and f"CANopen node {canopen}",
-    )
-    unit = ", ".join(link for link in links if link) + (", emulator started for this run" if start else "")
     with interruptible():
         result = run_conformance(
             request, lambda outcome: report.print_outcome(console, outcome, verbose=verbose)
@@ -151,9 +154,9 @@ def command(
         if junit is not None:
             report.write_junit_report(junit, outcomes)
         if html is not None:
-            report.write_html_report(html, outcomes, unit)
+            report.write_html_report(html, outcomes, result.facts)
     if as_json:
-        json.dump(report.to_json(outcomes, unit), sys.stdout)
+        json.dump(report.to_json(outcomes, result.facts), sys.stdout)
         print()
     else:
         report.print_summary(console, outcomes)

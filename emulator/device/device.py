@@ -95,7 +95,7 @@ class Device:
             defaults = profile_defaults(profile, icd)
             self.parameters = Parameters(icd, defaults, signals.parameters_changed.emit)
         except EmulatorError as error:
-            raise EmulatorError(f"profile {profile.source}: {error}") from None
+            raise EmulatorError(f"{profile.source_of(error)}: {error}") from None
         self.counters = Counters()
         self.acknowledge = Acknowledge()
         self.modes = Modes(signals.mode_changed.emit)

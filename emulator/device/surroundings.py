@@ -86,4 +86,4 @@ def orbit_of(profile: Profile) -> Orbit | None:
     try:
         return profile.orbit.build(profile.start_unix_s, profile.folder)
     except EmulatorError as error:
-        raise EmulatorError(f"profile {profile.source}: {error}") from None
+        raise EmulatorError(f"{profile.source_of(error)}: {error}") from None

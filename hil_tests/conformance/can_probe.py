@@ -14,19 +14,8 @@ from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pa
 class CanProbe(LinkProbe):
     """Talks to a unit over a CAN bus.
 
-    Parameters
-    ----------
-    bus
-        The bus.
-    unit
-        Definition of the unit.
-    host, device
-        CAN addresses of the tester and of the device.
-
-    Attributes
-    ----------
-    unsolicited
-        Frames of unsolicited telemetry.
+    `host` and `device` are the CAN addresses of the tester and of the device; `unsolicited` has the frames of unsolicited
+    telemetry.
     """
 
     link = "can"

@@ -13,12 +13,28 @@ An answer is one of
     block MUX               the answer to a block download, with a block size of 1 to 127
     silence, *, -           no answer; any answer or none; do not wait
 
-Other lines: `nmt N` sends an NMT command, `value BYTES` reads the writable number, `kept` finds it as it was before the
-dialogue. Names in braces are in `Names`; all are found before the first request.
+Other lines begin with a verb:
+
+    need 1016 1029              skip the case if an object is missing
+    set 1017:0 20 u16           write a number; it must be accepted
+    set 1003:0 1 u8 > A|B       it must be refused with one of these aborts; VALUES stands for those of a wrong value
+    set 1010:1 save             write a text
+    holds 1005:0 0x80 0x7ff     read a number, and look at the bits of a mask
+    value BYTES, kept           read the writable number: these bytes, or as it was before the dialogue
+    nmt 1, nmt 1 all, nmt 1 other       an NMT command to the node, to all nodes, to another node
+    boot-up, state 7f           the boot-up message; the next heartbeat, with this state
+    guard 7f, guard             node guarding is answered with this state and toggle bit, or not at all
+    watched                     a heartbeat of the node that this one watches
+    emcy 8130 0.3, calm 0.4     this EMCY, or none, within a time, s
+    send 000 01 extended        a frame, with 29 bits of CAN ID if so said
+    sleep 0.2, drain, quiet, reset      wait; forget what was received; PDOs and heartbeat off; reset of the communication
+
+Names in braces are in `Names`; all are found before the first request.
 """
 
 from __future__ import annotations
 
+import re
 from binascii import crc_hqx
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -29,6 +45,8 @@ from canopen.objectdictionary import ODVariable, datatypes
 
 from starhil.hil_tests.conformance.canopen_probe import (
     ANSWER_S,
+    NOBODY,
+    VALUE_ABORTS,
     Abort,
     CanopenProbe,
     check_abort,
@@ -36,7 +54,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     is_integer,
     size_of,
 )
-from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
 from starhil.hil_tests.judge.canopen import multiplexer
 
 LONGEST_TIMEOUT_S: Final = 12.0
@@ -65,7 +83,7 @@ class Names(dict[str, str]):
 
     `text`, `number`, `write_only`: multiplexer of a long readable text, of a writable number of 16 bits, of an object
     that cannot be read; `new`, `low`, `high`: another value for the number, and its bytes; `crc`, `bad_crc`: CRC of this
-    value, and another; `node`; `vendor`, `product`, `revision`, `serial`: parts of the identity.
+    value, and another; `tpdo`: index of the first TPDO; `node`; `vendor`, `product`, `revision`, `serial`: parts of the identity.
     """
 
     def __init__(self, probe: CanopenProbe) -> None:
@@ -83,6 +101,8 @@ class Names(dict[str, str]):
             return mux(writable_number(probe))
         if name == "write_only":
             return mux(probe.find("write-only object", lambda item: item.access_type == "wo"))
+        if name == "tpdo":
+            return f"{next(iter(probe.pdo_indices(0x1800)), 0x1800):04x}"
         if name == "node":
             return f"{probe.node:02x}"
         if name in IDENTITY:
@@ -97,14 +117,14 @@ class Names(dict[str, str]):
 def add_dialogues(
     area: CaseArea[CanopenProbe],
     table: Iterable[Dialogue],
-    ask_of: Callable[[CanopenProbe], Ask],
+    ask_of: Callable[[CanopenProbe], Ask] | None = None,
     prepare: Callable[[CanopenProbe], object] = lambda _probe: None,
 ) -> None:
-    """Add one case per dialogue; `ask_of` returns how its requests are sent, `prepare` precedes it."""
+    """Add one case per dialogue; `ask_of` returns how its requests are sent, by default by SDO; `prepare` precedes it."""
 
     def run(row: Dialogue, probe: CanopenProbe) -> None:
         prepare(probe)
-        hold(probe, row.lines, ask_of(probe))
+        hold(probe, row.lines, (ask_of or sdo)(probe))
 
     for row in table:
         area.case(row.id, row.title, row.clause, intrusive=row.intrusive)(partial(run, row))
@@ -121,25 +141,93 @@ def sdo(probe: CanopenProbe) -> Ask:
 
 def hold(probe: CanopenProbe, lines: str, ask: Ask) -> None:
     """Hold a dialogue."""
-    text = lines.format_map(Names(probe))
-    number = writable_number(probe) if "value" in text or "kept" in text else None
-    before = b"" if number is None else probe.value(number)
-    for line in text.split("; "):
-        match line.split():
-            case ["nmt", command]:
-                probe.command(int(command))
-            case ["value", *data] if number is not None:
-                check_equal(probe.value(number), bytes.fromhex("".join(data)), "value")
-            case ["kept"] if number is not None:
-                check_equal(probe.value(number), before, "value as before")
-            case _:
-                request, _, answer = (part.strip() for part in line.partition(">"))
-                if _ends(request, answer, ask):
-                    return
+    for needed in re.findall(r"need ([\w ]+)", lines):
+        probe.require(*(int(index, 16) for index in needed.split()))
+    master = _Master(probe, lines)
+    for number, line in enumerate(lines.format_map(Names(probe)).split(";"), 1):
+        try:
+            if _ends(master, line.strip(), ask):
+                return
+        except CaseFailed as failure:
+            raise CaseFailed(f"{failure.expected} (step {number}: {line.strip()})", failure.seen) from None
 
 
-def _ends(request: str, answer: str, ask: Ask) -> bool:
-    """Send a request and check the answer; return whether the dialogue ends with it."""
+class _Master:
+    """The verbs of a dialogue, with the words that follow them."""
+
+    def __init__(self, probe: CanopenProbe, lines: str) -> None:
+        self.drain, self.quiet, self.reset = probe.drain, probe.quiet, probe.reset_communication
+        self.boot_up, self.watched = probe.expect_boot_up, probe.send_watched_heartbeat
+        self._probe = probe
+        self._emergency = probe.emergency_id() if re.search("emcy|calm", lines) else 0
+        self._number = writable_number(probe) if re.search("value|kept", lines) else None
+        self._before = b"" if self._number is None else probe.value(self._number)
+
+    def need(self, *_indices: str) -> None:
+        pass  # checked before the dialogue
+
+    def set(self, entry: str, value: str, kind: str = "", *refused: str) -> None:
+        index, subindex = (int(part, 16) for part in entry.split(":"))
+        data = int(value, 0).to_bytes(int(kind[1:]) // 8, "little") if kind else value.encode()
+        if refused:
+            self._probe.expect_refusal(index, subindex, data, len(data), *_codes(refused[1]))
+        else:
+            self._probe.set(index, subindex, data)
+
+    def holds(self, entry: str, number: str, mask: str = "-1") -> None:
+        index, subindex = (int(part, 16) for part in entry.split(":"))
+        check_equal(self._probe.number(index, subindex) & int(mask, 0), int(number, 0), f"{index:04X}h")
+
+    def value(self, *data: str) -> None:
+        check_equal(self._read(), bytes.fromhex("".join(data)), "value")
+
+    def kept(self) -> None:
+        check_equal(self._read(), self._before, "value as before")
+
+    def _read(self) -> bytes:
+        return b"" if self._number is None else self._probe.value(self._number)
+
+    def nmt(self, command: str, whom: str = "") -> None:
+        node = {"all": 0, "other": self._probe.node % 127 + 1}.get(whom)
+        self._probe.command(int(command), node)
+
+    def state(self, wanted: str) -> None:
+        check_equal(f"{self._probe.state():02x}", wanted, "state")
+
+    def guard(self, wanted: str = "") -> None:
+        can_id = 0x700 + self._probe.node
+        self._probe.send(can_id, remote=True)
+        if wanted:
+            seen = self._probe.expect(can_id, "answer to node guarding").hex()
+            check(seen in wanted.split("|"), f"answer {wanted} to node guarding", seen)
+        else:
+            self._probe.expect_silence(can_id, "answer to node guarding", 0.2)
+
+    def emcy(self, code: str, within_s: str = str(ANSWER_S)) -> None:
+        self._probe.expect_emergency(self._emergency, int(code, 16), float(within_s))
+
+    def calm(self, for_s: str) -> None:
+        self._probe.expect_silence(self._emergency, "EMCY", float(for_s))
+
+    def send(self, can_id: str, data: str, extended: str = "") -> None:
+        self._probe.send(int(can_id, 16), data, extended=bool(extended))
+
+    def sleep(self, seconds: str) -> None:
+        self._probe.wait_for(NOBODY, float(seconds))
+
+
+def _codes(names: str) -> tuple[int, ...]:
+    return VALUE_ABORTS if names == "VALUES" else tuple(Abort[name] for name in names.split("|"))
+
+
+def _ends(master: _Master, line: str, ask: Ask) -> bool:
+    """Do what a line says, and check the answer; return whether the dialogue ends with it."""
+    verb, *words = line.split()
+    act = getattr(master, verb.replace("-", "_"), None) if verb[:1].isalpha() else None
+    if act is not None:
+        act(*words)
+        return False
+    request, _, answer = (part.strip() for part in line.partition(">"))
     data = b"" if request == "wait" else bytes.fromhex(request)
     kind, *details = answer.split()
     timeout_s = {"silence": 0.1, "-": 0.0}.get(kind, LONGEST_TIMEOUT_S if request == "wait" else ANSWER_S)
@@ -148,10 +236,10 @@ def _ends(request: str, answer: str, ask: Ask) -> bool:
         case "silence":
             check(seen is None, f"no answer to {request}", seen or "an empty frame")
         case "abort":
-            _check_abort(seen, *details)
+            check_abort(seen, *_codes(details[0]), multiplexer="".join(details[1:]))
         case "unless":
             if seen is None or seen[0] == 0x80:
-                _check_abort(seen, *details[1:])
+                check_abort(seen, *_codes(details[1]), multiplexer="".join(details[2:]))
                 return True
         case "segment":
             check(seen is not None, f"segment {details[0]} of the block", seen)
@@ -165,10 +253,6 @@ def _ends(request: str, answer: str, ask: Ask) -> bool:
         case _:
             check_answer(seen, answer)
     return False
-
-
-def _check_abort(seen: bytes | None, names: str, multiplexer: str = "") -> None:
-    check_abort(seen, *(Abort[name] for name in names.split("|")), multiplexer=multiplexer)
 
 
 # --- objects that every node has in some form ---

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from starhil.hil_tests.conformance.canopen_dialogue import Dialogue, add_dialogues
 from starhil.hil_tests.conformance.canopen_probe import (
     PDO_OFF,
     PRE_OPERATIONAL,
@@ -17,6 +18,12 @@ from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, che
 from starhil.hil_tests.judge.canopen import multiplexer
 
 EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusive=True)
+
+
+add_dialogues(
+    EMCY,
+    [Dialogue("history-write", "the error history accepts only 0", "need 1003; set 1003:0 1 u8 > VALUES")],
+)
 
 
 class ProvokedError:
@@ -122,12 +129,6 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     error.clear()
     data = probe.expect(error.emergency, "EMCY 0000h")
     check_equal(data[2], register, "error register with the error that remains")
-
-
-@EMCY.case("history-write", "the error history accepts only 0")
-def emcy_history_write(probe: CanopenProbe) -> None:
-    probe.require(0x1003)
-    probe.expect_refusal(0x1003, 0, 1, 1, *VALUE_ABORTS)
 
 
 @EMCY.case("switch", "bit 31 switches EMCY off, and its CAN ID changes only then", "CiA 301 7.5.2.15")

@@ -12,6 +12,7 @@ from typing import Final
 
 from canopen.objectdictionary import ODVariable
 
+from starhil.hil_tests.conformance.canopen_dialogue import Dialogue, add_dialogues
 from starhil.hil_tests.conformance.canopen_probe import (
     FIRST_OWN_OBJECT,
     NO_RTR,
@@ -187,6 +188,19 @@ def after_event(probe: CanopenProbe, can_id: int, timeout_s: float | None = None
 # --- transmit PDOs ---
 
 
+add_dialogues(
+    TPDO,
+    [
+        Dialogue(
+            "types",
+            "reserved transmission types",
+            "need 1800; set {tpdo}:2 241 u8 > VALUES; set {tpdo}:2 251 u8 > VALUES; set {tpdo}:2 0 u8; set {tpdo}:2 1 u8; "
+            "set {tpdo}:2 240 u8; set {tpdo}:2 254 u8; set {tpdo}:2 255 u8",
+        )
+    ],
+)
+
+
 @TPDO.case("cyclic", "a synchronous TPDO is sent at every nth SYNC", "CiA 301 7.2.2.2")
 def cyclic(probe: CanopenProbe) -> None:
     index, item = first(probe, 0x1800), constant(probe)
@@ -349,15 +363,6 @@ def fixed(probe: CanopenProbe) -> None:
     probe.expect_refusal(index + 0x200, 1, entry(item), 4, *FIXED)
     probe.set(index + 0x200, 0, 0, 1)
     probe.set(index + 0x200, 1, entry(item))
-
-
-@TPDO.case("types", "reserved transmission types")
-def types(probe: CanopenProbe) -> None:
-    index = first(probe, 0x1800)
-    for value in (241, 251):
-        probe.expect_refusal(index, 2, value, 1, *VALUE_ABORTS)
-    for value in (0, 1, 240, 254, 255):
-        probe.set(index, 2, value, 1)
 
 
 @TPDO.case("reserved", "sub-index 4 of a TPDO does not exist", intrusive=False)

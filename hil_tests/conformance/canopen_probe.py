@@ -9,6 +9,7 @@ from typing import Final
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
+from starhil.hil_tests.conformance.attitude_cases import TruthSource
 from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_equal
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
@@ -21,6 +22,7 @@ from starhil.hil_tests.judge.canopen import (
     segment_request,
     upload_request,
 )
+from starhil.hil_tests.raw_traffic import format_frame
 
 NMT: Final = 0x000
 SYNC: Final = 0x080
@@ -34,6 +36,8 @@ PRE_OPERATIONAL: Final = 128
 RESET_NODE: Final = 129
 RESET_COMMUNICATION: Final = 130
 
+TEXTS: Final = {"name": 0x1008, "hardware": 0x1009, "software": 0x100A}
+"""Objects that describe the node."""
 ANSWER_S: Final = 0.5
 """Maximum time for an answer."""
 BOOT_S: Final = 3.0
@@ -92,17 +96,10 @@ WATCHED_NODE: Final = 0x05
 class CanopenProbe:
     """Talks to one node.
 
-    Parameters
-    ----------
-    port
-        The bus of the node.
-    node
-        Node ID.
-    od
-        Object dictionary, from the EDS.
-    eds
-        Text of the EDS; empty if there is none.
+    `od` is the object dictionary of the EDS, whose text is `eds`; empty if there is none.
     """
+
+    link = "canopen"
 
     def __init__(self, port: Port[CanFrame], node: int, od: ObjectDictionary, eds: str = "") -> None:
         self.port = port
@@ -110,11 +107,21 @@ class CanopenProbe:
         self.od = od
         self.eds = eds
         self.log: list[str] = []
+        self.truth: TruthSource | None = None
         self._boots = True
         self._multiplexer = bytes(3)
         self._found: dict[tuple[int, int], bytes] = {}
 
     # Around a run
+
+    def identity(self) -> str:
+        """Return names, versions and numbers of the node, as far as it has them."""
+        texts = {what: self.try_read(index) for what, index in TEXTS.items() if index in self.od}
+        found = {what: text.decode("latin-1") for what, text in texts.items() if isinstance(text, bytes)}
+        for subindex, what in enumerate(("vendor", "product", "revision", "serial number"), 1):
+            if isinstance(number := self.try_read(0x1018, subindex), bytes):
+                found[what] = f"0x{int.from_bytes(number, 'little'):08X}"
+        return ", ".join(f"{what} {text}" for what, text in found.items())
 
     def silence(self, *, booting: bool) -> str | None:
         """Return `nothing` if the node does not answer a read of its device type, None if it does.
@@ -144,10 +151,7 @@ class CanopenProbe:
     def restore(self) -> None:
         """Restore the values that `prepare` recorded, and store them.
 
-        Raises
-        ------
-        CaseFailed
-            The node does not accept them.
+        Raises CaseFailed: the node does not accept them.
         """
         if not self._found:
             return
@@ -184,14 +188,14 @@ class CanopenProbe:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
         frame = CanFrame(can_id, payload, extended=extended, remote=remote)
-        self.log.append(f"{self.port.now():.4f} -> {_frame_text(frame)}")
+        self.log.append(f"{self.port.now():.4f} -> {format_frame(frame)}")
         self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, or None if none arrives in time."""
         frame = self.port.receive(timeout_s)
         if frame is not None:
-            self.log.append(f"{self.port.now():.4f} <- {_frame_text(frame)}")
+            self.log.append(f"{self.port.now():.4f} <- {format_frame(frame)}")
         return frame
 
     def drain(self) -> None:
@@ -351,6 +355,12 @@ class CanopenProbe:
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
 
+    def state(self) -> int:
+        """Return the state in the next heartbeat, after frames in transit have arrived."""
+        self.wait_for(NOBODY, SETTLING_S)
+        self.drain()
+        return self.expect(0x700 + self.node, "heartbeat", 1.0)[0]
+
     def send_watched_heartbeat(self) -> None:
         """Send a heartbeat of the watched node, in OPERATIONAL."""
         self.send(0x700 + WATCHED_NODE, b"\x05")
@@ -471,11 +481,6 @@ def is_integer(item: ODVariable) -> bool:
 
 def _is_boot_up(data: bytes) -> bool:
     return data == b"\0"
-
-
-def _frame_text(frame: CanFrame) -> str:
-    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    return f"{can_id}#{'R' if frame.remote else frame.data.hex().upper()}"
 
 
 def _seen(data: bytes | None) -> str:

@@ -13,7 +13,6 @@ from starhil.hil_tests.conformance.canopen_dialogue import (
     add_dialogues,
     long_text,
     mux,
-    sdo,
     writable_number,
 )
 from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, check_abort, is_integer, size_of
@@ -64,8 +63,8 @@ IGNORED: Final = (
 )  # fmt: skip
 """ID, title, clause and content of frames with the CAN ID of a request."""
 
-add_dialogues(SDO, DIALOGUES, sdo)
-add_dialogues(SDO_BLOCK, BLOCK_DIALOGUES, sdo)
+add_dialogues(SDO, DIALOGUES)
+add_dialogues(SDO_BLOCK, BLOCK_DIALOGUES)
 
 
 # --- expedited and segmented transfer ---

@@ -28,6 +28,22 @@ def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
     probe.expect_boot_up()
 
 
+RESET: Final = "drain; nmt 129; boot-up; "
+STORE_DIALOGUES: Final = (
+    Dialogue(
+        "save", "stored parameters are restored by a reset",
+        f"need 1010; set 1017:0 777 u16; set 1010:1 save; set 1017:0 555 u16; {RESET}holds 1017:0 777; "
+        f"set 1017:0 555 u16; drain; nmt 130; boot-up; holds 1017:0 777; set 1011:1 load; {RESET}drain",
+    ),
+    Dialogue(
+        "pdo", "a stored PDO configuration is restored by a reset",
+        f"need 1010 1800; set 1800:2 17 u8; set 1010:2 save; {RESET}holds 1800:2 17; set 1011:1 load; {RESET}drain",
+    ),
+)  # fmt: skip
+
+add_dialogues(STORE, STORE_DIALOGUES)
+
+
 @STORE.case("ability", "1010h and 1011h report their capabilities", intrusive=False)
 def ability(probe: CanopenProbe) -> None:
     for index in (0x1010, 0x1011):
@@ -43,18 +59,6 @@ def signature(probe: CanopenProbe) -> None:
         if index in probe.od:
             for value in (other, other.upper(), b"evas", bytes(4), b"\x01\0\0\0"):
                 probe.expect_refusal(index, 1, value, 4, *SIGNATURE_REFUSED)
-
-
-@STORE.case("save", "stored parameters are restored by a reset")
-def save(probe: CanopenProbe) -> None:
-    probe.require(0x1010)
-    probe.set(0x1017, 0, 777, 2)
-    probe.set(0x1010, 1, b"save")
-    for command in (RESET_NODE, RESET_COMMUNICATION):
-        probe.set(0x1017, 0, 555, 2)
-        _reset(probe, command)
-        check_equal(probe.number(0x1017), 777, "1017h")
-    _restore(probe)
 
 
 def _restore(probe: CanopenProbe) -> None:
@@ -84,16 +88,6 @@ def groups(probe: CanopenProbe) -> None:
     probe.set(0x1010, 3, b"save")
     _reset(probe)
     check_equal(probe.number(0x1017), before, "1017h")
-    _restore(probe)
-
-
-@STORE.case("pdo", "a stored PDO configuration is restored by a reset")
-def pdo(probe: CanopenProbe) -> None:
-    probe.require(0x1010, 0x1800)
-    probe.set(0x1800, 2, 17, 1)
-    probe.set(0x1010, 2, b"save")
-    _reset(probe)
-    check_equal(probe.number(0x1800, 2), 17, "1800h:02h")
     _restore(probe)
 
 

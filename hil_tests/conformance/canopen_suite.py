@@ -30,9 +30,6 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
 def canopen_suite(unit: Unit) -> tuple[Case[CanopenProbe], ...]:
     """Return the cases for a unit on CANopen.
 
-    Raises
-    ------
-    IcdError
-        The unit has no CANopen node.
+    Raises IcdError: the unit has no CANopen node.
     """
     return (*CANOPEN_CASES, *canopen_unit_cases(unit))

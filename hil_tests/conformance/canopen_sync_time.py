@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Final
 
+from starhil.hil_tests.conformance.canopen_dialogue import Dialogue, add_dialogues
 from starhil.hil_tests.conformance.canopen_probe import (
     NO_RTR,
     RESTRICTED_IDS,
     STOP,
-    VALUE_ABORTS,
     Abort,
     CanopenProbe,
 )
@@ -23,35 +23,40 @@ def _quiet_and_drain(probe: CanopenProbe) -> None:
     probe.drain()
 
 
-# SYNC
+SYNC_DIALOGUES: Final = (
+    Dialogue(
+        "identifier", "CAN IDs that SYNC must not have",
+        "need 1005; " + "".join(f"set 1005:0 {can_id} u32 > VALUES; " for can_id in (*RESTRICTED_IDS, 0x2000_0080))
+        + "holds 1005:0 0x80 0x7ff",
+    ),
+    Dialogue(
+        "counter-range", "invalid values of the counter overflow",
+        "need 1019; set 1019:0 1 u8 > VALUES; set 1019:0 241 u8 > VALUES; set 1019:0 255 u8 > VALUES; "
+        "set 1019:0 2 u8; set 1019:0 240 u8; set 1019:0 0 u8",
+        "CiA 301 7.5.2.22",
+    ),
+    Dialogue(
+        "counter-fixed", "the counter overflow cannot be changed while a period is set",
+        "need 1019 1006; set 1006:0 100000 u32; set 1019:0 10 u8 > DEVICE_STATE; set 1006:0 0 u32; set 1019:0 10 u8",
+        "CiA 301 7.5.2.22",
+    ),
+)  # fmt: skip
+TIME_DIALOGUES: Final = (
+    Dialogue(
+        "identifier", "CAN IDs that TIME must not have",
+        "need 1012; set 1012:0 0x100 u32; "
+        + "".join(f"set 1012:0 {can_id} u32 > VALUES; " for can_id in (*RESTRICTED_IDS, 0x2000_0100))
+        + "set 1012:0 0x80000100 u32; set 1012:0 0x80000090 u32 > VALUES",
+    ),
+    Dialogue(
+        "malformed", "TIME of wrong length has no effect",
+        "send 100 0011223344; send 100 00112233445566; send 100 ffffff0f0000; 40 00 10 00 > 43 00 10 00 .. .. .. ..",
+        "CiA 301 7.2.6.3",
+    ),
+)  # fmt: skip
 
-
-@SYNC.case("identifier", "CAN IDs that SYNC must not have")
-def sync_identifier(probe: CanopenProbe) -> None:
-    probe.require(0x1005)
-    for can_id in (*RESTRICTED_IDS, 0x2000_0080):
-        probe.expect_refusal(0x1005, 0, can_id, 4, *VALUE_ABORTS)
-    check_equal(probe.number(0x1005) & 0x7FF, 0x80, "1005h as before")
-
-
-@SYNC.case("counter-range", "invalid values of the counter overflow", "CiA 301 7.5.2.22")
-def sync_counter_range(probe: CanopenProbe) -> None:
-    probe.require(0x1019)
-    for value in (1, 241, 255):
-        probe.expect_refusal(0x1019, 0, value, 1, *VALUE_ABORTS)
-    for value in (2, 240, 0):
-        probe.set(0x1019, 0, value, 1)
-
-
-@SYNC.case(
-    "counter-fixed", "the counter overflow cannot be changed while a period is set", "CiA 301 7.5.2.22"
-)
-def sync_counter_fixed(probe: CanopenProbe) -> None:
-    probe.require(0x1019, 0x1006)
-    probe.set(0x1006, 0, 100_000)
-    probe.expect_refusal(0x1019, 0, 10, 1, Abort.DEVICE_STATE)
-    probe.set(0x1006, 0, 0)
-    probe.set(0x1019, 0, 10, 1)
+add_dialogues(SYNC, SYNC_DIALOGUES)
+add_dialogues(TIME, TIME_DIALOGUES)
 
 
 @SYNC.case("length", "SYNC of unexpected length is reported", "CiA 301 7.2.5.3")
@@ -86,23 +91,3 @@ def sync_producer(probe: CanopenProbe) -> None:
     probe.expect_refusal(0x1005, 0, NO_RTR | 0x81, 4, Abort.VALUE)
     probe.command_and_settle(STOP)
     probe.expect_silence(0x080, "SYNC in STOPPED")
-
-
-# TIME
-
-
-@TIME.case("identifier", "CAN IDs that TIME must not have")
-def time_identifier(probe: CanopenProbe) -> None:
-    probe.require(0x1012)
-    probe.set(0x1012, 0, 0x100)
-    for can_id in (*RESTRICTED_IDS, 0x2000_0100):
-        probe.expect_refusal(0x1012, 0, can_id, 4, *VALUE_ABORTS)
-    probe.set(0x1012, 0, 0x8000_0100)
-    probe.expect_refusal(0x1012, 0, 0x8000_0090, 4, *VALUE_ABORTS)
-
-
-@TIME.case("malformed", "TIME of wrong length has no effect", "CiA 301 7.2.6.3")
-def time_malformed(probe: CanopenProbe) -> None:
-    for data in ("00 11 22 33 44", "00 11 22 33 44 55 66", "ff ff ff 0f 00 00"):
-        probe.send(0x100, data)
-    probe.expect_answer("40 00 10 00", "43 00 10 00 .. .. .. ..")

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from typing import Any, Final
 
+from starhil.hil_tests.conformance.attitude_cases import (
+    ATTITUDE_S,
+    AttitudeRow,
+    identifying_stars,
+    reported_mode,
+)
 from starhil.hil_tests.conformance.canopen_pdo import SYNCHRONOUS, send_sync
 from starhil.hil_tests.conformance.canopen_probe import (
     NO_RTR,
@@ -16,16 +22,9 @@ from starhil.hil_tests.conformance.canopen_probe import (
     VALUE_ABORTS,
     CanopenProbe,
 )
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
-from starhil.hil_tests.conformance.row_cases import (
-    ATTITUDE_S,
-    CLOCK_S,
-    QUATERNION,
-    check_unit_length,
-    clause_of,
-    is_valid,
-)
+from starhil.hil_tests.conformance.row_cases import CLOCK_S
 from starhil.hil_tests.judge.canopen import (
     EXPEDITED,
     Entry,
@@ -58,10 +57,9 @@ def canopen_unit_cases(unit: Unit) -> list[Case[CanopenProbe]]:
 
 
 def _case(
-    area: str, name: str, title: str, run: Run, clause: str = CLAUSE, *, safe: bool = False
+    area: str, name: str, title: str, run: Run, clause: str | Row = CLAUSE, *, safe: bool = False
 ) -> Case[CanopenProbe]:
-    area = f"canopen.{area}"
-    return Case(f"{area}.{name}", area, title, clause, run, intrusive=not safe)
+    return case_in(f"canopen.{area}", name, title, run, clause, intrusive=not safe)
 
 
 # --- reading and writing ---
@@ -95,25 +93,38 @@ def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Va
     probe.set(entry.index, entry.subindex, written(entry, command, command.encode(values)))
 
 
-@contextmanager
-def _identifying_stars(probe: CanopenProbe, found: list[Entry]) -> Iterator[None]:
-    """Have the unit identify stars, if an entry can start this; restore the mode afterwards."""
-    for entry in found:
-        command, field = entry.command, _argument(entry, "mode")
-        reading = next(
-            (item for item in (entry, *found) if item.row is not None and _reports(item, "mode")), None
-        )
-        if command is not None and command.action == "set_mode" and field is not None and reading is not None:
-            before = _value(probe, reading) or 0
-            _write(probe, entry, command, {field.name: "lost_in_space"})
-            try:
-                yield
-            finally:
-                _write(
-                    probe, entry, command, {field.name: "lost_in_space" if before == "tracking" else before}
-                )
-            return
-    yield
+class EntryAccess:
+    """The rows that entries of the object dictionary hold."""
+
+    def __init__(self, probe: CanopenProbe, found: list[Entry]) -> None:
+        self.truth = probe.truth
+        self._probe, self._found = probe, found
+
+    def telecommands(self) -> Iterable[Row]:
+        """Return the telecommands that an entry executes."""
+        return [entry.command for entry in self._found if entry.command is not None and entry.part is None]
+
+    def telemetry_rows(self) -> Iterable[Row]:
+        """Return the rows that entries read."""
+        return {entry.row.name: entry.row for entry in self._found if entry.row is not None}.values()
+
+    def values(self, row: Row) -> dict[str, Value]:
+        """Read the values of a row; one outside its limits fails the case."""
+        return checked_values(row, _read_row(self._probe, row, self._found))
+
+    def command(self, name: str, **values: Value) -> None:
+        """Write an entry that executes a telecommand, which must be accepted."""
+        entry = next(item for item in self._found if item.command is not None and item.command.name == name)
+        if entry.command is not None:
+            _write(self._probe, entry, entry.command, values)
+
+    def now(self) -> float:
+        """Time of the port, s."""
+        return self._probe.port.now()
+
+    def sleep(self, seconds: float) -> None:
+        """Wait."""
+        self._probe.wait_for(NOBODY, seconds)
 
 
 def _argument(entry: Entry, name: str) -> Field | None:
@@ -128,35 +139,26 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     for row in unit.telemetry.values():
         if not any(entry.row is row for entry in found):
             continue
+        attitude = AttitudeRow.of(row)
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
-        yield _case("rows", row.name, title, _values(row, found), clause_of(row), safe=True)
-        bound = {field.value: name for name, field in row.named.items() if field.value}
-        if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
-            title = f"{row.name} has a quaternion of length 1 if it is valid"
-            yield _case("attitude", row.name, title, _unit_length(row, bound, found), clause_of(row))
+        yield _case("rows", row.name, title, _values(row, attitude, found), row, safe=True)
+        if attitude is not None:
+            run = partial(_becomes_valid, attitude, found)
+            yield _case("attitude", row.name, attitude.title, run, row)
 
 
-def _values(row: Row, found: list[Entry]) -> Run:
+def _values(row: Row, attitude: AttitudeRow | None, found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
-        checked_values(row, _read_row(probe, row, found))
+        access = EntryAccess(probe, found)
+        seen = access.values(row)
+        if attitude is not None:
+            attitude.check(access, seen)
 
     return run
 
 
-def _unit_length(row: Row, bound: dict[str, str], found: list[Entry]) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        with _identifying_stars(probe, found):
-            end = probe.port.now() + ATTITUDE_S
-            while True:
-                seen = checked_values(row, _read_row(probe, row, found))
-                if is_valid(seen[bound["attitude.valid"]]):
-                    break
-                if probe.port.now() > end:
-                    raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
-                probe.wait_for(NOBODY, 0.1)
-        check_unit_length(row, seen, bound)
-
-    return run
+def _becomes_valid(attitude: AttitudeRow, found: list[Entry], probe: CanopenProbe) -> None:
+    attitude.becomes_valid(EntryAccess(probe, found))
 
 
 # --- telecommands ---
@@ -169,8 +171,7 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             continue
         if command.action == "reset":
             title = f"{command.name} restarts the node"
-            mode = next((item for item in found if item.row is not None and _reports(item, "mode")), None)
-            run = _restarts(entry, command, mode)
+            run = _restarts(entry, command, found)
         elif entry.row is not None and entry.slot is not None:
             title = f"{entry.name}h reports each written value of {command.name}"
             run = _reported(entry, command)
@@ -178,14 +179,14 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             title, run = f"{command.name} is accepted", _accepted(entry, command)
         else:
             continue
-        yield _case("commands", command.name, title, run, clause_of(command))
+        yield _case("commands", command.name, title, run, command)
 
 
 def _accepted(entry: Entry, command: Row) -> Run:
     return lambda probe: _write(probe, entry, command, command.example())
 
 
-def _restarts(entry: Entry, command: Row, mode: Entry | None) -> Run:
+def _restarts(entry: Entry, command: Row, found: list[Entry]) -> Run:
     """Restart the unit, and wait until the mode reported by an entry is no longer the boot mode."""
 
     def run(probe: CanopenProbe) -> None:
@@ -193,18 +194,11 @@ def _restarts(entry: Entry, command: Row, mode: Entry | None) -> Run:
         _write(probe, entry, command, command.example())
         probe.expect_boot_up()
         end = probe.port.now() + BOOT_S
-        while mode is not None and _value(probe, mode) == "boot":
+        while reported_mode(EntryAccess(probe, found)) == "boot":
             check(probe.port.now() < end, f"the end of booting within {BOOT_S:g} s", "boot")
             probe.wait_for(NOBODY, 0.1)
 
     return run
-
-
-def _value(probe: CanopenProbe, entry: Entry) -> Value | None:
-    """Return the value of the first telemetry field of an entry."""
-    if entry.row is None:
-        return None
-    return entry.row.decode(_read_row(probe, entry.row, [entry]))[_fields(entry)[0].name]
 
 
 def _fields(entry: Entry) -> list[Field]:
@@ -247,7 +241,7 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
-        yield _case("records", command.name, title, _keeps_values(command, members), clause_of(command))
+        yield _case("records", command.name, title, _keeps_values(command, members), command)
 
 
 def _keeps_values(command: Row, members: list[Entry]) -> Run:
@@ -285,7 +279,7 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             for why, data in command.bad_values(field):
                 title = f"{entry.name}h with {name} {why} is refused"
                 run = _refused(entry, written(entry, command, data))
-                yield _case("limits", f"{command.name}.{name}.{why}", title, run, clause_of(command))
+                yield _case("limits", f"{command.name}.{name}.{why}", title, run, command)
 
 
 def _refused(entry: Entry, data: bytes) -> Run:
@@ -369,7 +363,7 @@ def _carries_values(index: int, mapped: list[Entry]) -> Run:
 
 def _sent_with_frames(index: int, model: Any, found: list[Entry]) -> Run:
     def run(probe: CanopenProbe) -> None:
-        with _identifying_stars(probe, found):
+        with identifying_stars(EntryAccess(probe, found)):
             probe.command(START)
             can_id = pdo_can_id(probe.node, index, model)
             times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
@@ -411,4 +405,4 @@ def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> I
         check(0 <= seen - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", seen)
 
     title = f"RPDO {(index & 0x1FF) + 1} ({model.name}) sets the clock"
-    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, clause_of(command))
+    yield _case("rpdos", f"{(index & 0x1FF) + 1}.clock", title, run, command)

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
+from starhil.hil_tests.judge.rows import Row
+
 ProbeType = TypeVar("ProbeType")
 
 
@@ -85,19 +87,31 @@ class CaseArea(Generic[ProbeType]):
         """Register a function as a case."""
 
         def register(run: Callable[[ProbeType], None]) -> Callable[[ProbeType], None]:
-            self.cases.append(
-                Case(
-                    f"{self.name}.{name}",
-                    self.name,
-                    title,
-                    self.clause if clause is None else clause,
-                    run,
-                    self.intrusive if intrusive is None else intrusive,
-                )
-            )
+            source = self.clause if clause is None else clause
+            changes = self.intrusive if intrusive is None else intrusive
+            self.cases.append(case_in(self.name, name, title, run, source, intrusive=changes))
             return run
 
         return register
+
+
+def clause_of(row: Row) -> str:
+    """Return the source of a row."""
+    return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
+
+
+def case_in(
+    area: str,
+    name: str,
+    title: str,
+    run: Callable[[Any], None],
+    clause: str | Row,
+    *,
+    intrusive: bool = False,
+) -> Case[Any]:
+    """Return a case of an area; the clause may be a row, for its source."""
+    source = clause_of(clause) if isinstance(clause, Row) else clause
+    return Case(f"{area}.{name}", area, title, source, run, intrusive)
 
 
 def cases_of(*modules: ModuleType) -> list[Case[Any]]:

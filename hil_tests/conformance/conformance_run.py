@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any
 
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
@@ -16,12 +18,14 @@ from starhil.hil_tests.conformance.runner import (
     Outcome,
     Verdict,
     case_of_run,
+    identity_of,
     not_run,
     run_cases,
     select_cases,
 )
-from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.serial_probe import DEFAULT_BAUD, SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
+from starhil.hil_tests.control import ControlClient, Truth
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
@@ -35,7 +39,8 @@ from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import IcdError
 
-DEFAULT_BAUD: Final = 115200
+if TYPE_CHECKING:
+    from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,8 @@ class ConformanceRequest:
     eds: Path | None = None
     start: bool = False
     profile: str | None = None
+    settings: tuple[str, ...] = ()
+    """With `start`: overrides of the profile, `section.key=value`."""
     dialect: str | None = None
     baud: int | None = None
     host_address: int = 1
@@ -64,10 +71,7 @@ class ConformanceRequest:
 def all_cases(request: ConformanceRequest) -> list[Case[Any]]:
     """Return the cases of all requested links, selected by pattern and safety.
 
-    Raises
-    ------
-    BenchError
-        No link is given, the unit does not have the dialect, or a pattern matches no case.
+    Raises BenchError: no link is given, the unit does not have the dialect, or a pattern matches no case.
     """
     unit = read_unit(request.unit or DEFAULT_UNIT)
     cases: list[Case[Any]] = []
@@ -91,10 +95,36 @@ def all_cases(request: ConformanceRequest) -> list[Case[Any]]:
 
 @dataclass(frozen=True)
 class ConformanceResult:
-    """Outcomes of a run, and the signal that interrupted it, if any."""
+    """Outcomes of a run.
+
+    Attributes
+    ----------
+    facts
+        For reports: `date`, versions of `starhil` and of the `definition`, `links`, and `device on LINK`: its identity.
+    interruption
+        The signal that interrupted the run, if any.
+    """
 
     outcomes: list[Outcome]
+    facts: dict[str, str]
     interruption: Interrupted | None = None
+
+
+def _facts(request: ConformanceRequest, unit: Unit) -> dict[str, str]:
+    links = [
+        f"serial {request.serial}" + (f" (dialect {request.dialect})" if request.dialect else "")
+        if request.serial
+        else "",
+        f"CAN {request.can}" if request.can else "",
+        f"CANopen node {request.canopen_node}" if request.canopen_node else "",
+    ]
+    started = ", emulator started for this run" if request.start else ""
+    return {
+        "links": ", ".join(filter(None, links)) + started,
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "starhil": version("starhil"),
+        "definition": f"{unit.name} {unit.version}",
+    }
 
 
 def run_conformance(
@@ -104,14 +134,12 @@ def run_conformance(
 
     After an interruption, the remaining cases are marked as not run.
 
-    Raises
-    ------
-    BenchError, ProtocolError
-        A port, a bus or the emulator is not available.
+    Raises BenchError, ProtocolError: a port, a bus or the emulator is not available.
     """
     unit = read_unit(request.unit or DEFAULT_UNIT)
     cases = all_cases(request)
     outcomes: list[Outcome] = []
+    facts = _facts(request, unit)
     complete = False
 
     def record(outcome: Outcome) -> None:
@@ -120,15 +148,24 @@ def run_conformance(
 
     try:
         with ExitStack() as stack:
-            serial, can = request.serial, request.can
+            ports: Mapping[str, str | None] = {"serial": request.serial, "can": request.can}
             emulator = _start_emulator(request, stack) if request.start else None
+            truth = None
             if emulator is not None:
-                serial, can = emulator.ready.get("serial"), emulator.ready.get("can")
+                ports = emulator.ready
+                if "control" in emulator.ready:
+                    truth = Truth(stack.enter_context(ControlClient(emulator.ready["control"]))).attitude
             shown: Callable[[Outcome], None] = record
             if request.view is not None:
                 address = console_address(request.view, emulator)
-                shown = _shown_on_console(address, f"{serial or ''} {can or ''}", len(cases), stack, record)
-            _run_on_links(request, unit, cases, serial, can, shown)
+                where = " ".join(port for link in ("serial", "can") if (port := ports.get(link)))
+                shown = _shown_on_console(address, where, len(cases), stack, record)
+            links = {item.id.partition(".")[0] for item in cases}
+            for probe, port in _probes(request, unit, links, ports, stack):
+                probe.truth = truth
+                facts[f"device on {probe.link}"] = identity_of(probe)
+                mine = [item for item in cases if item.id.startswith(f"{probe.link}.")]
+                run_cases(probe, mine, shown, port=port)
             complete = True
     except EmulatorProcessError as error:
         if not complete:
@@ -139,8 +176,8 @@ def run_conformance(
         for item in cases:
             if item.id not in done:
                 record(not_run(item, interruption.reason))
-        return ConformanceResult(outcomes, interruption)
-    return ConformanceResult(outcomes)
+        return ConformanceResult(outcomes, facts, interruption)
+    return ConformanceResult(outcomes, facts)
 
 
 def _shown_on_console(
@@ -148,7 +185,7 @@ def _shown_on_console(
 ) -> Callable[[Outcome], None]:
     """Return a function that shows an outcome on the console too."""
     feed = stack.enter_context(
-        RunFeed(address, kind="conformance", title="Conformance", unit=unit.strip(), planned=planned)
+        RunFeed(address, kind="conformance", title="Conformance", unit=unit, planned=planned)
     )
 
     def record_on_both(outcome: Outcome) -> None:
@@ -168,38 +205,33 @@ def _shown_on_console(
     return record_on_both
 
 
-def _run_on_links(
+def _probes(
     request: ConformanceRequest,
     unit: Unit,
-    cases: Sequence[Case[Any]],
-    serial: str | None,
-    can: str | None,
-    on_outcome: Callable[[Outcome], None],
-) -> None:
-    """Run the cases of each link in turn."""
-    with ExitStack() as stack:
-        mine = [item for item in cases if item.id.startswith("serial.")]
-        if mine and serial is not None:
-            port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD, request.speed))
-            baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
-            if baud is not None:  # the bit rate of the line does not change
-                baud = round(baud / request.speed)
-            own, dialect = settings_of(unit), request.dialect
-            probe = SerialProbe(port, unit, dialect=dialect, baud=baud, times=request.times, settings=own)
-            run_cases(probe, mine, on_outcome, port=serial)
-        mine = [item for item in cases if item.id.startswith("can.")]
-        if mine and can is not None:
-            bus = stack.enter_context(live_can(can, request.speed))
-            addresses = {"host": request.host_address, "device": request.device_address}
-            run_cases(
-                CanProbe(bus, unit, times=request.times, settings=settings_of(unit), **addresses),
-                mine,
-                on_outcome,
-                port=f"{can} at address {request.device_address}",
-            )
-        mine = [item for item in cases if item.id.startswith("canopen.")]
-        if mine and can is not None:
-            _run_canopen(request, can, mine, on_outcome)
+    links: set[str],
+    ports: Mapping[str, str | None],
+    stack: ExitStack,
+) -> Iterator[tuple[SerialProbe | CanProbe | CanopenProbe, str]]:
+    """Open the links one after the other; yield the probe of each, and the name of its port."""
+    serial, can = ports.get("serial"), ports.get("can")
+    if "serial" in links and serial is not None:
+        port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD, request.speed))
+        baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
+        if baud is not None:  # the bit rate of the line does not change
+            baud = round(baud / request.speed)
+        settings, dialect = settings_of(unit), request.dialect
+        yield (
+            SerialProbe(port, unit, dialect=dialect, baud=baud, times=request.times, settings=settings),
+            serial,
+        )
+    if "can" in links and can is not None:
+        bus = stack.enter_context(live_can(can, request.speed))
+        host, device = request.host_address, request.device_address
+        settings = settings_of(unit)
+        probe = CanProbe(bus, unit, host=host, device=device, times=request.times, settings=settings)
+        yield probe, f"{can} at address {device}"
+    if "canopen" in links and can is not None:
+        yield _canopen_probe(request, can, stack), f"{can} at node {request.canopen_node}"
 
 
 def _outcome_of_early_end(error: EmulatorProcessError) -> Outcome:
@@ -217,7 +249,9 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
         channel = (
             stack.enter_context(private_can_bus()) if request.can in (None, "auto") else str(request.can)
         )
-    extra = [] if request.canopen_node is None else ["--canopen", str(request.canopen_node)]
+    extra = ["--control", "auto"]
+    if request.canopen_node is not None:
+        extra += ["--canopen", str(request.canopen_node)]
     if request.speed != 1.0:
         extra += ["--clock", f"scaled:{request.speed:g}"]
     if request.view == "auto":
@@ -229,6 +263,7 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
         can=channel,
         dialect=request.dialect,
         seed=1,
+        settings=request.settings,
         state_dir=folder,
         extra=extra,
     )
@@ -237,13 +272,8 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
     return emulator
 
 
-def _run_canopen(
-    request: ConformanceRequest,
-    can: str,
-    cases: Sequence[Case[Any]],
-    on_outcome: Callable[[Outcome], None],
-) -> None:
-    """Run the CANopen cases with the requested EDS, or else the product's."""
+def _canopen_probe(request: ConformanceRequest, can: str, stack: ExitStack) -> CanopenProbe:
+    """Open a CANopen node with the requested EDS, or else the product's."""
     import canopen
     from canopen.objectdictionary import import_od
 
@@ -258,9 +288,7 @@ def _run_canopen(
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
             raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
-    with live_can(can, request.speed) as bus:
-        probe = CanopenProbe(bus, node, dictionary, text)
-        run_cases(probe, cases, on_outcome, port=f"{can} at node {node}")
+    return CanopenProbe(stack.enter_context(live_can(can, request.speed)), node, dictionary, text)
 
 
 def _eds_text(request: ConformanceRequest) -> str:

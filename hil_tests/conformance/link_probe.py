@@ -6,11 +6,12 @@ The judge (`starhil.hil_tests.judge`) encodes and decodes; a probe adds the port
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Protocol
 
+from starhil.hil_tests.conformance.attitude_cases import TruthSource
 from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
@@ -92,19 +93,14 @@ class ReadableSettings:
 class LinkProbe(ABC):
     """Talks to a unit over a link.
 
-    Parameters
-    ----------
-    port
-        Port with its clock.
-    unit
-        Definition of the unit.
-    settings
-        What a run restores; default: the settings that can be read.
+    `settings` are what a run restores; by default, those that can be read.
 
     Attributes
     ----------
     has_unsolicited
         Whether the link carries unsolicited telemetry.
+    truth
+        The true attitude, if the tester knows it; set by the run.
     """
 
     link: str
@@ -120,6 +116,7 @@ class LinkProbe(ABC):
         self.unit = unit
         self.times = times or ProbeTimes()
         self.settings = settings or ReadableSettings()
+        self.truth: TruthSource | None = None
         self.log: list[str] = []
         self._prepared = False
 
@@ -197,6 +194,14 @@ class LinkProbe(ABC):
             pass
 
     # --- requests ---
+
+    def telecommands(self) -> Iterable[Row]:
+        """Return the telecommands of the unit."""
+        return self.unit.telecommands.values()
+
+    def telemetry_rows(self) -> Iterable[Row]:
+        """Return the telemetry of the unit."""
+        return self.unit.telemetry.values()
 
     def post(self, row: Row | int, data: bytes = b"", klass: str = "") -> None:
         """Send a request for a row, or for an ID that need not belong to one, without waiting."""
@@ -333,6 +338,18 @@ class LinkProbe(ABC):
         self.sleep(RECOVERY_S)
 
     # --- around a run ---
+
+    def identity(self) -> str:
+        """Return what the unit reports of its identity; empty if no row does."""
+        found: dict[str, Value] = {}
+        for row in self.unit.telemetry.values():
+            names = [name for name, item in row.named.items() if (item.value or "").startswith("identity.")]
+            found |= {
+                name: value
+                for name, value in (self.telemetry(row.name) if names else {}).items()
+                if name in names
+            }
+        return ", ".join(f"{name} {value!s}" for name, value in found.items())
 
     def silence(self, *, booting: bool) -> str | None:
         """Read three telemetry rows; return None if one is answered correctly, otherwise the invalid answer.

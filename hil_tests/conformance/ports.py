@@ -34,12 +34,7 @@ class Port(Protocol[Item]):
 class LivePort(Generic[Item]):
     """A port over an asyncio transport, whose loop runs in a separate thread; a context manager.
 
-    Parameters
-    ----------
-    transport
-        What carries the items.
-    speed
-        Seconds on the clock of this port per second of the wall clock.
+    `speed` is the seconds on its clock per second of the wall clock.
     """
 
     def __init__(self, transport: Transport[Item], speed: float = 1.0) -> None:
@@ -52,10 +47,7 @@ class LivePort(Generic[Item]):
     def send(self, item: Item) -> None:
         """Send an item.
 
-        Raises
-        ------
-        LinkLostError
-            The port or bus was lost.
+        Raises LinkLostError: the port or bus was lost.
         """
         if not self._loop.run(self._send(item)):
             raise LinkLostError(f"{self._transport.description}: {self._lost or 'accepts no more data'}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Final
@@ -34,7 +34,7 @@ th {{ background: #f6f8fa; }} code, pre {{ font: 12.5px/1.4 ui-monospace, monosp
 details pre {{ background: #f6f8fa; padding: .5rem; overflow-x: auto; }}
 </style>
 <h1>{title}</h1>
-<p>{unit}</p>
+<table>{facts}</table>
 <p><b>{total}</b> cases: <span class="passed">{passed} passed</span>, <span class="failed">{failed} failed</span>,
 <span class="skipped">{skipped} skipped</span>, <span class="not-run">{not_run} not run</span>.</p>
 {areas}
@@ -48,10 +48,11 @@ def count(outcomes: Sequence[Outcome], status: str) -> int:
     return sum(outcome.status == status for outcome in outcomes)
 
 
-def to_json(outcomes: Sequence[Outcome], unit: str) -> dict[str, Any]:
-    """Return all results as JSON data."""
+def to_json(outcomes: Sequence[Outcome], facts: Mapping[str, str]) -> dict[str, Any]:
+    """Return all results as JSON data, with facts about the run."""
     return {
-        "unit": unit,
+        "unit": facts["links"],
+        "facts": dict(facts),
         "cases": len(outcomes),
         "passed": count(outcomes, PASSED),
         "failed": count(outcomes, FAILED),
@@ -112,8 +113,8 @@ def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:
     write_junit(path, "starhil conformance", cases, sum(outcome.seconds for outcome in outcomes))
 
 
-def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> None:
-    """Write an HTML page with all cases: clause, result, traffic, expected and seen."""
+def write_html_report(path: Path, outcomes: Sequence[Outcome], facts: Mapping[str, str]) -> None:
+    """Write an HTML page with facts about the run, and all cases: clause, result, traffic, expected and seen."""
     rows = []
     for area in areas_of(outcomes):
         mine = [outcome for outcome in outcomes if outcome.area == area]
@@ -124,7 +125,9 @@ def write_html_report(path: Path, outcomes: Sequence[Outcome], unit: str) -> Non
     heads = "".join(f"<th>{word}</th>" for word in ("area", "cases", *STYLES))
     text = _PAGE.format(
         title="Conformance",
-        unit=escape(unit),
+        facts="".join(
+            f"<tr><th>{escape(name)}</th><td>{escape(fact)}</td></tr>" for name, fact in facts.items()
+        ),
         total=len(outcomes),
         passed=count(outcomes, PASSED),
         failed=count(outcomes, FAILED),

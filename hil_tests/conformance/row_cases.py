@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Final
 
-from starhil.hil_tests.conformance.case import Case, CaseSkipped, check, check_equal, rule
+from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode, identifying_stars
+from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -16,19 +16,16 @@ from starhil.hil_tests.conformance.link_probe import (
     checked_values,
 )
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
 
 FLOOD: Final = 200
 SUBSCRIBED_S: Final = 3.0
-ATTITUDE_S: Final = 20.0
 SETTLING_S: Final = 1.0
 """Time after which a unit that identifies stars has an attitude."""
 RESTING: Final = 5
 """Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
-QUATERNION: Final = ("attitude.x", "attitude.y", "attitude.z", "attitude.w")
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
 
 Run = Callable[[LinkProbe], None]
@@ -39,16 +36,8 @@ def row_cases(
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
-    Parameters
-    ----------
-    unit
-        Definition of the unit.
-    lengths
-        Whether a message of a wrong length can be sent on the link.
-    marks
-        Bytes that are special on the link; settings are made of them.
-    highest_id
-        Highest ID that a message can carry.
+    `lengths`: whether a message of a wrong length can be sent on the link. `marks`: bytes that are special on it, of which settings
+    are made. `highest_id`: the highest that a message can carry.
     """
     yield from _identifiers(unit, highest_id)
     if lengths:
@@ -60,30 +49,12 @@ def row_cases(
             for why, data in row.bad_values(item):
                 title = f"{row.name} with {name} {why} is refused, and the refused field named"
                 run = _refused(row, data, INVALID_PARAMETER, index)
-                yield _case("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
+                yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
     yield from _subscriptions(unit)
-    yield _case(
+    yield case_in(
         "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
-    )
-
-
-def clause_of(row: Row) -> str:
-    """Return the source of a row."""
-    return f"{row.kind} {row.name} ({row.provenance}{': ' + row.source if row.source else ''})"
-
-
-def _case(
-    area: str, name: str, title: str, run: Run, clause: str | Row, *, intrusive: bool = False
-) -> Case[LinkProbe]:
-    return Case(
-        f"{area}.{name}",
-        area,
-        title,
-        clause_of(clause) if isinstance(clause, Row) else clause,
-        run,
-        intrusive,
     )
 
 
@@ -110,7 +81,7 @@ def _identifiers(unit: Unit, highest: int) -> Iterator[Case[LinkProbe]]:
                 probe.expect_refusal(row_id, b"", INVALID_ID, klass)
 
         title = f"unknown {'IDs of class ' + klass if klass else 'IDs' if name == 'unknown' else name} are refused"
-        yield _case("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
+        yield case_in("identifiers", name, title, run, PUBLISHED_IDS, intrusive=name != "telemetry")
 
 
 def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
@@ -120,7 +91,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
                 probe.expect_refusal(row, b"\x00", INVALID_LENGTH)
 
     title = "a telemetry request with data is refused for its length"
-    yield _case("identifiers", "telemetry-with-data", title, with_data, rule(5))
+    yield case_in("identifiers", "telemetry-with-data", title, with_data, rule(5))
     beyond = b"\0\0" if unit.telecommand_crc else b"\0"
     for row in unit.telecommands.values():
         whole = row.encode()
@@ -133,7 +104,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
             if data is not None:
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
                 run = _refused(row, data, INVALID_LENGTH)
-                yield _case("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
+                yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
 
 
 def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run:
@@ -148,67 +119,19 @@ def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run
 
 
 def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
+    attitude = AttitudeRow.of(row)
+
     def read_twice(probe: LinkProbe) -> None:
         for _ in range(2):
-            probe.values(row)
+            seen = probe.values(row)
+            if attitude is not None:
+                attitude.check(probe, seen)
 
     title = f"{row.name} has {row.size} bytes and values within their limits"
-    yield _case("telemetry", row.name, title, read_twice, row)
-    bound = {item.value: name for name, item in row.named.items() if item.value}
-    if "attitude.valid" in bound and all(name in bound for name in QUATERNION):
-        title = f"{row.name} has a quaternion of length 1 if it is valid"
-        changes_mode = any(item.action == "set_mode" for item in unit.telecommands.values())
-        yield _case("attitude", row.name, title, _unit_length(unit, row, bound), row, intrusive=changes_mode)
-
-
-def _unit_length(unit: Unit, row: Row, bound: dict[str, str]) -> Run:
-    def run(probe: LinkProbe) -> None:
-        with identifying_stars(probe, unit):
-            end = probe.now() + ATTITUDE_S
-            while not is_valid((seen := probe.values(row))[bound["attitude.valid"]]):
-                if probe.now() > end:
-                    raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
-                probe.sleep(0.1)
-        check_unit_length(row, seen, bound)
-
-    return run
-
-
-def check_unit_length(row: Row, seen: dict[str, Value], bound: dict[str, str]) -> None:
-    """Fail the case unless the quaternion of a row has length 1, to the resolution of its fields."""
-    step = max(abs(row.named[bound[name]].scale) for name in QUATERNION)
-    length = sum(float(seen[bound[name]]) ** 2 for name in QUATERNION) ** 0.5
-    tolerance = 1e-5 + (2.0 * step if step < 1.0 else 0.0)
-    check(abs(length - 1.0) < tolerance, "a quaternion of length 1", f"{length:.7f}")
-
-
-def is_valid(value: Value) -> bool:
-    """Return whether a field reports a valid attitude: a flag or a number."""
-    return str(value).lower() in ("true", "1")
-
-
-@contextmanager
-def identifying_stars(probe: LinkProbe, unit: Unit) -> Iterator[None]:
-    """Have the unit identify stars, if a telecommand starts this; restore the mode afterwards."""
-    found = [
-        (row, name, str(reported.name), key)
-        for row in unit.telecommands.values()
-        for name, item in row.named.items()
-        if row.action == "set_mode" and item.argument == "mode"
-        for reported in unit.telemetry.values()
-        for key, field in reported.named.items()
-        if field.value == "mode"
-    ]
-    if not found:
-        yield
-        return
-    command, field_name, reporting, key = found[0]
-    before = probe.telemetry(reporting)[key]
-    probe.command(command.name, **{field_name: "lost_in_space"})
-    try:
-        yield
-    finally:
-        probe.command(command.name, **{field_name: "lost_in_space" if before == "tracking" else before})
+    yield case_in("telemetry", row.name, title, read_twice, row)
+    if attitude is not None:
+        intrusive = changes_mode(unit.telecommands.values())
+        yield case_in("attitude", row.name, attitude.title, attitude.becomes_valid, row, intrusive=intrusive)
 
 
 # --- quantities in several rows ---
@@ -228,14 +151,14 @@ def _agreement(unit: Unit) -> Iterator[Case[LinkProbe]]:
         return
 
     def run(probe: LinkProbe) -> None:
-        with identifying_stars(probe, unit):
+        with identifying_stars(probe):
             probe.sleep(SETTLING_S)
             for (quantity, _unit), (first, *others) in shared.items():
                 for other in others:
                     _compare(probe, quantity, first, other)
 
     title = "numbers that several fields report agree within the resolution of the fields"
-    yield _case(
+    yield case_in(
         "agreement", "rows", title, run, "[[telemetry]]: fields with the same `value`", intrusive=True
     )
 
@@ -279,13 +202,13 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
-            yield _case("commands", row.name, title, _accepted(row), row, intrusive=True)
+            yield case_in("commands", row.name, title, _accepted(row), row, intrusive=True)
     for row in unit.telemetry.values():
         source = next((item.telecommand for item in row.named.values() if item.telecommand), None)
         if source is not None and unit.telecommands[source].action in (None, "nothing"):
             title = f"{row.name} reports the bytes set by {source}"
             run = _read_back(unit.telecommands[source], row, marks)
-            yield _case("settings", row.name, title, run, row, intrusive=True)
+            yield case_in("settings", row.name, title, run, row, intrusive=True)
 
 
 def _accepted(row: Row) -> Run:
@@ -330,7 +253,7 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
         offered = [item for item in unit.telemetry.values() if klass in ("", item.klass)][:2]
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
-            yield _case(
+            yield case_in(
                 "subscriptions", row.name, title, _subscribed(row, fields, offered), row, intrusive=True
             )
 

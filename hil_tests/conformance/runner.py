@@ -36,6 +36,8 @@ class Outcome:
         `passed`, `failed`, `skipped` or `not run`.
     expected, seen
         Set for a failed case; for a skipped case or one not run, `seen` has the reason.
+    seconds
+        Duration, with the recovery after a failure.
     log
         Sent and received traffic, with times.
     """
@@ -70,10 +72,7 @@ def select_cases(
 ) -> list[Case[Any]]:
     """Return the cases whose ID matches a pattern with `*` and `?`, or begins with a plain name.
 
-    Raises
-    ------
-    BenchError
-        A pattern matches no case.
+    Raises BenchError: a pattern matches no case.
     """
     chosen = list(cases)
     if patterns:
@@ -94,6 +93,9 @@ class Probe(Protocol):
 
     log: list[str]
     """Sent and received traffic."""
+
+    def identity(self) -> str:
+        """Return what the device reports of its identity."""
 
     def silence(self, *, booting: bool) -> str | None:
         """Return None if the device answers, otherwise the invalid answer or `nothing`."""
@@ -131,11 +133,10 @@ def run_case(probe: Probe, case: Case[Any]) -> Outcome:
     ending = _attempt(probe, lambda: probe.end(intrusive=case.intrusive, passed=passed))
     if ending.status == FAILED and verdict.status != FAILED:
         verdict = ending
-    seconds = time.perf_counter() - begin
     log = tuple(probe.log)
     if verdict.status == FAILED and not verdict.link_lost:
         _attempt(probe, probe.recover)
-    return Outcome.of(case, verdict, seconds, log)
+    return Outcome.of(case, verdict, time.perf_counter() - begin, log)
 
 
 def _attempt(probe: Probe, act: Callable[[], None]) -> Verdict:
@@ -158,6 +159,18 @@ def _attempt(probe: Probe, act: Callable[[], None]) -> Verdict:
         seen = f"{last.partition(' <- ')[2] or last} ({type(error).__name__}: {error})"
         return Verdict(FAILED, "an answer that can be read", seen)
     return Verdict(PASSED)
+
+
+def identity_of(probe: Probe) -> str:
+    """Return what a device reports of its identity; empty if it reports nothing."""
+    found = ""
+
+    def read() -> None:
+        nonlocal found
+        found = probe.identity()
+
+    _attempt(probe, read)
+    return found
 
 
 def run_cases(

@@ -16,13 +16,14 @@ from starhil.hil_tests.conformance.case import (
     CaseArea,
     CaseFailed,
     CaseSkipped,
+    case_in,
     check,
     check_equal,
     rule,
 )
 from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
-from starhil.hil_tests.conformance.row_cases import CLOCK_S, clause_of, row_cases
-from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases
+from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
 from starhil.hil_tests.conformance.wire_tables import Exchange, add_exchange_cases, filled
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.headers import Header
@@ -57,19 +58,13 @@ def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
         yield from _clock(unit, envelope.replies)
         highest = _highest_id(unit)
     yield from _echoes(unit)
-    yield _case(
+    yield case_in(
         "timing", "pace", "a long reply takes at least its time on the line", pace, "8N1: ten bits a byte"
     )
     yield from row_cases(
         unit, lengths=unit.serial.framing.kind != "fixed", marks=line.framing.marks, highest_id=highest
     )
-    yield _case("recovery", "noise", "after noise and a pause the next request is answered", noise, rule(9))
-
-
-def _case(
-    area: str, name: str, title: str, run: Run, clause: str = CLAUSE, *, intrusive: bool = False
-) -> Case[SerialProbe]:
-    return Case(f"{area}.{name}", area, title, clause, run, intrusive)
+    yield case_in("recovery", "noise", "after noise and a pause the next request is answered", noise, rule(9))
 
 
 def _highest_id(unit: Unit) -> int:
@@ -83,10 +78,10 @@ def _highest_id(unit: Unit) -> int:
 
 def _asked(probe: SerialProbe, times: int = 1) -> bytes:
     """Return the bytes of a request for the lively row, which is expected to be answered."""
-    request = probe.unit.request(probe.lively)
-    for _ in range(times):
+    requests = [probe.line.numbered(probe.unit.request(probe.lively)) for _ in range(times)]
+    for request in requests:
         probe.line.expect(request)
-    return probe.line.encode(request) * times
+    return b"".join(probe.line.encode(request) for request in requests)
 
 
 def _answered(probe: SerialProbe, times: int = 1) -> None:
@@ -149,15 +144,15 @@ def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
         )  # which may be omitted before a frame
         check_equal(probe.raw.strip(end), whole.strip(end), "bytes")
 
-    yield _case("framing", "one", "a request is answered once", one, clause)
-    yield _case("framing", "reply-form", "a reply is one frame without extra bytes", form, clause)
-    yield _case(
+    yield case_in("framing", "one", "a request is answered once", one, clause)
+    yield case_in("framing", "reply-form", "a reply is one frame without extra bytes", form, clause)
+    yield case_in(
         "framing", "two-at-once", "two requests sent together are both answered, in order", two, clause
     )
-    yield _case("framing", "byte-by-byte", "a request may be sent byte by byte", bytewise, clause)
-    yield _case("framing", "junk", "bytes that are not a message are ignored", junk, clause)
-    yield _case("framing", "half", "an incomplete message is dropped after a time-out", half, rule(2))
-    yield _case(
+    yield case_in("framing", "byte-by-byte", "a request may be sent byte by byte", bytewise, clause)
+    yield case_in("framing", "junk", "bytes that are not a message are ignored", junk, clause)
+    yield case_in("framing", "half", "an incomplete message is dropped after a time-out", half, rule(2))
+    yield case_in(
         "framing",
         "overlong",
         "a message that is too long is dropped, and the next one answered",
@@ -209,11 +204,11 @@ def _cubespace(unit: Unit) -> Iterator[Case[SerialProbe]]:
     add_exchange_cases(area, filled(EXCHANGES, texts))
     yield from area.cases
     title = "a message of 512 bytes is received and refused for its length"
-    yield _case("framing", "longest", title, longest, rule(4))
+    yield case_in("framing", "longest", title, longest, rule(4))
     if any(row.id == ESCAPE for row in unit.rows):
         return
     title = "ID 1F doubled is ID 31, which does not exist"
-    yield _case(
+    yield case_in(
         "stuffing",
         "id",
         title,
@@ -224,7 +219,7 @@ def _cubespace(unit: Unit) -> Iterator[Case[SerialProbe]]:
     # sent with data, because some senders stuff only the data
     clause = "flight software differs: AlbertaSat, RADSAT"
     run: Run = lambda probe: _refuses_31(probe, "1F 7F 1F 00 01 1F FF")  # noqa: E731
-    yield _case("stuffing", "id-single", "ID 1F not doubled is ID 31, too", run, clause, intrusive=True)
+    yield case_in("stuffing", "id-single", "ID 1F not doubled is ID 31, too", run, clause, intrusive=True)
 
 
 def _id_texts(row: Row) -> tuple[tuple[str, str], ...]:
@@ -285,13 +280,17 @@ def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
     def missing(body: bytes) -> Iterator[bytes]:
         yield body[:-size]
 
-    yield _case("check", "wrong", "a message with a bit of the check flipped is not answered", silent(wrong))
+    yield case_in(
+        "check", "wrong", "a message with a bit of the check flipped is not answered", silent(wrong), CLAUSE
+    )
     if "header" in envelope.covers:
-        yield _case("check", "damaged", "a message with a bit flipped is not answered", silent(damaged))
-    yield _case("check", "missing", "a message without the check is not answered", silent(missing))
+        yield case_in(
+            "check", "damaged", "a message with a bit flipped is not answered", silent(damaged), CLAUSE
+        )
+    yield case_in("check", "missing", "a message without the check is not answered", silent(missing), CLAUSE)
     if size > 1:
         title = "a check with its bytes in the other order is not accepted"
-        yield _case("check", "swapped", title, silent(swapped))
+        yield case_in("check", "swapped", title, silent(swapped), CLAUSE)
 
 
 # --- header ---
@@ -325,7 +324,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
         probe.drain()
         probe.expect_alive()
 
-    return _case("header", name, f"a message with {what} is not answered", run)
+    return case_in("header", name, f"a message with {what} is not answered", run, CLAUSE)
 
 
 def _clock(unit: Unit, replies: Header) -> Iterator[Case[SerialProbe]]:
@@ -335,7 +334,7 @@ def _clock(unit: Unit, replies: Header) -> Iterator[Case[SerialProbe]]:
         if command.action == "set_clock" and "microseconds" in names and row is not None:
             title = "the times in replies follow the clock after it was set"
             run = _clock_runs(command, names["microseconds"], row)
-            yield _case("clock", command.name, title, run, clause_of(command), intrusive=True)
+            yield case_in("clock", command.name, title, run, command, intrusive=True)
 
 
 def _clock_runs(command: Row, name: str, row: Row) -> Run:
@@ -366,14 +365,14 @@ def _echoes(unit: Unit) -> Iterator[Case[SerialProbe]]:
     for row in unit.rows:
         if "echo" in row.answers:
             title = f"{row.name} is echoed byte for byte before any other answer"
-            yield _case("echo", row.name, title, _echoed(row), clause_of(row), intrusive=not row.is_telemetry)
+            yield case_in("echo", row.name, title, _echoed(row), row, intrusive=not row.is_telemetry)
 
 
 def _echoed(row: Row) -> Run:
     def run(probe: SerialProbe) -> None:
         data = b"" if row.is_telemetry else row.encode()
-        sent = probe.line.encode(probe.unit.request(row, data))
         probe.ask(row, data)
+        sent = probe.sent
         check_equal(probe.raw[: len(sent)] or None, sent, "the echo")
 
     return run
@@ -387,7 +386,7 @@ def pace(probe: SerialProbe) -> None:
     probe.post(row)
     probe.expect_telemetry(row)
     seconds = probe.now() - begin
-    least = len(probe.raw) * 10 / probe.baud
+    least = len(probe.raw) * BITS_A_BYTE / probe.baud
     if seconds < least - CLOCK_GRAIN_S:
         raise CaseFailed(f"at least {least * 1e3:.2f} ms at {probe.baud} baud", f"{seconds * 1e3:.2f} ms")
 

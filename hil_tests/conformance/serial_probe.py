@@ -14,6 +14,8 @@ from starhil.hil_tests.judge.messages import Answer, Request
 from starhil.hil_tests.judge.rows import Row
 from starhil.hil_tests.judge.serial import SerialLine
 
+DEFAULT_BAUD: Final = 115200
+BITS_A_BYTE: Final = 10
 PAUSE: Final = 1.6
 """Silence after which a message has certainly timed out, as a multiple of the time-out."""
 SHOWN_BYTES: Final = 48
@@ -23,21 +25,12 @@ SHOWN_BYTES: Final = 48
 class SerialProbe(LinkProbe):
     """Talks to a unit over a serial port.
 
-    Parameters
-    ----------
-    port
-        The port.
-    unit
-        Definition of the unit.
-    dialect
-        Dialect of the answers, of a unit that has several.
-    baud
-        Bit rate of the line, for the case on its pace; None if unknown.
+    `dialect` is that of the answers, of a unit that has several; `baud` the bit rate of the line, None if unknown.
 
     Attributes
     ----------
-    raw
-        All bytes received since the last drain.
+    raw, sent
+        All bytes received since the last drain, and those sent last.
     """
 
     link = "serial"
@@ -59,6 +52,8 @@ class SerialProbe(LinkProbe):
         self.has_unsolicited = self.line.envelope.has_unsolicited
         self.has_codes = self.line.envelope.has_codes
         self.raw = b""
+        self.sent = b""
+        self._line_free = 0.0
         self._answers: deque[Answer] = deque()
         self._unsolicited: list[Answer] = []
 
@@ -67,7 +62,10 @@ class SerialProbe(LinkProbe):
     def send(self, data: bytes) -> None:
         """Send raw bytes."""
         self._note("->", data)
+        self.sent = data
         self.port.send(data)
+        seconds = len(data) * BITS_A_BYTE / (self.baud or DEFAULT_BAUD)
+        self._line_free = max(self._line_free, self.now()) + seconds
 
     def send_text(self, text: str) -> None:
         """Send bytes written in hexadecimal."""
@@ -96,8 +94,8 @@ class SerialProbe(LinkProbe):
         self._unsolicited.clear()
 
     def sleep_past_timeout(self) -> None:
-        """Wait until an incomplete message has timed out."""
-        self.sleep(PAUSE * float(self.unit.serial.timeout))
+        """Wait until what was sent has passed the line, and an incomplete message has timed out."""
+        self.sleep(max(0.0, self._line_free - self.now()) + PAUSE * float(self.unit.serial.timeout))
 
     # --- answers ---
 
@@ -127,6 +125,7 @@ class SerialProbe(LinkProbe):
 
     def post_request(self, request: Request, *, answered: bool = True) -> None:
         """Send a request without waiting."""
+        request = self.line.numbered(request)
         row = self.unit.row(request)
         if answered and (row is None or self.answers(row)):
             self.line.expect(request)

@@ -9,7 +9,7 @@ ID the definition yields too replaces that case.
 from __future__ import annotations
 
 import runpy
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -24,29 +24,13 @@ from starhil.hil_tests.judge.definition import Unit
 
 
 def serial_suite(unit: Unit) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on a serial line.
-
-    Raises
-    ------
-    BenchError
-        The unit has no serial link.
-    """
-    if unit.serial is None:
-        raise BenchError(f"unit {unit.name}: has no serial link")
-    return _suite(unit, "serial", serial_cases(unit))
+    """Return the cases for a unit on a serial line; raises BenchError if it has none."""
+    return _suite(unit, "serial", unit.serial, serial_cases)
 
 
 def can_suite(unit: Unit) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on CAN.
-
-    Raises
-    ------
-    BenchError
-        The unit has no CAN link.
-    """
-    if unit.can is None:
-        raise BenchError(f"unit {unit.name}: has no CAN link")
-    return _suite(unit, "can", can_cases(unit))
+    """Return the cases for a unit on CAN; raises BenchError if it has no such link."""
+    return _suite(unit, "CAN", unit.can, can_cases)
 
 
 def settings_of(unit: Unit) -> Settings:
@@ -58,9 +42,14 @@ def settings_of(unit: Unit) -> Settings:
     return ReadableSettings()
 
 
-def _suite(unit: Unit, link: str, derived: Iterable[Case[Any]]) -> tuple[Case[Any], ...]:
+def _suite(
+    unit: Unit, name: str, model: object, derived: Callable[[Unit], Iterable[Case[Any]]]
+) -> tuple[Case[Any], ...]:
     """Return derived and own cases, with IDs and areas that begin with the link."""
-    found = {item.id: item for item in derived}
+    if model is None:
+        raise BenchError(f"unit {unit.name}: has no {name} link")
+    link = name.lower()
+    found = {item.id: item for item in derived(unit)}
     for contents in _own_files(unit.folder):
         areas = [area for area in contents.values() if isinstance(area, CaseArea) and link in area.links]
         own = [item for area in areas for item in area.cases]
@@ -76,10 +65,7 @@ def _suite(unit: Unit, link: str, derived: Iterable[Case[Any]]) -> tuple[Case[An
 def _own_files(folder: Path | None) -> tuple[dict[str, Any], ...]:
     """Run the files with a unit's own cases.
 
-    Raises
-    ------
-    BenchError
-        A file fails; the text names it.
+    Raises BenchError: a file fails; the text names it.
     """
     found = []
     for path in sorted(folder.glob("*_cases.py")) if folder is not None else ():

@@ -56,6 +56,7 @@ class Unit:
     """
 
     name: str
+    version: str
     folder: Path | None
     telecommands: Mapping[str, Row]
     telemetry: Mapping[str, Row]
@@ -121,9 +122,10 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
     serial = icd.link.serial
     return Unit(
         name=icd.name,
+        version=icd.version,
         folder=folder,
-        telecommands={row.name: _row(row) for row in icd.telecommands.values()},
-        telemetry={row.name: _row(row) for row in icd.telemetry.values()},
+        telecommands={row.name: _row(row, icd) for row in icd.telecommands.values()},
+        telemetry={row.name: _row(row, icd) for row in icd.telemetry.values()},
         parameters={item.name: _parameter(item) for item in icd.parameters.values()},
         serial=serial,
         can=icd.link.can,
@@ -144,15 +146,18 @@ def _parameter(item: Any) -> Parameter:
     return Parameter(item.id, item.name, item.type, item.minimum, item.maximum, float(default), enum)
 
 
-def _row(row: Any) -> Row:
+def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
-        row.kind, row.id, row.name, tuple(_fields(row)), row.klass, row.provenance, row.source, row.action, row.arguments,
+        row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
         row.answers,
     )  # fmt: skip
 
 
-def _fields(row: Any) -> Iterator[Field]:
-    """Yield the fields of a row in wire order: bytes follow bytes, and bits of the same bytes follow bits."""
+def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
+    """Yield the fields of a row in wire order: bytes follow bytes, and bits of the same bytes follow bits.
+
+    A number without limits of its own has those of the parameter that it sets or reports.
+    """
     offset = 0
     for slot in row.slots:
         size = SIZES.get(slot.type, slot.size)
@@ -161,9 +166,13 @@ def _fields(row: Any) -> Iterator[Field]:
             if item.slot.index != slot.index:
                 continue
             default: Value | None = item.default
+            bound = icd.device_parameters[item.parameter] if item.parameter is not None else None
+            if bound is None or item.kind not in ("integer", "float") or bound.enum is not None:
+                bound = item
             yield Field(
                 item.name, item.kind, slot.type, slot.order, offset, size, shift, item.width, item.scale, item.bias,
-                item.minimum, item.maximum, None if item.enum is None else item.enum.values, default, item.const,
+                bound.minimum if item.minimum is None else item.minimum,
+                bound.maximum if item.maximum is None else item.maximum, None if item.enum is None else item.enum.values, default, item.const,
                 item.value, item.argument, item.telecommand, item.unit,
             )  # fmt: skip
             shift += item.width

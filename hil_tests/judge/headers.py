@@ -29,16 +29,8 @@ class Opened:
 class Header:
     """The header of requests or of replies.
 
-    Parameters
-    ----------
-    models
-        Fields as in the definition.
-    order
-        Byte order of the unit.
-    codes
-        Code of each class in messages of this direction; several codes may name one class.
-    sizes
-        Bytes of `start`, `check` and `end`, which a length may include.
+    `models` are the fields as in the definition; `codes` the code of each class in this direction, several of which may name
+    one class; `sizes` the bytes of `start`, `check` and `end`, which a length may include.
     """
 
     def __init__(
@@ -58,6 +50,12 @@ class Header:
         """Return the roles in messages of a class, or of any."""
         models = self._models if klass is None else self._in(klass)
         return {part.role for model in models for part in (model, *model.bits) if part.role is not None}
+
+    def width(self, role: str) -> int:
+        """Return the bits that hold a role; 0 if the header does not have it."""
+        fields = [8 * _size(model) for model in self._models if model.role == role]
+        bits = [bit.width for model in self._models for bit in model.bits if bit.role == role]
+        return max(fields + bits, default=0)
 
     def place(self, model: Any, klass: str) -> tuple[int, int]:
         """Return offset and size of a field in messages of a class."""

@@ -26,12 +26,16 @@ AnswerKind = Literal["ack", "nack", "telemetry", "burst", "unsolicited", "malfor
 
 @dataclass(frozen=True)
 class Request:
-    """A telecommand with its data, or a request for telemetry; it need not belong to a row."""
+    """A telecommand with its data, or a request for telemetry; it need not belong to a row.
+
+    `sequence` is its number where headers have one, which the answer repeats.
+    """
 
     id: int
     data: bytes = b""
     klass: str = ""
     telemetry: bool = False
+    sequence: int = 0
 
     def __str__(self) -> str:
         return f"{self.klass} {self.id}".strip()

@@ -13,6 +13,7 @@ An answer without an ID belongs to the oldest request that has not been answered
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from functools import partial
 from typing import Final, Protocol
 
@@ -33,6 +34,8 @@ from starhil.hil_tests.judge.messages import (
     Request,
 )
 
+MIXING: Final = 0x9E3779B1
+"""Odd, so that numbers do not repeat, and with bits in every byte."""
 CUBESPACE: Final = (0x1F, 0x7F, 0xFF)
 """Escape, start of a request, and end."""
 KINDS: Final[dict[int, AnswerKind]] = {0x07: "ack", 0x0F: "nack", 0x2F: "unsolicited", 0x4F: "unsolicited"}
@@ -56,6 +59,8 @@ class Envelope(Protocol):
     def can_refuse(self, klass: str) -> bool:
         """Return whether answers of a class can express a refusal."""
 
+    sequence_bits: int
+    """Bits of the number that an answer repeats; 0 if there is none."""
     has_codes: bool
     """Whether a refusal carries a code."""
     has_unsolicited: bool
@@ -64,12 +69,7 @@ class Envelope(Protocol):
 class SerialLine:
     """The host's end of a unit's serial line.
 
-    Parameters
-    ----------
-    unit
-        Definition of the unit.
-    dialect
-        Dialect of the answers, of a unit that has several; default: b.
+    `dialect` is that of the answers, of a unit that has several; b by default.
     """
 
     def __init__(self, unit: Unit, dialect: str | None = None) -> None:
@@ -78,6 +78,7 @@ class SerialLine:
         self.framing: Framing
         self.envelope: Envelope
         self.dialect: str | None = None
+        self._requests = 0
         if link.framing.kind == "cubespace":
             self.dialect = link.framing.dialect or dialect or "b"
             escape, start, end = CUBESPACE
@@ -94,6 +95,11 @@ class SerialLine:
         self.received = bytearray()
         self._asked: deque[Request] = deque()
         self._echoed = False
+
+    def numbered(self, request: Request) -> Request:
+        """Return a request with the next sequence number; successive ones differ in every bit."""
+        self._requests += 1
+        return replace(request, sequence=self._requests * MIXING % (1 << self.envelope.sequence_bits))
 
     def encode(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
@@ -195,10 +201,11 @@ class Headed:
         self.replies = Header(link.reply_header, unit.byte_order, replies, sizes)
         self._codes = dict(requests)
         self.has_codes = "status" in self.replies.roles()
+        self.sequence_bits = self.requests.width("sequence")
 
     def body(self, request: Request) -> bytes:
         """Return header, data and check of a request."""
-        values = {"id": request.id, "class": self._codes.get(request.klass, 0)}
+        values = {"id": request.id, "class": self._codes.get(request.klass, 0), "sequence": request.sequence}
         return self.closed(self.requests.write(values, request.klass, len(request.data)), request.data)
 
     def closed(self, header: bytes, data: bytes) -> bytes:
@@ -242,15 +249,22 @@ class Headed:
         header, data = taken.body[: opened.size], taken.body[opened.size : end]
         if self.closed(header, data) != taken.body or self.replies.data_size(opened) not in (None, len(data)):
             return Answer("malformed", data=taken.body)
+        values = opened.values
+        asynchronous = values.get("class") in self._unsolicited
+        if (
+            asked is not None
+            and not asynchronous
+            and values.get("sequence", asked.sequence) != asked.sequence
+        ):
+            return Answer("malformed", data=taken.body)
         row = self._unit.row(request)
         klass = request.klass or (row.klass if row is not None else "")
         telemetry = row.is_telemetry if row is not None else self._unit.is_telemetry(klass, request.id)
         kind: AnswerKind = "telemetry" if telemetry else "ack"
         if _refused(opened):
             kind = "nack"
-        elif opened.values.get("class") in self._unsolicited:
+        elif asynchronous:
             kind = "unsolicited"
-        values = opened.values
         time_s = self.replies.seconds("time", values["time"]) if "time" in values else 0.0
         final = bool(values.get("final", 1))
         code = values.get("status", 0)
@@ -269,6 +283,7 @@ class Dialect:
     """The CubeSpace dialects of the answers; requests are the same in all: ID and data."""
 
     has_codes = True
+    sequence_bits = 0
 
     def __init__(self, unit: Unit, dialect: str) -> None:
         self._unit, self._dialect = unit, dialect

@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 from starhil.emulator.control.scenario import Scenario
+from starhil.emulator.device.device import profile_defaults
+from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
+from starhil.protocol.icd import load_unit
 from starid.camera import Camera
 
 
@@ -221,6 +224,23 @@ def test_an_impossible_value_is_named_with_its_bound(override):
     key = override.partition("=")[0]
     assert message.startswith(f"--set {override}: {key}")
     assert "must be at " in message
+
+
+@pytest.mark.parametrize(
+    ("override", "why"),
+    [
+        ("parameters.exposur=1", "parameters: no parameter named 'exposur'"),
+        ("parameters.exposure=99999", "parameters.exposure: 99999 is outside"),
+    ],
+)
+def test_an_impossible_parameter_is_named_with_its_option(override, why):
+    """Parameters are compared with the definition of the unit, after the profile has been read."""
+    profile = load_profile("cubestar", ["parameters.update_rate=2", override])
+    with pytest.raises(EmulatorError) as caught:
+        Parameters(load_unit(), profile_defaults(profile, load_unit()), lambda _changes: None)
+    assert f"{profile.source_of(caught.value)}: {caught.value}".startswith(f"--set {override}: {why}")
+    with pytest.raises(EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"):
+        load_profile("cubestar", ["parameters.serial_baud=5"])
 
 
 @pytest.mark.parametrize(

@@ -11,8 +11,7 @@ import pytest
 
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.images import decode_bmp
-from starhil.hil_tests.png import write_png
+from starhil.hil_tests.images import decode_bmp, write_png
 from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
 from starhil.hil_tests.truth_log import TruthLogReader

@@ -42,6 +42,28 @@ def test_a_report_that_cannot_be_written_is_rejected_before_the_run(words, tmp_p
     assert "is a folder" in str(outcome.exception)
 
 
+def test_settings_are_those_of_the_emulator_that_conformance_starts(monkeypatch):
+    given = {}
+
+    def stop(**options):
+        given.update(options)
+        raise BenchError("enough")
+
+    monkeypatch.setattr(conformance_run, "emulator_command", stop)
+    words = (
+        "conformance",
+        "--serial",
+        "auto",
+        "--set",
+        "truth.kind=rate",
+        "--set",
+        "parameters.update_rate=3",
+    )
+    assert str(run_command(*words, "--start").exception) == "enough"
+    assert given["settings"] == ("truth.kind=rate", "parameters.update_rate=3")
+    assert "--set needs --start" in str(run_command(*words[:2], "/dev/ttyX", *words[3:]).exception)
+
+
 @pytest.mark.process
 def test_an_emulator_that_dies_at_the_last_step_fails_the_session_and_its_report(tmp_path, monkeypatch):
     script = tmp_path / "s.toml"

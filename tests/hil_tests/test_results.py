@@ -99,6 +99,18 @@ def test_a_conformance_run_whose_emulator_ended_keeps_its_outcomes_and_reports_t
     assert reported == outcomes
 
 
+def test_an_html_report_has_the_facts_of_the_run(tmp_path):
+    facts = {
+        "date": "2026-11-23T09:30:00+00:00",
+        "definition": "unit 1.1",
+        "device on can": "firmware_major <2>",
+    }
+    write_html_report(tmp_path / "r.html", [], facts)
+    page = (tmp_path / "r.html").read_text(encoding="utf-8")
+    assert "<tr><th>definition</th><td>unit 1.1</td></tr>" in page
+    assert "<td>firmware_major &lt;2&gt;</td>" in page
+
+
 WRITERS = pytest.mark.parametrize(
     "write",
     [
@@ -106,7 +118,7 @@ WRITERS = pytest.mark.parametrize(
         lambda path: write_report(path, b"x"),
         lambda path: write_junit(path, "suite", [], 0.0),
         lambda path: write_junit_report(path, []),
-        lambda path: write_html_report(path, [], "unit"),
+        lambda path: write_html_report(path, [], {"links": "serial x"}),
     ],
     ids=["before", "any", "junit", "conformance-junit", "html"],
 )

@@ -1,0 +1,222 @@
+"""What the definition and the truth say of a unit, and a device that does something else."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, identifying_stars
+from starhil.hil_tests.conformance.case import Case, CaseFailed, check
+from starhil.hil_tests.conformance.runner import identity_of, run_case
+from starhil.hil_tests.conformance.serial_probe import SerialProbe
+from starhil.hil_tests.conformance.suites import serial_suite
+from starhil.hil_tests.judge.definition import read_unit
+from tests.conformance.links import LINKS, ROWS, write_unit
+from tests.conformance.simulated import SimulatedUnit
+
+SEQUENCE = """
+framing = { kind = "length", start = [0xEB, 0x90] }
+check = { kind = "crc", type = "u16", poly = 0x1021, init = 0xFFFF }
+request_header = [{ role = "length", type = "u16" }, { role = "sequence", type = "u16" }, { role = "id", type = "u8" }]
+reply_header = [{ role = "length", type = "u16" }, NUMBER, { role = "id", type = "u8" }, { role = "status", type = "u8" }]
+"""
+COMMANDS = """
+[[telecommand]]
+id = 3
+name = "set_exposure"
+doc = "Set the exposure time."
+action = "set_parameters"
+fields = [{ name = "exposure", type = "u16", unit = "ms", parameter = "exposure" }]
+
+[[telecommand]]
+id = 4
+name = "search"
+doc = "Identify stars."
+action = "set_mode"
+arguments = { mode = "lost_in_space" }
+
+[[telecommand]]
+id = 5
+name = "rest"
+doc = "Stop."
+action = "set_mode"
+arguments = { mode = "standby" }
+
+[[telemetry]]
+id = 131
+name = "state"
+doc = "Mode."
+fields = [{ name = "mode", type = "u8", value = "mode", map = { 0 = "boot", 1 = "standby", 2 = "lost_in_space", 3 = "tracking", 4 = "error" } }]
+
+[link.serial]
+"""
+TRUTH = from_radec_roll(83.8, -1.2, 0.0)
+
+
+def outcome_of(case: str, unit: Path, served: Path | None = None, damage=None, truth=None):
+    """Run a case on a simulated unit, which may serve another definition."""
+    cases = {item.id: item for item in serial_suite(read_unit(unit))}
+    with SimulatedUnit("serial", damage, unit=unit, served=served) as simulated:
+        simulated.probe.truth = truth
+        return run_case(simulated.probe, cases[f"serial.{case}"])
+
+
+def written(folder: Path, name: str, text: str) -> Path:
+    """Write a unit in one file into a folder of its own."""
+    place = folder / name
+    place.mkdir()
+    (place / "unit.toml").write_text(text, encoding="utf-8")
+    return place
+
+
+def sequenced(folder: Path, name: str, number: str) -> Path:
+    """Write a unit whose replies have this field where its requests have a sequence number."""
+    return written(
+        folder, name, ROWS.format(name="sequence", order="big") + SEQUENCE.replace("NUMBER", number)
+    )
+
+
+@pytest.mark.parametrize("case", ["framing.two-at-once", "telemetry.numbers", "commands.set_numbers"])
+def test_a_sequence_number_that_is_not_repeated_fails(case, tmp_path):
+    unit = sequenced(tmp_path, "unit", '{ role = "sequence", type = "u16" }')
+    wrong = sequenced(tmp_path, "wrong", '{ type = "u16", const = 0 }')
+    low = sequenced(tmp_path, "low", '{ type = "u8", const = 0 }, { role = "sequence", type = "u8" }')
+    assert outcome_of(case, unit).status == "passed"
+    assert outcome_of(case, unit, wrong).status == "failed"
+    assert outcome_of(case, unit, low).status == "failed"
+
+
+def commanded(folder: Path, name: str = "commanded") -> Path:
+    text = ROWS.format(name="commanded", order="big")
+    return written(folder, name, text.removesuffix("[link.serial]\n") + COMMANDS + LINKS["sum"])
+
+
+def test_a_field_without_limits_has_those_of_its_parameter(tmp_path):
+    unit, case = commanded(tmp_path), "fields.set_exposure.exposure.high"
+    assert outcome_of(case, unit).status == "passed"
+
+    def accept(simulated):
+        simulated.device.parameters.set = lambda _changes: None
+
+    outcome = outcome_of(case, unit, damage=accept)
+    assert (outcome.status, outcome.seen) == ("failed", "acknowledge of 3")
+
+
+def negated(folder: Path, order: str = "big") -> Path:
+    """A unit that reports the conjugate."""
+    text = ROWS.format(name="sum", order=order) + LINKS["sum"]
+    for axis in "xyz":
+        text = text.replace(
+            f'type = "f64", value = "attitude.{axis}"', f'type = "f64", scale = -1, value = "attitude.{axis}"'
+        )
+    return written(folder, "negated", text)
+
+
+def test_a_conjugated_quaternion_fails_where_the_truth_is_known(tmp_path):
+    unit, served = write_unit(tmp_path / "unit", "sum"), negated(tmp_path)
+    case = "attitude.attitude"
+    assert outcome_of(case, unit, truth=lambda: TRUTH).status == "passed"
+    assert outcome_of(case, unit, served).status == "passed"
+    outcome = outcome_of(case, unit, served, truth=lambda: TRUTH)
+    assert outcome.status == "failed"
+    assert outcome.expected.startswith("the true attitude (")
+    assert outcome.seen.endswith("deg off")
+
+
+def test_a_valid_quaternion_that_is_not_of_length_1_fails_a_safe_case(tmp_path):
+    unit = write_unit(tmp_path / "unit", "sum")
+    text = (unit / "unit.toml").read_text()
+    served = written(
+        tmp_path,
+        "served",
+        text.replace('type = "f64", value = "attitude.', 'type = "f64", scale = 0.5, value = "attitude.'),
+    )
+    case = next(item for item in serial_suite(read_unit(unit)) if item.id == "serial.telemetry.attitude")
+    assert not case.intrusive
+    assert outcome_of("telemetry.attitude", unit).status == "passed"
+    outcome = outcome_of("telemetry.attitude", unit, served)
+    assert (outcome.status, outcome.expected) == ("failed", "a quaternion of length 1")
+
+
+class Rows:
+    """Rows of a unit with given values, and the commands sent."""
+
+    def __init__(self, folder: Path, mode: str) -> None:
+        self.unit = read_unit(commanded(folder))
+        self.mode = mode
+        self.sent: list[str] = []
+        self.truth = None
+
+    def telecommands(self):
+        return self.unit.telecommands.values()
+
+    def telemetry_rows(self):
+        return self.unit.telemetry.values()
+
+    def values(self, _row):
+        return {"mode": self.mode, "x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0, "valid": True}
+
+    def command(self, name, **_values):
+        self.sent.append(name)
+
+
+def test_an_attitude_that_is_valid_in_standby_fails(tmp_path):
+    rows = Rows(tmp_path, "standby")
+    attitude = AttitudeRow.of(rows.unit.telemetry["attitude"])
+    with pytest.raises(CaseFailed, match="in standby"):
+        attitude.check(rows, rows.values(attitude.row))
+    rows.mode = "tracking"
+    attitude.check(rows, rows.values(attitude.row))
+
+
+@pytest.mark.parametrize(("mode", "last"), [("standby", "rest"), ("tracking", "search")])
+def test_the_mode_is_commanded_by_a_telecommand_without_fields_too(mode, last, tmp_path):
+    rows = Rows(tmp_path, mode)
+    with identifying_stars(rows):
+        assert rows.sent == ["search"]
+    assert rows.sent == ["search", last]
+
+
+@pytest.mark.parametrize(
+    ("link", "unit", "words"),
+    [
+        ("serial", "cubestar", "node_type 83, interface_version 1, firmware_major 1"),
+        ("canopen", "cubestar", "revision 0x"),
+        ("serial", "sagitta", ""),
+    ],
+)
+def test_the_identity_of_a_device_is_read(link, unit, words):
+    with SimulatedUnit(link, unit=unit) as simulated:
+        assert words in identity_of(simulated.probe)
+
+
+def test_a_pause_begins_when_the_line_is_free(tmp_path):
+    """At 9600 bits a second, 960 bytes take a second."""
+
+    class Port:
+        time_s = 0.0
+
+        def send(self, _data): ...
+        def now(self):
+            return self.time_s
+
+        def receive(self, timeout_s):
+            self.time_s += timeout_s
+
+    unit = read_unit(write_unit(tmp_path, "sum"))
+    probe = SerialProbe(Port(), unit, baud=9600)
+    probe.send(bytes(960))
+    probe.sleep_past_timeout()
+    assert probe.now() >= 1.0 + unit.serial.timeout
+
+
+def test_the_seconds_of_a_failed_case_include_its_recovery(tmp_path):
+    with SimulatedUnit("serial", unit=write_unit(tmp_path, "sum")) as simulated:
+        simulated.probe.recover = lambda: time.sleep(0.05)
+        outcome = run_case(
+            simulated.probe, Case("a.b.c", "a.b", "t", "c", lambda _probe: check(None, "so", "not so"))
+        )
+    assert outcome.seconds >= 0.05
