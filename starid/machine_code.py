@@ -134,7 +134,9 @@ def _relocate(
     memory: mmap.mmap, base: int, start: int, addresses: NDArray[np.uint64], code: bytes, section: Any
 ) -> None:
     """Fill in the addresses in one section, which begins at `start`."""
-    entries = np.frombuffer(code, _RELOCATION, int(section["size"]) // _RELOCATION.itemsize, section["offset"])
+    entries = np.frombuffer(
+        code, _RELOCATION, int(section["size"]) // _RELOCATION.itemsize, section["offset"]
+    )
     if not np.isin(entries["type"], (_ADDRESS, _DISTANCE)).all():
         raise NotLoadableError(f"relocations of types {sorted(set(entries['type'].tolist()))}")
     places = entries["offset"] + np.uint64(start)

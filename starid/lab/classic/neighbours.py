@@ -94,6 +94,15 @@ def nearest_beyond(polar: Array, count: int, buffer: float) -> int:
 
 
 @inner
+def aligned_neighbours(
+    vectors: Array, pivot: int, radius: float, buffer: float, polar: Array, rows: Indices
+) -> tuple[int, int]:
+    """List the neighbours of a pivot as `neighbours_of` does; their number, and the nearest beyond a buffer or −1."""
+    count = neighbours_of(vectors, pivot, radius, polar, rows)
+    return count, nearest_beyond(polar, count, buffer)
+
+
+@inner
 def bright_neighbour(
     polar: Array, rows: Indices, count: int, magnitude: Array, buffer: float, rank: int
 ) -> int:
