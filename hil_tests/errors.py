@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
-
 
 class BenchError(Exception):
     """A script, port or device cannot be used; the text is one line with what, where and remedy."""
@@ -59,11 +56,3 @@ class LinkLostError(DeviceError):
 
 class EmulatorProcessError(BenchError):
     """The emulator process did not start, or did not end cleanly."""
-
-
-def near_matches(name: str, known: Iterable[str]) -> str:
-    """Return a hint such as `; did you mean 'quaternion'?`, or an empty text without a near match."""
-    near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.55)
-    if not near:
-        return ""
-    return "; did you mean " + " or ".join(f"'{word}'" for word in near) + "?"

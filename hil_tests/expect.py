@@ -17,8 +17,9 @@ from starhil.hil_tests.attitude import (
     unit,
     wrapped_difference,
 )
-from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
+from starhil.hil_tests.errors import BenchError, ScriptError
 from starhil.hil_tests.script_reader import TableReader
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.values import Value
 
 RELATIVE_ROUNDING: Final = 1e-6
@@ -48,7 +49,7 @@ def operand(value: Any, reader: TableReader, key: str, known: frozenset[str]) ->
         if name not in known and name not in CLOCK_VARIABLES:
             every = [*known, *CLOCK_VARIABLES]
             reader.fail(
-                f"'{key}': nothing was captured as '${name}' before this step{near_matches(name, every)}"
+                f"'{key}': nothing was captured as '${name}' before this step{did_you_mean(name, every)}"
             )
         return Variable(name)
     if not isinstance(value, bool | int | float | str):

@@ -38,7 +38,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
+from starhil.hil_tests.errors import BenchError, ScriptError
 from starhil.hil_tests.expect import (
     AttitudeCheck,
     Expectation,
@@ -74,6 +74,7 @@ from starhil.hil_tests.script_reader import TableReader
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import Parameter, Value
 
@@ -154,7 +155,7 @@ class _Checker:
         present = [key for key in ACTIONS if key in table]
         if len(present) != 1:
             unknown = [key for key in table if key not in STEP_KEYS]
-            hint = f"; '{unknown[0]}' is unknown{near_matches(unknown[0], STEP_KEYS)}" if unknown else ""
+            hint = f"; '{unknown[0]}' is unknown{did_you_mean(unknown[0], STEP_KEYS)}" if unknown else ""
             found = "has none" if not present else f"has {' and '.join(present)}"
             reader.fail(f"needs exactly one action of {', '.join(ACTIONS)}; {found}{hint}")
         verb = present[0]
@@ -238,7 +239,7 @@ class _Checker:
         if row is not None and name not in row.named_fields:
             known = f"; its fields: {', '.join(row.named_fields)}" if row.named_fields else "; it has none"
             reader.fail(
-                f"row '{row.name}' has no field '{name}'{near_matches(name, row.named_fields) or known}"
+                f"row '{row.name}' has no field '{name}'{did_you_mean(name, row.named_fields) or known}"
             )
 
     def _check_kind(self, reader: TableReader, row: Row | None, expectation: Expectation) -> Expectation:
@@ -257,7 +258,7 @@ class _Checker:
             if item.enum is not None:
                 if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
                     known = f"; one of: {', '.join(item.enum.values)}"
-                    near = near_matches(show(value), item.enum.values) or known
+                    near = did_you_mean(show(value), item.enum.values) or known
                     reader.fail(f"'{item.name}' is never '{show(value)}'{near}")
             elif (item.kind == "flag") != isinstance(value, bool):
                 kind = "true or false" if item.kind == "flag" else "not true or false"
@@ -274,14 +275,14 @@ class _Checker:
             kind = "telecommand" if telecommand else "telemetry row"
             remedy = "; it is telemetry: use read" if telecommand else "; it is a telecommand: use command"
             reader.fail(
-                f"unknown {kind} '{name}'{remedy if name in other else near_matches(name, rows) or LISTED}"
+                f"unknown {kind} '{name}'{remedy if name in other else did_you_mean(name, rows) or LISTED}"
             )
         return rows[name]
 
     def _parameter(self, reader: TableReader, key: str) -> Parameter:
         name = reader.text(key)
         if name not in self._icd.parameters:
-            reader.fail(f"unknown parameter '{name}'{near_matches(name, self._icd.parameters) or LISTED}")
+            reader.fail(f"unknown parameter '{name}'{did_you_mean(name, self._icd.parameters) or LISTED}")
         return self._icd.parameters[name]
 
     def _refusal_code(self, reader: TableReader) -> str | None:

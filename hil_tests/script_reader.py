@@ -7,7 +7,8 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NoReturn
 
-from starhil.hil_tests.errors import ScriptError, near_matches
+from starhil.hil_tests.errors import ScriptError
+from starhil.protocol.names import did_you_mean
 
 
 @dataclass
@@ -99,7 +100,7 @@ class TableReader:
         value = self.text(key, default)
         if value not in allowed:
             self.fail(
-                f"'{key}' is '{value}', must be one of {', '.join(sorted(allowed))}{near_matches(value, allowed)}"
+                f"'{key}' is '{value}', must be one of {', '.join(sorted(allowed))}{did_you_mean(value, allowed)}"
             )
         return value
 
@@ -130,4 +131,4 @@ class TableReader:
         for key in self.table:
             if key not in self._known:
                 known = ", ".join(sorted(self._known))
-                self.fail(f"unknown key '{key}'{near_matches(key, self._known) or f' (known here: {known})'}")
+                self.fail(f"unknown key '{key}'{did_you_mean(key, self._known) or f' (known here: {known})'}")

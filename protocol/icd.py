@@ -26,11 +26,12 @@ from starhil.protocol.definition import (
     InterfaceDefinition,
     Names,
 )
-from starhil.protocol.device_model import DeviceModel, device_model, did_you_mean
+from starhil.protocol.device_model import DeviceModel, device_model
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit

@@ -29,6 +29,7 @@ COMMANDS: Final[dict[str, str]] = {
         "conformance",
         "hub",
         "cache",
+        "docs",
     )
 }
 """Sub-command → module."""

@@ -85,7 +85,7 @@ def turned(azimuth: float, reference: float) -> float:
 
 
 @inner
-def nearest_beyond(polar: Array, count: int, buffer: float) -> int:
+def nearest_beyond(polar: Array | Array32, count: int, buffer: float) -> int:
     """Find the nearest neighbour beyond a buffer; −1 if there is none."""
     for i in range(count):
         if polar[i, 0] > buffer:
