@@ -10,7 +10,7 @@ from tests.emulator.cli.command_line import run_command_line
 
 def completed(monkeypatch: pytest.MonkeyPatch, shell: str, line: str) -> str:
     """Return what a shell is answered at the end of a line."""
-    program = line.split()[0]
+    program = line.split(maxsplit=1)[0]
     monkeypatch.setenv(f"_{program.upper()}_COMPLETE", f"complete_{shell}")
     if shell == "bash":
         monkeypatch.setenv("COMP_WORDS", line)
@@ -50,9 +50,7 @@ def test_other_shells_are_answered_too(monkeypatch: pytest.MonkeyPatch, shell: s
     assert "first_light" in completed(monkeypatch, shell, "starhil session fi")
 
 
-@pytest.mark.parametrize(
-    ("words", "kinds"), [(["run"], ["profile", "scenario"]), (["session"], ["session"])]
-)
+@pytest.mark.parametrize(("words", "kinds"), [(["run"], ["profile", "scenario"]), (["session"], ["session"])])
 def test_what_ships_is_listed_with_a_description(words: list[str], kinds: list[str]) -> None:
     status, out, _ = run_command_line(*words, "--list")
     assert status == 0
