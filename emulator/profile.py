@@ -24,6 +24,7 @@ from starhil.emulator.truth.config import (
     TruthConfig,
 )
 from starhil.emulator.validation_messages import explain
+from starhil.protocol.names import find, not_found
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starid.earth import unix_time
 
@@ -372,27 +373,13 @@ LINK_PARAMETERS: Final[dict[str, str]] = {
 """Device parameters whose defaults are set under another key of a profile."""
 
 
-def configs_folder() -> Path:
-    """Return the folder `configs` of the installation or checkout."""
-    return Path(__file__).resolve().parent.parent / "configs"
-
-
 def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
     """Return the path of a profile given by name or path."""
-    folder = configs_folder() / "profiles"
-    if "/" not in name_or_path and not name_or_path.endswith(".toml"):
-        path = folder / f"{name_or_path}.toml"
-        if path.is_file():
-            return path
-        known = ", ".join(sorted(p.stem for p in folder.glob("*.toml")))
-        raise EmulatorError(
-            f"profile {name_or_path!r}: unknown; give a path to a .toml file or one of: {known}"
-        )
-    path = Path(name_or_path).expanduser()
+    path = find("profile", name_or_path)
     if relative_to is not None and not path.is_absolute():
         path = relative_to / path
     if not path.is_file():
-        raise EmulatorError(f"profile {path}: no such file; give a path to a .toml file or a profile's name")
+        raise EmulatorError(not_found("profile", name_or_path))
     return path
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
-from typing import Any, Final, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
+from starhil.protocol.names import did_you_mean
 from starid.errors import plain
-
-MIN_SIMILARITY: Final = 0.55
-"""Similarity above which a known key is suggested for an unknown one (`difflib`)."""
 
 
 def explain(
@@ -37,9 +34,8 @@ def explain(
         known = sorted(
             {*(key for each in above for key in each.model_fields), *(also if len(loc) == 1 else ())}
         )
-        near = difflib.get_close_matches(unknown, known, n=1, cutoff=MIN_SIMILARITY)
-        remedy = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(known)}"
-        return f"{'.'.join([*path, unknown])}: unknown key; {remedy}"
+        remedy = did_you_mean(unknown, known) or f"; known: {', '.join(known)}"
+        return f"{'.'.join([*path, unknown])}: unknown key{remedy}"
     where = ".".join(path) or "as a whole"
     context = first.get("ctx", {})
     if first["type"] == "missing":

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable
-
-from starhil.protocol.errors import OneLineError
+from starhil.protocol.errors import OneLineError, escape_controls
 
 
 class BenchError(OneLineError):
@@ -13,7 +10,11 @@ class BenchError(OneLineError):
 
 
 class ScriptError(BenchError):
-    """An invalid session script; the text names file, step and key."""
+    """An invalid session script; the arguments are its problems, each of which names file, step and key."""
+
+    def __str__(self) -> str:
+        """Return a line for each problem."""
+        return "\n".join(escape_controls(str(problem)) for problem in self.args)
 
 
 class DeviceError(BenchError):
@@ -61,11 +62,3 @@ class LinkLostError(DeviceError):
 
 class EmulatorProcessError(BenchError):
     """The emulator process did not start, or did not end cleanly."""
-
-
-def near_matches(name: str, known: Iterable[str]) -> str:
-    """Return a hint such as `; did you mean 'quaternion'?`, or an empty text without a near match."""
-    near = difflib.get_close_matches(name, list(known), n=3, cutoff=0.55)
-    if not near:
-        return ""
-    return "; did you mean " + " or ".join(f"'{word}'" for word in near) + "?"

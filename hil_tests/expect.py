@@ -27,7 +27,8 @@ from starhil.hil_tests.attitude import (
     unit,
     wrapped_difference,
 )
-from starhil.hil_tests.errors import BenchError, near_matches
+from starhil.hil_tests.errors import BenchError
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.values import Value
 
 RELATIVE_ROUNDING: Final = 1e-6
@@ -65,7 +66,7 @@ def read_operand(value: Any, info: ValidationInfo) -> Operand:
         every = [*(info.context or {}).get("captured", ()), *CLOCK_VARIABLES]
         if value[1:] not in every:
             raise ValueError(
-                f"nothing was captured as '{value}' before this step{near_matches(value[1:], every)}"
+                f"nothing was captured as '{value}' before this step{did_you_mean(value[1:], every)}"
             )
         return Variable(value[1:])
     if not isinstance(value, bool | int | float | str):

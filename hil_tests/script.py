@@ -41,7 +41,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 from pydantic import AfterValidator, Field, PlainValidator, ValidationError, ValidationInfo, model_validator
 from pydantic_core import ErrorDetails
 
-from starhil.hil_tests.errors import BenchError, ScriptError, near_matches
+from starhil.hil_tests.errors import BenchError, ScriptError
 from starhil.hil_tests.expect import (
     AttitudeCheck,
     Conditions,
@@ -59,6 +59,7 @@ from starhil.protocol.codec import Field as RowField
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import Parameter, Value
 
@@ -107,7 +108,7 @@ def _telecommand(value: Any, info: ValidationInfo) -> Row:
 
 def _row(name: str, kind: str, rows: Mapping[str, Row], others: Mapping[str, Row], remedy: str) -> Row:
     if name not in rows:
-        hint = f"; it is {remedy}" if name in others else near_matches(name, rows) or LISTED
+        hint = f"; it is {remedy}" if name in others else did_you_mean(name, rows) or LISTED
         raise ValueError(f"unknown {kind} '{name}'{hint}")
     return rows[name]
 
@@ -115,13 +116,13 @@ def _row(name: str, kind: str, rows: Mapping[str, Row], others: Mapping[str, Row
 def _parameter(value: Any, info: ValidationInfo) -> Parameter:
     known = _icd(info).parameters
     if _text(value) not in known:
-        raise ValueError(f"unknown parameter '{value}'{near_matches(value, known) or LISTED}")
+        raise ValueError(f"unknown parameter '{value}'{did_you_mean(value, known) or LISTED}")
     return known[value]
 
 
 def _one_of(names: Iterable[str], value: Any) -> str:
     if _text(value) not in (known := sorted(names)):
-        raise ValueError(f"must be one of {', '.join(known)}, not '{value}'{near_matches(value, known)}")
+        raise ValueError(f"must be one of {', '.join(known)}, not '{value}'{did_you_mean(value, known)}")
     return str(value)
 
 
@@ -490,7 +491,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         names = table.get("capture")
         captured.update(names if isinstance(names, dict) else ())  # also of a step with an error
     if problems or script is None:
-        raise ScriptError("\n".join(problems))
+        raise ScriptError(*problems)
     return script.model_copy(update={"steps": steps})
 
 
@@ -501,7 +502,7 @@ def _step(location: str, table: dict[str, Any], context: dict[str, Any]) -> tupl
         return _checked(ACTIONS[present[0]], table, location, context)
     known = {key for action in ACTIONS.values() for key in _keys_of(action)}
     unknown = [key for key in table if key not in known]
-    hint = f"; '{unknown[0]}' is unknown{near_matches(unknown[0], known)}" if unknown else ""
+    hint = f"; '{unknown[0]}' is unknown{did_you_mean(unknown[0], known)}" if unknown else ""
     found = f"has {' and '.join(present)}" if present else "has none"
     return None, [f"{location}: needs exactly one action of {', '.join(ACTIONS)}; {found}{hint}"]
 
@@ -546,7 +547,7 @@ def _explanation(error: ErrorDetails, key: str, known: list[str]) -> str:
     match error["type"]:
         case "extra_forbidden":
             return (
-                f"unknown key '{key}'{near_matches(key, known) or ' (known here: ' + ', '.join(known) + ')'}"
+                f"unknown key '{key}'{did_you_mean(key, known) or ' (known here: ' + ', '.join(known) + ')'}"
             )
         case "missing":
             return "must be given, but is missing"
@@ -554,7 +555,7 @@ def _explanation(error: ErrorDetails, key: str, known: list[str]) -> str:
             return f"must be at least {context['ge']:g}, not {given!r}"
         case "literal_error":
             allowed = [word for word in re.findall(r"\w+", context["expected"]) if word != "or"]
-            return f"must be one of {', '.join(allowed)}, not {given!r}{near_matches(str(given), allowed)}"
+            return f"must be one of {', '.join(allowed)}, not {given!r}{did_you_mean(str(given), allowed)}"
         case "value_error":
             return str(context["error"])
         case kind:
@@ -586,7 +587,7 @@ def _unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
     known = row.named_fields
     for name in names:
         if name not in known:
-            hint = near_matches(name, known) or (
+            hint = did_you_mean(name, known) or (
                 f"; its fields: {', '.join(known)}" if known else "; it has none"
             )
             yield f"{key}: row '{row.name}' has no field '{name}'{hint}"
@@ -606,7 +607,7 @@ def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:
         if item.enum is not None:
             if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
                 known = f"; one of: {', '.join(item.enum.values)}"
-                yield f"'{item.name}' is never '{show(value)}'{near_matches(show(value), item.enum.values) or known}"
+                yield f"'{item.name}' is never '{show(value)}'{did_you_mean(show(value), item.enum.values) or known}"
         elif (item.kind == "flag") != isinstance(value, bool):
             yield f"'{item.name}' is {'true or false' if item.kind == 'flag' else 'not true or false'}, not {value!r}"
         elif item.kind in ("integer", "float", "bits") and isinstance(value, str):

@@ -13,7 +13,7 @@ from rich.text import Text
 
 from starhil.hil_tests.bench import Bench, LinkOptions
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError, near_matches
+from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.results import (
@@ -33,10 +33,10 @@ from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import find, not_found
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
-SCRIPT_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "sessions"
 DEFAULT_FOLDER: Final = Path("out") / "session"
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}
 
@@ -64,14 +64,10 @@ def find_script(path: Path) -> Path:
 
     Raises ScriptError: there is no such script; the text suggests similar names.
     """
-    if path.is_file():
-        return path
-    shipped = {item.stem: item for item in sorted(SCRIPT_FOLDER.glob("*.toml"))}
-    if str(path) in shipped:
-        return shipped[str(path)]
-    raise ScriptError(
-        f"{path}: no such session script{near_matches(path.stem, shipped)} (bundled: {', '.join(shipped)})"
-    )
+    found = find("session", path)
+    if not found.is_file():
+        raise ScriptError(not_found("session", path))
+    return found
 
 
 def run_session(request: SessionRequest) -> SessionResult:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -16,6 +15,7 @@ from starhil.protocol.device_model import DeviceModel, device_model
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import LinkModel, MessageClass
 from starhil.protocol.messages import ErrorCode, Request, RequestKind
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.plugin import Plugin
 from starhil.protocol.values import EnumDefinition, Parameter, Section
 
@@ -41,9 +41,8 @@ class Names(dict[str, _Item]):
         self._what = what
 
     def __missing__(self, name: str) -> _Item:
-        near = difflib.get_close_matches(name, self, n=3)
-        hint = f"did you mean {', '.join(near)}?" if near else "`starhil icd export markdown` lists all"
-        raise UnknownNameError(f"no {self._what} named {name!r} in the interface definition; {hint}")
+        hint = did_you_mean(name, self) or "; `starhil icd export markdown` lists all"
+        raise UnknownNameError(f"no {self._what} named {name!r} in the interface definition{hint}")
 
 
 @dataclass(frozen=True)

@@ -6,10 +6,9 @@ functions that compute quantities and perform actions are in the emulator.
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Final
@@ -22,6 +21,7 @@ from starhil.protocol.icd_schema import (
     DeviceModelFile,
     QuantityModel,
 )
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.unit_folders import UNITS_FOLDER
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import EnumDefinition, IcdError, Parameter
@@ -87,12 +87,6 @@ def number_in(name: str) -> int | None:
     """Return the number in the brackets of a name, or None."""
     found = _NUMBER.search(name)
     return None if found is None else int(found[1])
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
-    near = difflib.get_close_matches(name, list(known), n=3)
-    return f"; did you mean {', '.join(near)}?" if near else ""
 
 
 def _of_parameter(name: str, parameter: Parameter) -> QuantityModel:

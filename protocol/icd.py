@@ -26,12 +26,13 @@ from starhil.protocol.definition import (
     InterfaceDefinition,
     Names,
 )
-from starhil.protocol.device_model import DeviceModel, device_model, did_you_mean
+from starhil.protocol.device_model import DeviceModel, device_model
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
@@ -109,7 +110,8 @@ def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDe
         reader.read(file)
     definition = reader.definition()
     errors = reader.errors if files else [f"{path}: no .toml file in this folder"]
-    return definition, [escape_controls(error) for error in errors]  # an error may quote any text of the definition
+    # an error may quote any text of the definition
+    return definition, [escape_controls(error) for error in errors]
 
 
 def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:

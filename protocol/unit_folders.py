@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import difflib
 from pathlib import Path
 from typing import Final
 
+from starhil.protocol.names import CONFIGS, bundled, find, not_found
 from starhil.protocol.values import IcdError
 
 DEFAULT_UNIT: Final = "cubestar"
 """Name of the unit that is emulated unless another is chosen."""
 
-UNITS_FOLDER: Final = Path(__file__).resolve().parent.parent / "configs" / "units"
+UNITS_FOLDER: Final = CONFIGS / "units"
 """Folder of the bundled units."""
 
 SKELETON: Final = UNITS_FOLDER.parent / "new_unit.toml"
@@ -20,7 +20,7 @@ SKELETON: Final = UNITS_FOLDER.parent / "new_unit.toml"
 
 def bundled_units() -> list[str]:
     """Return the names of the bundled units."""
-    return sorted(folder.name for folder in UNITS_FOLDER.iterdir() if any(folder.glob("*.toml")))
+    return list(bundled("unit"))
 
 
 def find_unit(name_or_folder: str | Path) -> Path:
@@ -28,14 +28,7 @@ def find_unit(name_or_folder: str | Path) -> Path:
 
     Raises IcdError, whose text suggests similar names.
     """
-    path = Path(name_or_folder).expanduser()
-    shipped = bundled_units()
-    if path.name == str(name_or_folder) in shipped:
-        return UNITS_FOLDER / path.name
+    path = find("unit", name_or_folder)
     if path.exists():
         return path
-    near = difflib.get_close_matches(path.name, shipped, n=3)
-    hint = f"did you mean {', '.join(near)}?" if near else f"bundled units: {', '.join(shipped)}"
-    raise IcdError(
-        f"unit {name_or_folder}: neither a folder nor a bundled unit; {hint}; `starhil unit new FOLDER` creates one"
-    )
+    raise IcdError(f"{not_found('unit', name_or_folder)}; `starhil unit new FOLDER` creates one")

@@ -30,6 +30,7 @@ COMMANDS: Final[dict[str, str]] = {
         "conformance",
         "hub",
         "cache",
+        "docs",
     )
 }
 """Sub-command → module."""

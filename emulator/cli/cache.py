@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import names_of
 from starhil.emulator.cli.output import report_slow_start
 from starid.cli.options import AsJson
 
@@ -52,7 +53,9 @@ def warm(
     profile: Annotated[
         str | None,
         typer.Argument(
-            help="Device profile for which to fill the cache: a name or a TOML file.", show_default="cubestar"
+            help="Device profile for which to fill the cache: a name or a TOML file.",
+            show_default="cubestar",
+            autocompletion=names_of("profile"),
         ),
     ] = None,
 ) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.options import names_of
 from starid.cli.options import AsJson
 
 group = typer.Typer(
@@ -29,7 +30,9 @@ def campaigns(
             help="Measure the performance of a device per ECSS-E-ST-60-20C and write a report to -o.",
         ),
     ] = False,
-    profile: Annotated[str, typer.Option(help="Device profile: a name or a TOML file.")] = "cubestar",
+    profile: Annotated[
+        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
+    ] = "cubestar",
     setting: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the profile. Repeatable."),

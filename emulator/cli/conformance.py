@@ -20,6 +20,7 @@ from starhil.emulator.cli.options import (
     SerialDialect,
     SerialPort,
     UnitChoice,
+    names_of,
 )
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.cli.options import AsJson, one_of
@@ -50,7 +51,9 @@ def command(
         Path | None, typer.Option(help="EDS file of the CANopen node; default: starhil's.")
     ] = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this run.")] = False,
-    profile: Annotated[str | None, typer.Option(help="With --start: device profile.")] = None,
+    profile: Annotated[
+        str | None, typer.Option(help="With --start: device profile.", autocompletion=names_of("profile"))
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option(

@@ -17,6 +17,7 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from starhil.emulator.cli.options import names_of
 from starid.cli.options import AsJson
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
@@ -33,7 +34,10 @@ YEAR_S: Final = 365.25 * 86_400.0
 def command(
     unit: Annotated[
         list[str] | None,
-        typer.Option(help="Unit: a name or a folder. Repeatable; default: all bundled units in turns."),
+        typer.Option(
+            help="Unit: a name or a folder. Repeatable; default: all bundled units in turns.",
+            autocompletion=names_of("unit"),
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the first life; the others follow.")] = 1,
     lives: Annotated[int, typer.Option(min=1, help="Number of lives.")] = 60,

@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
 
+from starhil.protocol.names import Kind, bundled
 from starid.cli.output import output_help
+
+
+def names_of(kind: Kind) -> Callable[[str], list[str]]:
+    """Return a function that completes the names of what ships with the package."""
+    return lambda incomplete: [name for name in bundled(kind) if name.startswith(incomplete)]
+
+
+def list_option(*kinds: Kind) -> object:
+    """Return an option that lists what ships with the package, by name with a description, and exits."""
+
+    def show(asked: bool) -> None:
+        if not asked:
+            return
+        for kind in kinds:
+            print(f"{kind}s:")
+            for name, path in bundled(kind).items():
+                print(f"  {name:<16}  {_description(path.read_text(encoding='utf-8'))}")
+        raise typer.Exit
+
+    what = " and ".join(f"{kind}s" for kind in kinds)
+    return typer.Option("--list", help=f"List the bundled {what} and exit.", callback=show, is_eager=True)
+
+
+def _description(text: str) -> str:
+    """Return the title of a TOML file, or the first sentence of the comment at its beginning."""
+    comment = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            break
+        comment.append(line.lstrip("# "))
+    return " ".join(comment).partition(". ")[0].rstrip(".") or str(tomllib.loads(text)["title"])
+
 
 SerialPort: TypeAlias = Annotated[
     str | None,
@@ -36,6 +71,7 @@ Unit: TypeAlias = Annotated[
     typer.Option(
         "--unit",
         help="Interface of the device: name of a bundled unit, or a folder of TOML files.",
+        autocompletion=names_of("unit"),
     ),
 ]
 UnitChoice: TypeAlias = Annotated[
@@ -43,6 +79,7 @@ UnitChoice: TypeAlias = Annotated[
     typer.Option(
         "--unit",
         help="Interface of the device: name of a bundled unit, or a folder of TOML files. Default: the profile's (cubestar).",
+        autocompletion=names_of("unit"),
     ),
 ]
 JunitFile: TypeAlias = Annotated[

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.options import names_of
 from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help, prepare_output, report_stream
 
@@ -53,7 +54,8 @@ def command(
     profile: Annotated[
         str | None,
         typer.Option(
-            help="Device profile with camera, sensor, exposure, gain, catalogue and sky: a name or a TOML file."
+            help="Device profile with camera, sensor, exposure, gain, catalogue and sky: a name or a TOML file.",
+            autocompletion=names_of("profile"),
         ),
     ] = None,
     as_annotated: Annotated[

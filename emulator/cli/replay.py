@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from starhil.emulator.cli.options import names_of
 from starid.cli.options import AsJson
 
 
@@ -17,7 +18,8 @@ def command(
         str | None,
         typer.Option(
             help="Device profile, a name or a TOML file, instead of the one in the recording; `[links]` and `[run]`, except its "
-            "algorithm, stay as recorded."
+            "algorithm, stay as recorded.",
+            autocompletion=names_of("profile"),
         ),
     ] = None,
     overrides: Annotated[

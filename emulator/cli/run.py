@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import DIALECTS, UnitChoice
+from starhil.emulator.cli.options import DIALECTS, UnitChoice, list_option, names_of
 from starhil.emulator.cli.output import report_slow_start
 from starid.cli.options import one_of
 from starid.cli.output import output_help, prepare_output
@@ -16,14 +16,19 @@ from starid.cli.output import output_help, prepare_output
 def command(
     profile: Annotated[
         str | None,
-        typer.Argument(help="Device profile: a name or a TOML file.", show_default="cubestar"),
+        typer.Argument(
+            help="Device profile: a name or a TOML file.",
+            show_default="cubestar",
+            autocompletion=names_of("profile"),
+        ),
     ] = None,
     unit: UnitChoice = None,
     head: Annotated[
         list[str] | None,
         typer.Option(
             help="Emulate several heads: give --head PROFILE for each, instead of PROFILE. All heads share one clock and the "
-            "first head's truth; each has its own mount."
+            "first head's truth; each has its own mount.",
+            autocompletion=names_of("profile"),
         ),
     ] = None,
     serial: Annotated[
@@ -92,7 +97,8 @@ def command(
     scenario: Annotated[
         str,
         typer.Option(
-            help="Scenario of timed faults and attitude changes: the name of a bundled scenario, or a TOML file."
+            help="Scenario of timed faults and attitude changes: the name of a bundled scenario, or a TOML file.",
+            autocompletion=names_of("scenario"),
         ),
     ] = "",
     view: Annotated[
@@ -115,6 +121,7 @@ def command(
         typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
     ] = None,
     log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
+    _list: Annotated[bool, list_option("profile", "scenario")] = False,
 ) -> int:
     """Run the emulator until SIGINT, SIGTERM or SIGHUP.
 

@@ -18,18 +18,29 @@ from starhil.emulator.cli.options import (
     SerialDialect,
     SerialPort,
     UnitChoice,
+    list_option,
+    names_of,
 )
 from starid.cli.options import AsJson
 
 
 def command(
-    script: Annotated[Path, typer.Argument(help="Name of a bundled session, or a TOML script.")],
+    script: Annotated[
+        Path,
+        typer.Argument(
+            help="Name of a bundled session, or a TOML script.", autocompletion=names_of("session")
+        ),
+    ],
     unit: UnitChoice = None,
     serial: SerialPort = None,
     can: CanChannel = None,
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,
     profile: Annotated[
-        str | None, typer.Option(help="With --start: device profile, instead of that in the script.")
+        str | None,
+        typer.Option(
+            help="With --start: device profile, instead of that in the script.",
+            autocompletion=names_of("profile"),
+        ),
     ] = None,
     log: Annotated[
         Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
@@ -43,6 +54,7 @@ def command(
     device_address: DeviceAddress = 4,
     keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
     as_json: AsJson = False,
+    _list: Annotated[bool, list_option("session")] = False,
 ) -> None:
     """Run a session (a TOML script of telecommands, reads and expectations).
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.options import names_of
 from starhil.emulator.cli.output import print_text
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.cli.options import AsJson
@@ -23,7 +24,11 @@ _FIELD_KEYS = ("name", "offset", "type", "unit", "value", "argument", "parameter
 
 UnitArgument = Annotated[
     str,
-    typer.Argument(metavar="UNIT", help="Name of a bundled unit, or a folder of TOML files."),
+    typer.Argument(
+        metavar="UNIT",
+        help="Name of a bundled unit, or a folder of TOML files.",
+        autocompletion=names_of("unit"),
+    ),
 ]
 
 

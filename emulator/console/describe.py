@@ -12,11 +12,11 @@ import numpy as np
 from starhil.emulator.console.history import COLUMNS, MODES
 from starhil.emulator.faults import NO_ERROR, DeviceFault, WireFault
 from starhil.emulator.head import Head
-from starhil.emulator.profile import configs_folder
 from starhil.emulator.run import Run
 from starhil.emulator.sky.objects import SkyObjects, range_of
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.names import bundled
 from starid.catalog import load_catalog
 from starid.star_names import STAR_NAMES
 
@@ -53,7 +53,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
             for item in icd.parameters.values()
         ],
         "faults": fault_controls(icd, [link.bus for link in head.links]),
-        "scenarios": sorted(path.stem for path in (configs_folder() / "scenarios").glob("*.toml")),
+        "scenarios": list(bundled("scenario")),
     }
 
 

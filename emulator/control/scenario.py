@@ -20,7 +20,6 @@ cannot set a live feed, because opening a socket takes time.
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, ValidationError, model_validator
@@ -30,12 +29,12 @@ from starhil.emulator.device.scheduler import Action
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
-from starhil.emulator.profile import configs_folder
 from starhil.emulator.toml_file import read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import reason
+from starhil.protocol.names import find, not_found
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
@@ -112,17 +111,14 @@ class Scenario(Strict):
 def load_scenario(name_or_path: str) -> Scenario:
     """Read a scenario from a path, or by the name of one in `configs/scenarios`."""
     try:
-        path = Path(name_or_path).expanduser()
-        if "/" not in name_or_path and not name_or_path.endswith(".toml"):
-            path = configs_folder() / "scenarios" / f"{name_or_path}.toml"
+        path = find("scenario", name_or_path)
         found = path.exists()
     except (OSError, RuntimeError) as error:  # RuntimeError: the home folder of an unknown user
         raise EmulatorError(
             f"scenario {name_or_path!r}: cannot be read ({reason(error)}); give another path"
         ) from None
     if not found:
-        known = ", ".join(sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
-        raise EmulatorError(f"scenario {name_or_path!r}: no such file; give a path, or one of: {known}")
+        raise EmulatorError(not_found("scenario", name_or_path))
     values = read_toml(path, "scenario")
     try:
         return Scenario.model_validate(values)

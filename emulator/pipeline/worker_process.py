@@ -27,7 +27,10 @@ class WorkerProcess:
         self.started_ns = time.monotonic_ns()
         self.socket, inherited = socket.socketpair()
         command = [sys.executable, "-m", "starhil.emulator.pipeline.worker", str(inherited.fileno())]
-        self.process = subprocess.Popen(command, pass_fds=[inherited.fileno()], stdin=subprocess.DEVNULL)  # noqa: S603
+        # in a process group of its own, so that Ctrl-C does not reach it while it imports
+        self.process = subprocess.Popen(  # noqa: S603
+            command, pass_fds=[inherited.fileno()], stdin=subprocess.DEVNULL, process_group=0
+        )
         inherited.close()
 
     @property

@@ -32,7 +32,7 @@ def command(
 ) -> None:
     """Identify the stars in a photograph of any camera and write it with the stars circled and the bright ones named.
 
-    This is `starid identify --annotate` without the options that matter for the attitude only. The exit status is
+    This is `starid identify -o` without the options that matter for the attitude only. The exit status is
     1 if the stars cannot be identified; detections are then marked as unidentified.
     """
     identify(
@@ -41,6 +41,6 @@ def command(
         fov=None if profile else fov,
         time_limit=time_limit,
         allow_colour=True,
-        annotate=output,
+        output=output,
         as_json=as_json,
     )

@@ -59,7 +59,8 @@ def command(
         ),
     ] = None,
     budget: Annotated[
-        float, typer.Option(help="Time limit of a solver per row, seconds; the rest of the row is skipped.")
+        float,
+        typer.Option(help="Processor time of a solver per row, seconds; the rest of the row is skipped."),
     ] = 120.0,
     raw: Annotated[
         bool, typer.Option("--raw", help="Use the answers of published algorithms without verification.")

@@ -12,6 +12,7 @@ import importlib
 import importlib.metadata
 import itertools
 import math
+import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Final, NoReturn
@@ -47,8 +48,8 @@ def _only_python_reads(word: str) -> bool:
     return "_" in word or not word.isascii()
 
 
-OPTIONAL_VALUES: Final = {"--view": "auto"}
-"""Options whose value may be omitted → their value in this case; typer does not support this."""
+OMITTED: Final = "auto"
+"""Value of an option whose metavar is in brackets (`[HOST:PORT]`) if it is given without one; typer does not support this."""
 
 
 class _PlainHelp:
@@ -73,14 +74,20 @@ class FiniteCommand(_PlainHelp, TyperCommand):
     """A command that rejects infinite numbers, NaN and numbers in Python notation (`1_0`)."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the arguments, with omitted values of `OPTIONAL_VALUES` added."""
+        """Parse the arguments, with omitted values of options added."""
         words = [word.rpartition("=")[2] for word in args]
         ctx.meta[_PYTHON_NUMBERS] = {float(word): word for word in words if _only_python_reads(word)}
+        optional = {
+            name
+            for param in self.params
+            if param.param_type_name == "option" and (param.metavar or "").startswith("[")
+            for name in param.opts
+        }
         whole = []
         for argument, after in itertools.pairwise([*args, "--"]):
             whole.append(argument)
-            if argument in OPTIONAL_VALUES and after.startswith("-"):
-                whole.append(OPTIONAL_VALUES[argument])
+            if argument in optional and after.startswith("-"):
+                whole.append(OMITTED)
         return super().parse_args(ctx, whole)
 
     def invoke(self, ctx: Any) -> Any:
@@ -135,7 +142,6 @@ def build_app(program: str, about: str, modules: Mapping[str, str], words: Seque
         cls=Group,
         help=about,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
     )
     app.callback()(_options)
@@ -148,6 +154,12 @@ def build_app(program: str, about: str, modules: Mapping[str, str], words: Seque
         else:
             app.command(name, cls=FiniteCommand)(module.command)
     return app
+
+
+def words_to_complete() -> list[str]:
+    """Return the arguments that a shell asks to complete, as typer's scripts for bash, zsh and fish hand them over."""
+    line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
+    return line.split()[1:]
 
 
 def describe_os_error(error: OSError) -> str:
@@ -188,7 +200,9 @@ def run(
     """
     show_every_character()
     try:
-        status = build(words)(args=list(words), prog_name=program, standalone_mode=False)
+        status = build(words or words_to_complete())(
+            args=list(words), prog_name=program, standalone_mode=False
+        )
     except errors as error:
         exit_for_bad_input(str(error), program)
     except ModuleNotFoundError as error:

@@ -10,7 +10,17 @@ from typing import Annotated, TextIO
 
 import typer
 
-from starid.cli.frame_options import frame_catalog, frame_parameters
+from starid.cli.frame_options import (
+    Epoch,
+    Fov,
+    FullField,
+    Geometry,
+    Kappa,
+    KeptStars,
+    MagnitudeBand,
+    frame_catalog,
+    frame_parameters,
+)
 from starid.cli.options import AsJson
 from starid.cli.output import output_help, prepare_output, report_stream
 
@@ -25,9 +35,7 @@ def build(
     overlap: Annotated[
         float, typer.Option(help="Overlap of neighbouring sky patches in percent, such as 99.5.")
     ],
-    geometry: Annotated[
-        str, typer.Option(help="planar (flat RA–Dec plane, as in the thesis) or spherical (a real camera).")
-    ] = "planar",
+    geometry: Geometry = "planar",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -36,29 +44,12 @@ def build(
             help=output_help("File to write; without it, the database is built and discarded."),
         ),
     ] = None,
-    kappa: Annotated[
-        float | None, typer.Option(help="Magnitude limit κ; default: 11.5 planar, 5.0 spherical.")
-    ] = None,
-    direction: Annotated[
-        str | None,
-        typer.Option(
-            help="Stars kept: faintest (magnitude ≥ κ) or brightest (magnitude ≤ κ); default: faintest planar, brightest spherical."
-        ),
-    ] = None,
-    band: Annotated[
-        str | None, typer.Option(help="Magnitude band: hp or v; default: hp planar, v spherical.")
-    ] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="Width of a sky patch, degrees; default: 40 planar, 42 spherical.")
-    ] = None,
-    full_field: Annotated[
-        bool,
-        typer.Option("--full-field", help="Square patches instead of circular ones; not roll-invariant."),
-    ] = False,
-    epoch: Annotated[
-        float | None,
-        typer.Option(help="Epoch of the positions, Julian year; default: 1991.25 planar, 2026 spherical."),
-    ] = None,
+    kappa: Kappa = None,
+    direction: KeptStars = None,
+    band: MagnitudeBand = None,
+    fov: Fov = None,
+    full_field: FullField = False,
+    epoch: Epoch = None,
     as_json: AsJson = False,
 ) -> None:
     """Build a feature database."""
@@ -70,13 +61,12 @@ def build(
 
     if output is not None:
         prepare_output(output, "-o")
-    planar = geometry == "planar"
     parameters = frame_parameters(
         geometry,
         fov=fov,
-        kappa=kappa if kappa is not None else (11.5 if planar else 5.0),
-        direction=direction or ("faintest" if planar else "brightest"),
-        band=band or ("hp" if planar else "v"),
+        kappa=kappa,
+        direction=direction,
+        band=band,
         full_field=full_field,
         overlap_percent=overlap,
     )

@@ -8,7 +8,17 @@ from typing import Annotated, Final
 
 import typer
 
-from starid.cli.frame_options import frame_catalog, frame_parameters
+from starid.cli.frame_options import (
+    Epoch,
+    Fov,
+    FullField,
+    Geometry,
+    Kappa,
+    KeptStars,
+    MagnitudeBand,
+    frame_catalog,
+    frame_parameters,
+)
 from starid.cli.options import AsJson
 from starid.errors import StaridError
 
@@ -30,31 +40,13 @@ def command(
     dec: Annotated[
         float | None, typer.Option(help="Declination of the centre of the patch, degrees.")
     ] = None,
-    kappa: Annotated[float, typer.Option(help="Magnitude limit κ.")] = 11.5,
-    direction: Annotated[
-        str,
-        typer.Option(
-            help="Stars kept: faintest (magnitude ≥ κ, as in the thesis) or brightest (magnitude ≤ κ)."
-        ),
-    ] = "faintest",
-    geometry: Annotated[
-        str,
-        typer.Option(
-            help="planar (degrees in the flat RA–Dec plane, as in the thesis) or spherical (pixels of a 937-pixel camera)."
-        ),
-    ] = "planar",
-    fov: Annotated[
-        float | None,
-        typer.Option(help="Width of the patch, degrees; default: 40 planar (as published), 42 spherical."),
-    ] = None,
-    band: Annotated[str, typer.Option(help="Magnitude band: hp or v.")] = "hp",
-    full_field: Annotated[
-        bool, typer.Option("--full-field", help="Square patch instead of its inscribed circle.")
-    ] = False,
-    epoch: Annotated[
-        float | None,
-        typer.Option(help="Epoch of the positions, Julian year; default: 1991.25 planar, 2026 spherical."),
-    ] = None,
+    kappa: Kappa = None,
+    direction: KeptStars = None,
+    geometry: Geometry = "planar",
+    fov: Fov = None,
+    band: MagnitudeBand = None,
+    full_field: FullField = False,
+    epoch: Epoch = None,
     as_json: AsJson = False,
 ) -> None:
     """Print the feature vector (n, A, r, sigma_A, sigma_r) and polar angle theta (°) of a patch of the sky."""

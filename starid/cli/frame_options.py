@@ -1,8 +1,10 @@
-"""Frame parameters and catalogue from the options of `features` and `database`."""
+"""Options of `features` and `database` for a patch of the sky, and its parameters and catalogue."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, cast
+
+import typer
 
 from starid.cli.options import one_of
 from starid.errors import StaridError
@@ -11,6 +13,39 @@ if TYPE_CHECKING:
     from starid.catalog import Band, StarCatalog
     from starid.thesis.database import DatabaseParameters
     from starid.thesis.frame_sky import Direction
+
+Geometry: TypeAlias = Annotated[
+    str,
+    typer.Option(
+        help="planar (degrees in the flat RA–Dec plane, as in the thesis) or spherical (pixels of a real camera)."
+    ),
+]
+Fov: TypeAlias = Annotated[
+    float | None,
+    typer.Option(help="Width of a sky patch, degrees; default: 40 planar (as published), 42 spherical."),
+]
+Kappa: TypeAlias = Annotated[
+    float | None, typer.Option(help="Magnitude limit κ; default: 11.5 planar, 5.0 spherical.")
+]
+KeptStars: TypeAlias = Annotated[
+    str | None,
+    typer.Option(
+        "--direction",
+        help="Stars kept: faintest (magnitude ≥ κ, as in the thesis) or brightest (magnitude ≤ κ); default: faintest planar, "
+        "brightest spherical.",
+    ),
+]
+MagnitudeBand: TypeAlias = Annotated[
+    str | None, typer.Option("--band", help="Magnitude band: hp or v; default: hp planar, v spherical.")
+]
+FullField: TypeAlias = Annotated[
+    bool,
+    typer.Option("--full-field", help="Square patches instead of circular ones; not roll-invariant."),
+]
+Epoch: TypeAlias = Annotated[
+    float | None,
+    typer.Option(help="Epoch of the positions, Julian year; default: 1991.25 planar, 2026 spherical."),
+]
 
 PLANAR_EPOCH: Final = 1991.25
 """Epoch of the catalogue; the published results ignore proper motion."""
@@ -26,18 +61,21 @@ def frame_parameters(
     geometry: str,
     *,
     fov: float | None,
-    kappa: float,
-    direction: str,
-    band: str,
+    kappa: float | None,
+    direction: str | None,
+    band: str | None,
     full_field: bool,
     overlap_percent: float = 99.0,
 ) -> DatabaseParameters:
-    """Return frame parameters from command-line options."""
+    """Return frame parameters from command-line options; None stands for the default of the geometry."""
     from starid.camera import Camera
     from starid.thesis.database import DatabaseParameters
 
-    side = cast("Direction", one_of("--direction", direction, ("faintest", "brightest")))
-    magnitude = cast("Band", one_of("--band", band, ("hp", "v")))
+    planar = one_of("--geometry", geometry, ("planar", "spherical")) == "planar"
+    limit = (11.5 if planar else 5.0) if kappa is None else kappa
+    kept = direction or ("faintest" if planar else "brightest")
+    side = cast("Direction", one_of("--direction", kept, ("faintest", "brightest")))
+    magnitude = cast("Band", one_of("--band", band or ("hp" if planar else "v"), ("hp", "v")))
     if not 1.0 < overlap_percent < 100.0:
         raise StaridError(
             f"--overlap {overlap_percent}: must be a percentage between 1 and 100, such as 99.5"
@@ -47,12 +85,12 @@ def frame_parameters(
             f"--fov {fov:g}: must be above 0 and at most {_WIDEST_FRAME_DEG:g} degrees, such as 40"
         )
     overlap = overlap_percent / 100.0
-    if one_of("--geometry", geometry, ("planar", "spherical")) == "planar":
+    if planar:
         width = _PLANAR_FOV_DEG if fov is None else fov
-        return DatabaseParameters("planar", overlap, width, kappa, side, magnitude, full_field)
+        return DatabaseParameters("planar", overlap, width, limit, side, magnitude, full_field)
     camera = Camera.from_fov(_SPHERICAL_FOV_DEG if fov is None else fov)
     return DatabaseParameters.for_camera(
-        camera, overlap=overlap, kappa=kappa, direction=side, band=magnitude, full_field=full_field
+        camera, overlap=overlap, kappa=limit, direction=side, band=magnitude, full_field=full_field
     )
 
 

@@ -92,11 +92,9 @@ def command(
         Path | None,
         typer.Option(help="Dark image of the same camera, exposure and temperature, to be subtracted."),
     ] = None,
-    annotate: Annotated[
+    output: Annotated[
         Path | None,
-        typer.Option(
-            "--annotate", "-o", help=output_help("Write the image with the identified stars marked.")
-        ),
+        typer.Option("--output", "-o", help=output_help("Write the image with the identified stars marked.")),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -110,9 +108,9 @@ def command(
     from starid.earth import julian_year
     from starid.imaging.image_io import image_suffix, read_image, write_image
 
-    if annotate is not None:
-        image_suffix(annotate)
-        prepare_output(annotate, "-o")
+    if output is not None:
+        image_suffix(output)
+        prepare_output(output, "-o")
     colour = fov is not None if allow_colour is None else allow_colour
     pixels = read_image(image, allow_colour=colour)
     if dark is not None:
@@ -126,12 +124,12 @@ def command(
     velocity = _velocity(unix_s, observer_velocity)
     result = _solve(pixels, catalog, profile, fov, fov_tolerance, model, velocity, time_limit or math.inf)
     report = _report(image, result, _advice(result, fov, model, time_limit))
-    if annotate is not None:
-        write_image(annotate, _marked(pixels, result))
+    if output is not None:
+        write_image(output, _marked(pixels, result))
     if as_json:
-        typer.echo(json.dumps(report), file=report_stream(annotate))
+        typer.echo(json.dumps(report), file=report_stream(output))
     else:
-        _show(report, annotate)
+        _show(report, output)
     if not result.solution.valid:
         raise typer.Exit(1)
 

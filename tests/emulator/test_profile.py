@@ -8,10 +8,11 @@ from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline_setup import pipeline_setup
-from starhil.emulator.profile import CALIBRATION, Profile, configs_folder, load_profile
+from starhil.emulator.profile import CALIBRATION, Profile, load_profile
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import bundled
 from starid.camera import Camera
 
 
@@ -28,7 +29,7 @@ def refusal(*args) -> str:
     return str(caught.value)
 
 
-@pytest.mark.parametrize("name", sorted(p.stem for p in (configs_folder() / "profiles").glob("*.toml")))
+@pytest.mark.parametrize("name", bundled("profile"))
 def test_every_profile_of_the_product_is_valid(name):
     assert load_profile(name).name == name
 
@@ -145,8 +146,8 @@ def test_overrides_are_toml_or_text():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean 'seed'?"),
-        ("[rum]\nseed = 1\n", "rum: unknown key; did you mean 'run'?"),
+        ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean seed?"),
+        ("[rum]\nseed = 1\n", "rum: unknown key; did you mean run?"),
         ("[run]\nseed = -1\n", "run.seed: must be at least 0 (given: -1)"),
         ("[run]\nseed = '1'\n", "run.seed: must be a valid integer (given: '1')"),
         ("[links.can]\naddress = 255\n", "links.can.address"),
@@ -155,7 +156,7 @@ def test_overrides_are_toml_or_text():
         ("truth = 3\n", "truth: must be a"),
         ("run = 3\n", "run: must be a table (given: 3)"),
         ("[truth]\nkind = 'rate'\n", "truth.rate_deg_s: missing"),
-        ("[truth]\nkind = 'rate'\nrate = [0, 0, 1]\n", "truth.rate: unknown key; did you mean 'rate_deg_s'?"),
+        ("[truth]\nkind = 'rate'\nrate = [0, 0, 1]\n", "truth.rate: unknown key; did you mean rate_deg_s?"),
         ("[truth]\nkind = 'rate'\nrate_rad_s = [0, 0, 1]\n", "truth.rate_"),
         ("[truth]\nkind = 'fixed'\nattitude = {ra_deg = 1.0}\n", "give ra_deg and dec_deg"),
         ("[truth]\nkind = 'fixed'\nattitude = {quaternion_xyzw = [1.0, 1.0, 0.0, 0.0]}\n", "not of length 1"),
@@ -239,7 +240,9 @@ def test_an_impossible_parameter_is_named_with_its_option(override, why):
     with pytest.raises(EmulatorError) as caught:
         Parameters(load_unit(), profile_defaults(profile, load_unit()), lambda _changes: None)
     assert f"{profile.source_of(caught.value)}: {caught.value}".startswith(f"--set {override}: {why}")
-    with pytest.raises(EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"):
+    with pytest.raises(
+        EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"
+    ):
         load_profile("cubestar", ["parameters.serial_baud=5"])
 
 
@@ -291,7 +294,7 @@ def test_a_byte_order_mark_is_accepted(tmp_path):
 def test_a_device_in_place_of_a_profile_is_rejected(tmp_path):
     path = tmp_path / "zero.toml"
     path.symlink_to("/dev/zero")
-    with pytest.raises(EmulatorError, match="no such file"):
+    with pytest.raises(EmulatorError, match="not found"):
         load_profile(str(path))
 
 

@@ -13,12 +13,13 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.imager import ProcessImager
 from starhil.emulator.pipeline.messages import PipelineReady
-from starhil.emulator.profile import Profile, RunConfig, configs_folder
+from starhil.emulator.profile import Profile, RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.names import bundled
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 
@@ -210,7 +211,7 @@ def test_no_error_is_not_a_fault(run):
     run(scenario)
 
 
-@pytest.mark.parametrize("name", sorted(p.stem for p in (configs_folder() / "scenarios").glob("*.toml")))
+@pytest.mark.parametrize("name", bundled("scenario"))
 def test_every_scenario_of_the_product_is_valid(name):
     assert load_scenario(name).name == name
 

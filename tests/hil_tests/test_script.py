@@ -10,8 +10,9 @@ from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.expect import Variable
 from starhil.hil_tests.script import Command, Read, Sample, Send, load_script
-from starhil.hil_tests.session_run import SCRIPT_FOLDER, find_script
+from starhil.hil_tests.session_run import find_script
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import bundled
 
 ICD = load_unit()
 
@@ -103,32 +104,41 @@ def test_a_full_script_is_read_unchanged(load):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[[step]]\nread = 'quaternoin'", ["step 1", "quaternoin", "did you mean 'quaternion'"]),
-        ("[[step]]\ncommand = 'set_mod'\nwith = { mode = 'standby' }", ["step 1", "set_mod", "'set_mode'"]),
+        ("[[step]]\nread = 'quaternoin'", ["step 1", "quaternoin", "did you mean quaternion"]),
+        (
+            "[[step]]\ncommand = 'set_mod'\nwith = { mode = 'standby' }",
+            ["step 1", "set_mod", "did you mean set_mode?"],
+        ),
         ("[[step]]\nread = 'reset'", ["it is a telecommand: use command"]),
         ("[[step]]\ncommand = 'identification'", ["it is telemetry: use read"]),
         (
             "[[step]]\nwait_s = 1\n[[step]]\nread = 'rates'\nexpect = { rat_x = 1 }",
-            ["step 2", "rat_x", "'rate_x'"],
+            ["step 2", "rat_x", "did you mean rate_x"],
         ),
-        ("[[step]]\ncommand = 'set_mode'\nwith = { mod = 'standby' }", ["'mod'", "did you mean 'mode'"]),
+        ("[[step]]\ncommand = 'set_mode'\nwith = { mod = 'standby' }", ["'mod'", "did you mean mode"]),
         ("[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }", ["tracing", "tracking"]),
         ("[[step]]\ncommand = 'set_mode'", ["set_mode.mode", "missing value"]),
-        ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["unknown key 'expct'", "'expect'"]),
-        ("[[step]]\nreed = 'rates'", ["exactly one action", "'reed'", "'read'"]),
+        ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["unknown key 'expct'", "did you mean expect"]),
+        ("[[step]]\nreed = 'rates'", ["exactly one action", "'reed'", "did you mean read"]),
         ("[[step]]\nread = 'rates'\nwait_s = 1", ["has read and wait_s"]),
         ("[[step]]\nname = 'x'", ["has none"]),
         ("title = 'empty'", ["no step"]),
-        ("stepp = 1\n[[step]]\nwait_s = 1", ["unknown key 'stepp'", "'step'"]),
+        ("stepp = 1\n[[step]]\nwait_s = 1", ["unknown key 'stepp'", "did you mean step?"]),
         ("[step]\nwait_s = 1", ["[[step]]"]),
         ("[[step]]\nwait_s = -1", ["at least 0"]),
         ("[[step]]\nwait_s = 'long'", ["'wait_s' must be a number"]),
-        ("[[step]]\nset_parameter = 'exposur'\nvalue = 1", ["exposur", "'exposure'"]),
+        ("[[step]]\nset_parameter = 'exposur'\nvalue = 1", ["exposur", "did you mean exposure"]),
         ("[[step]]\nset_parameter = 'exposure'\nvalue = 1e9", ["exposure", "outside"]),
-        ("[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'trackin' }", ["trackin", "'tracking'"]),
+        (
+            "[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'trackin' }",
+            ["trackin", "did you mean tracking"],
+        ),
         ("[[step]]\nread = 'precise_attitude'\nexpect = { valid = 1 }", ["'valid' is true or false"]),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = 'fast' }", ["'rate_x' is a number"]),
-        ("[[step]]\nread = 'rates'\nexpect = { rate_x = { vale = 1 } }", ["unknown key 'vale'", "'value'"]),
+        (
+            "[[step]]\nread = 'rates'\nexpect = { rate_x = { vale = 1 } }",
+            ["unknown key 'vale'", "did you mean value"],
+        ),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = {} }", ["is empty"]),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = { within = 1 } }", ["need 'value'"]),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = '$befor' }", ["nothing was captured as '$befor'"]),
@@ -138,7 +148,7 @@ def test_a_full_script_is_read_unchanged(load):
         ("[truth]\nra_deg = 1\n[[step]]\nwait_s = 1", ["truth", "'dec_deg'", "missing"]),
         ("[truth]\nra_deg = 1\ndec_deg = 91\nroll_deg = 0\n[[step]]\nwait_s = 1", ["-90 and 90"]),
         ("[truth]\nquaternion_xyzw = [1, 1, 1, 1]\n[[step]]\nwait_s = 1", ["length is 2"]),
-        ("[[step]]\nread = 'rates'\nrefused = 'invalid_idd'", ["invalid_idd", "'invalid_id'"]),
+        ("[[step]]\nread = 'rates'\nrefused = 'invalid_idd'", ["invalid_idd", "did you mean invalid_id"]),
         ("[[step]]\ndownload_image = '../x.png'", ["plain file name"]),
         ("[[step]]\ndownload_image = '..'", ["plain file name"]),
         ("[truth]\nfile = '../victim.txt'\n[[step]]\nwait_s = 1", ["truth", "'file'", "plain file name"]),
@@ -250,7 +260,7 @@ def test_a_missing_file_is_rejected_with_near_names(tmp_path):
         load_script(tmp_path / "none.toml", ICD)
 
 
-@pytest.mark.parametrize("path", sorted(SCRIPT_FOLDER.glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", bundled("session").values(), ids=lambda path: path.stem)
 def test_the_included_scripts_are_valid(path):
     script = load_script(path, ICD)
     assert script.steps

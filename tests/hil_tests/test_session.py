@@ -439,7 +439,7 @@ def test_the_command_prints_json_alone_and_exits_1_when_a_step_fails(device, tmp
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["nothing"], "no such session script"),
+        (["nothing"], "session 'nothing': not found"),
         (["first_light"], "no link: use"),
         (["first_light", "--serial", "auto"], "needs --start"),
         (["first_light", "--serial", "/dev/ttyS77", "--dialect", "d"], "must be a, b or c"),

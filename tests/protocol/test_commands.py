@@ -45,7 +45,7 @@ def test_list_prints_every_row_and_parameter() -> None:
         ),
         (
             ("icd", "export", "html", "--unit", "/does/not/exist"),
-            "starhil: unit /does/not/exist: neither a folder nor a bundled unit",
+            "starhil: unit '/does/not/exist': not found; give a path, or one of: cubestar",
         ),
         (("hub", "--host", "203.0.113.1", "--port", "1"), "starhil: CAN hub: cannot listen at 203.0.113.1:1"),
     ],

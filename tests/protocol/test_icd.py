@@ -461,7 +461,7 @@ def test_a_bad_definition_is_rejected_by_file_and_row(tmp_path: Path, text: str,
 
 
 def test_a_missing_or_empty_definition_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(IcdError, match="neither a folder nor a bundled unit"):
+    with pytest.raises(IcdError, match="not found"):
         load_unit(tmp_path / "none.toml")
     with pytest.raises(IcdError, match=r"no \.toml file"):
         load_unit(tmp_path)

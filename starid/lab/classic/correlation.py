@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from starid.arrays import Array, Array32, Indices, Indices32
 from starid.jit import compiled_ieee, inner
 from starid.lab.classic.grid import BUFFER_SHARE, RADIUS_SHARE
-from starid.lab.classic.neighbours import nearest_beyond, neighbour_table, neighbours_of
+from starid.lab.classic.neighbours import aligned_neighbours, nearest_beyond, neighbour_table
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 
 Patterns = tuple[Indices32, Array32, NDArray[np.uint16]]
@@ -35,42 +35,34 @@ WIDTH_SHARE: Final = 0.015
 MIN_COINCIDENT: Final = 3.0
 
 
-@inner
-def turn(polar: Array, count: int, aligned: int) -> None:
-    """Replace chord and azimuth by x and y, with the aligned neighbour on the x axis."""
-    reference = polar[aligned, 1]
-    for i in range(count):
-        distance, angle = polar[i, 0], polar[i, 1] - reference
-        polar[i, 0], polar[i, 1] = distance * np.cos(angle), distance * np.sin(angle)
-
-
 @compiled_ieee
 def _images(patterns: Patterns, buffer: float) -> Array32:
-    """Turn the neighbours (m, 2) of all stars; NaN for a star without a neighbour to align with."""
+    """Chords and azimuths (m, 2) of the neighbours of all stars, turned; NaN without a neighbour to align with."""
     start, polar, _ = patterns
-    images = np.empty_like(polar)
+    images = polar.copy()
     for star in range(start.shape[0] - 1):
-        image = polar[start[star] : start[star + 1]].astype(np.float64)
+        image = images[start[star] : start[star + 1]]
         aligned = nearest_beyond(image, image.shape[0], buffer)
-        if aligned >= 0:
-            turn(image, image.shape[0], aligned)
-        else:
-            image[:] = np.nan
-        images[start[star] : start[star + 1]] = image
+        image[:, 1] -= image[aligned, 1] if aligned >= 0 else np.nan
     return images
 
 
 @inner
 def correlation(image: Array, count: int, other: Array32, width: float) -> float:
-    """Correlation of two images, in units of that of one star with itself."""
-    total = 0.0
-    reach = 36.0 * width * width
+    """Correlation of two images, in units of that of one star with itself; both in order of distance."""
+    total, first = 0.0, 0
+    reach = 6.0 * width
     for i in range(count):
-        for j in range(other.shape[0]):
-            dx, dy = image[i, 0] - other[j, 0], image[i, 1] - other[j, 1]
-            square = dx * dx + dy * dy
-            if square < reach:
+        while first < other.shape[0] and other[first, 0] < image[i, 0] - reach:
+            first += 1
+        j = first
+        while j < other.shape[0] and other[j, 0] <= image[i, 0] + reach:
+            apart = image[i, 0] - other[j, 0]
+            arc = 2.0 * np.sin(0.5 * (image[i, 1] - other[j, 1]))
+            square = apart * apart + image[i, 0] * other[j, 0] * arc * arc
+            if square < reach * reach:
                 total += np.exp(-square / (4.0 * width * width))
+            j += 1
     return total
 
 
@@ -81,11 +73,10 @@ def _correlate(start: Indices32, images: Array32, seen: Array, radius: float, bu
     image, rows = np.empty((n, 2)), np.empty(n, dtype=np.int64)
     matched = np.full(n, -1, dtype=np.int64)
     for pivot in range(n):
-        count = neighbours_of(seen, pivot, radius, image, rows)
-        aligned = nearest_beyond(image, count, buffer)
+        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, image, rows)
         if aligned < 0:
             continue
-        turn(image, count, aligned)
+        image[:count, 1] -= image[aligned, 1]
         most = 0.0
         for star in range(start.shape[0] - 1):
             value = correlation(image, count, images[start[star] : start[star + 1]], WIDTH_SHARE * radius)

@@ -27,9 +27,9 @@ from starid.jit import compiled_ieee, inner
 from starid.lab.classic.neighbours import (
     MAX_TIED,
     add_winners,
+    aligned_neighbours,
     bright_neighbour,
     grouped,
-    nearest_beyond,
     neighbours_of,
     turned,
 )
@@ -120,8 +120,7 @@ def _vote(table: Table, stars: int, seen: Array, radius: float, buffer: float) -
     matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
     filled = 0
     for pivot in range(seen.shape[0]):
-        count = neighbours_of(seen, pivot, radius, polar, rows)
-        aligned = nearest_beyond(polar, count, buffer)
+        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, polar, rows)
         if aligned < 0:
             continue
         votes = np.zeros(stars, dtype=np.int32)

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from starid.arrays import Array, Indices
 from starid.jit import compiled_ieee
 from starid.lab.classic.grid import BUFFER_SHARE, GRID, MAX_NEIGHBOURS, RADIUS_SHARE, place_on_grid
-from starid.lab.classic.neighbours import nearest_beyond, neighbours_of
+from starid.lab.classic.neighbours import aligned_neighbours
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 
 SHADING_WIDTH: Final = 0.7
@@ -45,8 +45,7 @@ def _shaded_patterns(vectors: Array, radius: float, buffer: float) -> NDArray[np
     polar, rows = np.empty((MAX_NEIGHBOURS, 2)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     grey = np.zeros((vectors.shape[0], GRID * GRID), dtype=np.uint8)
     for star in range(vectors.shape[0]):
-        count = neighbours_of(vectors, star, radius, polar, rows)
-        aligned = nearest_beyond(polar, count, buffer)
+        count, aligned = aligned_neighbours(vectors, star, radius, buffer, polar, rows)
         if aligned < 0:
             continue
         for i in range(count):
@@ -70,8 +69,7 @@ def _least_cost(
     matched = np.full(seen.shape[0], -1, dtype=np.int64)
     brightest, range_of = magnitude[0], max(magnitude[-1] - magnitude[0], 1e-9)
     for pivot in range(seen.shape[0]):
-        count = neighbours_of(seen, pivot, radius, polar, rows)
-        aligned = nearest_beyond(polar, count, buffer)
+        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, polar, rows)
         if aligned < 0 or count < MIN_NEIGHBOURS:
             continue
         whole = 0.0

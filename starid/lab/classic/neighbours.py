@@ -85,12 +85,21 @@ def turned(azimuth: float, reference: float) -> float:
 
 
 @inner
-def nearest_beyond(polar: Array, count: int, buffer: float) -> int:
+def nearest_beyond(polar: Array | Array32, count: int, buffer: float) -> int:
     """Find the nearest neighbour beyond a buffer; −1 if there is none."""
     for i in range(count):
         if polar[i, 0] > buffer:
             return i
     return -1
+
+
+@inner
+def aligned_neighbours(
+    vectors: Array, pivot: int, radius: float, buffer: float, polar: Array, rows: Indices
+) -> tuple[int, int]:
+    """List the neighbours of a pivot as `neighbours_of` does; their number, and the nearest beyond a buffer or −1."""
+    count = neighbours_of(vectors, pivot, radius, polar, rows)
+    return count, nearest_beyond(polar, count, buffer)
 
 
 @inner

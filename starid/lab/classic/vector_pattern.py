@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 
 from starid.arrays import Array, Array32, Indices, Indices32
 from starid.jit import compiled_ieee, inner
-from starid.lab.classic.grid import BUFFER_SHARE, MAX_NEIGHBOURS, RADIUS_SHARE
+from starid.lab.classic.grid import BUFFER_SHARE, MAX_NEIGHBOURS, RADIUS_SHARE, place_on_grid
 from starid.lab.classic.neighbours import (
     MAX_TIED,
     add_winners,
+    aligned_neighbours,
     grouped,
-    nearest_beyond,
-    neighbours_of,
     turned,
 )
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
@@ -46,8 +45,7 @@ MIN_VOTES: Final = 4
 @inner
 def _element(polar: Array, i: int, reference: float, radius: float) -> int:
     """Element of the vector for the x' of a neighbour."""
-    x = polar[i, 0] / radius * math.cos(turned(polar[i, 1], reference))
-    return min(max(int(0.5 * (1.0 + x) * ELEMENTS), 0), ELEMENTS - 1)
+    return int(place_on_grid(polar, i, reference, radius, ELEMENTS)[0])
 
 
 @compiled_ieee
@@ -57,8 +55,7 @@ def _patterns(vectors: Array, radius: float, buffer: float) -> tuple[Indices32, 
     elements, stars = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
     angles = [0.0 for _ in range(0)]
     for star in range(vectors.shape[0]):
-        count = neighbours_of(vectors, star, radius, polar, rows)
-        aligned = nearest_beyond(polar, count, buffer)
+        count, aligned = aligned_neighbours(vectors, star, radius, buffer, polar, rows)
         if aligned < 0:
             continue
         for i in range(count):
@@ -85,8 +82,7 @@ def _vote(
     matches = np.empty((seen.shape[0] * MAX_TIED, 2), dtype=np.int64)
     filled = 0
     for pivot in range(seen.shape[0]):
-        count = neighbours_of(seen, pivot, radius, polar, rows)
-        aligned = nearest_beyond(polar, count, buffer)
+        count, aligned = aligned_neighbours(seen, pivot, radius, buffer, polar, rows)
         if aligned < 0:
             continue
         votes, voter = np.zeros(stars, dtype=np.int32), np.full(stars, -1, dtype=np.int64)

@@ -200,7 +200,7 @@ def run(
     camera : Camera
         Pinhole camera without distortion.
     budget_s : float
-        Time per row after which a solver skips the rest of the row; its `frames` is the number completed.
+        Processor time per row after which a solver skips the rest of the row; its `frames` is the number completed.
     raw : bool
         Whether published algorithms give their answers without verification.
     progress : callable, optional
@@ -332,7 +332,7 @@ def _run_row(row: str, frames: int, seed: int, field_of: _Field, budget_s: float
                 reply = solver.track(scene, predicted, WINDOW_SIGMAS * settings.predicted_px)
             else:
                 reply = solver.solve(scene)
-            spent[name] += reply.seconds
+            spent[name] += reply.cpu_seconds
             tallies[name].add(scene, floor, reply)
     return list(tallies.values())
 

@@ -22,7 +22,7 @@ from tests.emulator.cli.command_line import run_command_line
 from tests.emulator.workers import WORKER
 
 PROGRAM = [sys.executable, "-c", "from starhil.emulator.cli import main; main()"]
-WRITTEN = {"--output", "--annotate", "--junit", "--html", "--truth-log"}
+WRITTEN = {"--output", "--junit", "--html", "--truth-log"}
 """Options that name a file to write; `hub --log` is one too, the other logs are not."""
 
 

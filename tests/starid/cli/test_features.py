@@ -50,21 +50,26 @@ def test_build_and_info(tmp_path):
     assert (info["cells"], info["geometry"], info["kappa"]) == (19_800, "planar", 11.5)
 
 
-def test_spherical_features_say_their_unit():
-    result = call(
-        "features",
-        "--ra",
-        "10",
-        "--dec",
-        "20",
-        "--geometry",
-        "spherical",
-        "--kappa",
-        "5",
-        "--direction",
-        "brightest",
+def test_spherical_features_say_their_unit_and_have_the_defaults_of_a_database():
+    given = call(
+        *[
+            "features",
+            "--ra",
+            "10",
+            "--dec",
+            "20",
+            "--geometry",
+            "spherical",
+            "--kappa",
+            "5",
+            "--direction",
+            "brightest",
+            "--band",
+            "v",
+        ]
     )
-    assert "px" in result.stdout
+    assert "px" in given.stdout
+    assert given.stdout == call(*["features", "--ra", "10", "--dec", "20", "--geometry", "spherical"]).stdout
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_the_stars_are_where_the_truth_has_them(tmp_path):
 def test_the_annotated_image_is_written_in_colour(tmp_path):
     image, marked = tmp_path / "sky.png", tmp_path / "marked.png"
     starhil("render", "--ra", "10", "--dec", "20", "-o", str(image))
-    answer(image, "--annotate", str(marked))
+    answer(image, "-o", str(marked))
     image = cv2.imread(str(marked), cv2.IMREAD_UNCHANGED)
     assert image.shape == (937, 937, 3)
     assert (image[..., 0] != image[..., 1]).any()

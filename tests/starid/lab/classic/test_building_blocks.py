@@ -102,14 +102,15 @@ def test_ants_find_the_shortest_path_through_most_circles() -> None:
 
 
 def test_images_correlate_as_the_integral_of_their_product() -> None:
-    rng, width = np.random.default_rng(2), 0.05
-    one, other = rng.random((6, 2)), rng.random((7, 2))
-    x, y = np.meshgrid(*2 * [np.linspace(-0.5, 1.5, 800)])
+    rng, width = np.random.default_rng(2), 0.1
+    one, other = (np.column_stack([np.sort(rng.random(count)), 6.0 * rng.random(count)]) for count in (6, 7))
+    x, y = np.meshgrid(*2 * [np.linspace(-1.6, 1.6, 800)])
 
     def image(stars):
-        return sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * width**2)) for a, b in stars)
+        at = [(r * np.cos(angle), r * np.sin(angle)) for r, angle in stars]
+        return sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * width**2)) for a, b in at)
 
-    itself = (image([(0.5, 0.5)]) ** 2).sum()
+    itself = (image([(0.0, 0.0)]) ** 2).sum()
     expected = (image(one) * image(other)).sum() / itself
     assert correlation.correlation.py_func(one, 6, other, width) == pytest.approx(expected, rel=0.01)
 

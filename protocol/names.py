@@ -1,0 +1,43 @@
+"""Names of what ships with the package: profiles, scenarios, sessions, units; and what is said of an unknown name."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, Literal, TypeAlias
+
+_MIN_SIMILARITY: Final = 0.55
+"""Similarity above which a known name is suggested for an unknown one (`difflib`)."""
+
+Kind: TypeAlias = Literal["profile", "scenario", "session", "unit"]
+
+CONFIGS: Final = Path(__file__).resolve().parent.parent / "configs"
+"""Folder `configs` of the installation or checkout."""
+
+
+def bundled(kind: Kind) -> dict[str, Path]:
+    """Return the files (for units, the folders) that ship with the package, by name."""
+    files = (CONFIGS / f"{kind}s").glob("*/*.toml" if kind == "unit" else "*.toml")
+    return {path.stem: path for path in sorted({file.parent if kind == "unit" else file for file in files})}
+
+
+def find(kind: Kind, name: str | Path) -> Path:
+    """Return the path of what is bundled under a name, or else the name as a path, which may not exist."""
+    try:
+        return bundled(kind).get(str(name)) or Path(name).expanduser()
+    except RuntimeError:  # the home folder of an unknown user
+        return Path(name)
+
+
+def not_found(kind: Kind, name: str | Path) -> str:
+    """Return the text of an error for a name that is neither bundled nor a path."""
+    known = bundled(kind)
+    hint = did_you_mean(Path(name).stem, known)
+    return f"{kind} {str(name)!r}: not found; give a path, or one of: {', '.join(known)}{hint}"
+
+
+def did_you_mean(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
+    near = difflib.get_close_matches(name, list(known), n=3, cutoff=_MIN_SIMILARITY)
+    return f"; did you mean {', '.join(near)}?" if near else ""
