@@ -56,8 +56,9 @@ class Console:
         runs.listeners.append(self._broadcast)
         self.trace = WireTrace(
             device.icd,
-            head.links,
-            lambda: None if head.serial is None else head.serial.dialect,
+            head.traffic,
+            head.serial_dialect,
+            lambda: next((link.transport.description for link in head.links if link.bus == "can"), ""),
         )
         self.stepping = stepping
         self._requests = RequestEncoder(device.icd)
