@@ -22,6 +22,9 @@ from starhil.protocol.values import Value
 SHOWN_VALUES: Final = 8
 """Maximum number of values in a line."""
 
+CONSOLE_ADDRESS: Final = 253
+"""CAN address of the OBC of console and recording, whose own requests are told apart by it."""
+
 MAX_ADDRESSES: Final = 64
 """Maximum number of addresses whose segments are joined: a link fault can cause many random CAN IDs."""
 
@@ -96,14 +99,14 @@ class Decoder:
 
     def line(self, entry: WireItem) -> dict[str, Any]:
         """Decode one item to a line of the trace, as JSON data."""
-        events = self.events(entry)
-        item = entry.item
+        events, item, own = self.events(entry), entry.item, False
         kind, text = self._text_of(events) if events else ("part", self._part(item))
         if isinstance(item, CanFrame):
             raw = cansend(item)
             if item.extended and self._icd.link.can is not None:
                 can_id = CanId.unpack(item.id)
                 text = f"{can_id.source}→{can_id.destination} {text}"
+                own = CONSOLE_ADDRESS in (can_id.source, can_id.destination)
             elif not item.extended:
                 kind = "canopen"
         else:
@@ -115,6 +118,7 @@ class Decoder:
             "raw": raw,
             "kind": kind,
             "text": text,
+            "own": own,
         }
 
     def events(self, entry: WireItem) -> Sequence[Request | Reply | LinkFault]:
