@@ -147,6 +147,7 @@ class Faults:
                 device.modes.fail(request.device.error)
             if request.device.upset is not None:
                 self._upset(request.device.upset)
+        device.signals.faults_changed.emit(request.model_dump(mode="json", exclude_unset=True))
 
     def _upset(self, upset: UpsetFault) -> None:
         if upset.parameter is not None:
@@ -197,6 +198,7 @@ class Faults:
         device.cycle.restore_catalog()
         for _, wire in self._wires:
             wire.settings = WireFaultSettings()
+        device.signals.faults_changed.emit({})
 
     def describe(self) -> dict[str, Any]:
         """Return the current faults by level."""

@@ -31,6 +31,7 @@ from starhil.emulator.guard import close_all
 from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
+from starhil.emulator.links.traffic import Traffic
 from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.pipeline_setup import camera_constants
@@ -43,6 +44,7 @@ from starhil.emulator.truth.truth import SensorTruth, Truth
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
+from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
@@ -91,6 +93,7 @@ class Head:
         self.canopen: Link | None = None
         self.links: list[Link] = []
         """The open links, in the order of opening."""
+        self.traffic = Traffic()
         self.ready_fields: dict[str, str] = {}
         self.warm: PipelineReady | None = None
         self._wiring = wiring
@@ -148,17 +151,25 @@ class Head:
         stepped = isinstance(self.clock, SteppedClock)  # no time passes between two items of one event
         if links.serial.port != "off" and self.icd.link.serial is not None:
             self.serial = SerialLink(self.requests, self._serial_transport(paced=not stepped), seed)
-            self.links.append(self.serial)
+            self._add(self.serial)
             self.ready_fields["serial"] = await self.serial.start()
             if self.serial.dialect is not None:
                 self.ready_fields["dialect"] = self.serial.dialect.value
         if links.can.channel != "off" and self.icd.link.can is not None:
             gap_s = 0.0 if stepped else links.can.frame_gap_s
             self.can = CanLink(self.requests, self._can_transport("can", links.can.channel), gap_s, seed)
-            self.links.append(self.can)
+            self._add(self.can)
             self.ready_fields["can"] = await self.can.start()
         if links.canopen.node or (self.icd.canopen_only and links.can.channel != "off"):
             await self._open_canopen()
+
+    def _add(self, link: Link) -> None:
+        self.links.append(link)
+        self.traffic.add(link)
+
+    def serial_dialect(self) -> Dialect | None:
+        """Return the current dialect of the serial line; None without a line or dialects."""
+        return None if self.serial is None else self.serial.dialect
 
     def _serial_transport(self, *, paced: bool) -> SerialTransport:
         from starhil.protocol.transports.serial import open_serial
@@ -183,7 +194,7 @@ class Head:
         bus = self.ready_fields.get("can") or ("auto" if channel == "off" else channel)
         transport = self._can_transport("canopen", bus)
         self.canopen = open_canopen(self.requests, transport, self._state_dir, self.profile.run.seed)
-        self.links.append(self.canopen)
+        self._add(self.canopen)
         opened = await self.canopen.start()
         self.ready_fields.setdefault("can", opened)
         self.ready_fields["canopen"] = str(self.device.parameters["canopen_node"])

@@ -8,9 +8,9 @@ import json
 import shutil
 import tempfile
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from io import TextIOWrapper
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self, TypeVar
@@ -24,6 +24,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.head import Head
+from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile
@@ -44,7 +45,8 @@ from starhil.emulator.truth_log import WALL_TIMES, TruthLog
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports.base import Receive, ReportError, Transport
+from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 from starid.errors import StaridError
 from starid.files import open_regular, read_text
@@ -187,9 +189,10 @@ class Player(Wiring):
     def __init__(self, *, ends_at_once: bool) -> None:
         self.stepped = SteppedClock()
         super().__init__(self.stepped)
-        self.sent: dict[str, list[Any]] = {}
-        """Items that the device has sent, by link, as JSON."""
+        self.passed: list[WireItem] = []
+        """Items that the device has received and sent."""
         self.receivers: dict[str, Callable[[Any], None]] = {}
+        """Function of each open link that takes its input."""
         self.pipeline: PlayedImager | None = None
         self.writes: deque[Callable[[], None]] = deque()
         """Functions that end pending slow writes."""
@@ -202,6 +205,10 @@ class Player(Wiring):
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002
         """Return a CAN bus that is connected to the tape."""
         return _PlayedTransport(name, self)
+
+    def pass_item(self, link: str, item: bytes | CanFrame, *, outgoing: bool) -> None:
+        """Keep an item that passes a link now, for the comparison."""
+        self.passed.append(WireItem(self.stepped.now_ns() / NANOSECONDS, link, outgoing, item))
 
     def imager(self, inner: Imager) -> Imager:
         """Return a pipeline whose replies wait for their entries."""
@@ -223,34 +230,29 @@ class Player(Wiring):
 class _PlayedTransport(Transport[Item]):
     """A port or bus that is connected to the tape."""
 
+    immediate = True
+
     def __init__(self, name: str, player: Player) -> None:
         super().__init__(f"virtual:{name}")  # a bus that no other process can join
         self._name = name
-        self._sent = player.sent.setdefault(name, [])
         self._player = player
 
-    async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:  # noqa: ARG002
-        self._player.receivers[self._name] = on_receive
-
     async def _open(self) -> None:
-        """Do nothing: there is no port."""
+        self._player.receivers[self._name] = self._receive
 
     def send(self, item: Item) -> bool:
-        self._sent.append(as_json(item))
+        self._player.pass_item(self._name, item, outgoing=True)
         return True
 
-    async def drain(self) -> None:
-        """Do nothing: items are never pending."""
-
     async def close(self) -> None:
-        """Do nothing: there is no port."""
+        self._player.receivers.pop(self._name, None)
 
 
 class _PlayedSerial(_PlayedTransport[bytes], SerialTransport):
     """A serial line that is connected to the tape."""
 
     def set_baud(self, baud: int) -> None:
-        """Do nothing: there is no line."""
+        """Take the bytes at any bit rate: they have their times on the tape."""
 
 
 class PlayedImager:
@@ -384,9 +386,10 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
                 text = _read(folder / SCENARIO_FILE)
                 _validated(Scenario, text, folder / SCENARIO_FILE).enter(head, again.truth)
             play = _Playing(again, head, player, await head.imager.start())
-            expected = await play.entries(folder, report, ends=ends)
+            recording = await play.entries(folder, report, ends=ends)
             to_the_end = not report.differences
-            _compare_sent(expected, player.sent, report, to_the_end=to_the_end)
+            new_decoder = partial(Decoder, head.icd, head.serial_dialect)
+            _compare_sent(recording, player.passed, report, new_decoder, to_the_end=to_the_end)
         finally:
             await again.close()
             log.close()
@@ -403,15 +406,17 @@ class _Playing:
         self._player = player
         self._warm = warm
 
-    async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> dict[str, list[Any]]:
-        """Play a tape to its end, or to the entry at which the device deviates; return what was sent until there, by link."""
-        expected: dict[str, list[Any]] = {}
+    async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> list[WireItem]:
+        """Play a tape to its end, or to the entry at which the device deviates; return what passed the links until there."""
+        recording: list[WireItem] = []
         ended = not ends
         stepped = self._player.stepped
         for where, entry in read_events(folder):
-            if isinstance(entry, _Item) and entry.do == "out":
-                expected.setdefault(entry.link, []).append(as_json(entry.item))
-                continue
+            if isinstance(entry, _Item):
+                outgoing = entry.do == "out"
+                recording.append(WireItem(entry.ns / NANOSECONDS, entry.link, outgoing, entry.item))
+                if outgoing:
+                    continue
             if isinstance(entry, _Plain) and entry.do == "end":
                 ended = True
                 continue
@@ -420,7 +425,7 @@ class _Playing:
                 await self.entry(entry)
             except _DeviationError as deviation:
                 report.differences.append(f"{where}: {deviation}")
-                return expected
+                return recording
             except (EmulatorError, ProtocolError, StaridError) as error:
                 raise EmulatorError(f"replay {where}: {error}") from None
             report.entries += 1
@@ -428,7 +433,7 @@ class _Playing:
             report.differences.append(
                 f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
             )
-        return expected
+        return recording
 
     async def entry(self, entry: Entry) -> None:
         """Play one entry at the current time.
@@ -445,6 +450,7 @@ class _Playing:
                 receive = self._player.receivers.get(entry.link)
                 if receive is None:
                     raise _DeviationError(_deviation(entry, f"the link {entry.link} is off"))
+                self._player.pass_item(entry.link, entry.item, outgoing=False)
                 receive(entry.item)
             case _Feed():
                 if self._truth.feed is None:
@@ -481,32 +487,75 @@ def _deviation(entry: Entry, why: str) -> str:
 
 
 def _compare_sent(
-    expected: dict[str, list[Any]], sent: dict[str, list[Any]], report: ReplayReport, *, to_the_end: bool
+    recording: list[WireItem],
+    played: list[WireItem],
+    report: ReplayReport,
+    new_decoder: Callable[[], Decoder],
+    *,
+    to_the_end: bool,
 ) -> None:
-    """Compare the items sent on each link, if not to the end then as far as they were recorded."""
-    for link in sorted(expected.keys() | sent.keys()):
-        before, now = expected.get(link, []), sent.get(link, [])
-        if link == "serial":  # on a serial line only the bytes matter, not how they are divided into items
-            before, now = (
-                [pair for piece in pieces for pair in _bytes_of(piece)] for pieces in (before, now)
-            )
+    """Compare what was sent on each link, if not to the end then as far as it was recorded."""
+    for link in sorted({each.bus for each in recording + played if each.outgoing}):
+        passed = [[each for each in items if each.bus == link] for items in (recording, played)]
+        before, now = (list(_units(items)) for items in passed)
         report.sent[link] = len(before)
         if not to_the_end:
             now = now[: len(before)]
         if before != now:
-            at = next(
-                (n for n, pair in enumerate(zip(before, now, strict=False)) if pair[0] != pair[1]),
-                min(len(before), len(now)),
-            )
-            what = "byte" if link == "serial" else "message"
-            report.differences.append(
-                f"{link}: differs from {what} {at + 1} on: {len(before)} recorded, {len(now)} now"
-            )
+            difference = _message_difference(*(_messages(items, new_decoder()) for items in passed))
+            what = "byte" if link == "serial" else "frame"
+            report.differences.append(f"{link}: {difference or _unit_difference(before, now, what)}")
 
 
-def _bytes_of(text: str) -> list[str]:
-    """Return the bytes of hexadecimal text."""
-    return [text[n : n + 2] for n in range(0, len(text), 2)]
+def _units(items: Iterable[WireItem]) -> Iterator[Any]:
+    """Yield what was sent, bytes or CAN frames.
+
+    On a serial line only the bytes matter, not how they are divided into items.
+    """
+    for each in items:
+        if each.outgoing:
+            yield from (each.item if isinstance(each.item, bytes) else (as_json(each.item),))
+
+
+def _messages(items: Iterable[WireItem], decoder: Decoder) -> Iterator[tuple[float, str, bytes]]:
+    """Yield the messages that were sent, each with its time, the name of its row or frame, and its data."""
+    for each in items:
+        events = decoder.events(each)
+        if not each.outgoing:
+            continue
+        for event in events:
+            if isinstance(event, Reply):
+                row = decoder.row_of(event)
+                name = event.kind.value if row is None else row.name
+                if event.kind in {ReplyKind.ACK, ReplyKind.NACK}:
+                    name += f" answered with {int(event.code)}"
+                yield each.at_s, name, event.data
+        if isinstance(each.item, CanFrame) and not each.item.extended:
+            yield each.at_s, canopen_text(each.item), each.item.data
+
+
+def _message_difference(
+    recorded: Iterable[tuple[float, str, bytes]], now: Iterable[tuple[float, str, bytes]]
+) -> str:
+    """Return where the messages differ first; empty if those that both runs have are the same."""
+    for (at_s, name, data), (_, other, changed) in zip(recorded, now, strict=False):
+        if name != other:
+            return f"at {at_s:.3f} s: recorded {name}, now {other}"
+        if len(data) != len(changed):
+            return f"at {at_s:.3f} s, {name}: {len(data)} bytes recorded, {len(changed)} now"
+        for number, (old, new) in enumerate(zip(data, changed, strict=True)):
+            if old != new:
+                return f"at {at_s:.3f} s, {name}, byte {number}: recorded {old:02x}, now {new:02x}"
+    return ""
+
+
+def _unit_difference(before: list[Any], now: list[Any], what: str) -> str:
+    """Return where bytes or frames differ first."""
+    at = next(
+        (n for n, (old, new) in enumerate(zip(before, now, strict=False)) if old != new),
+        min(len(before), len(now)),
+    )
+    return f"differs from {what} {at + 1} on: {len(before)} recorded, {len(now)} now"
 
 
 def _compare_truth(recorded: Path, now: Path, report: ReplayReport, *, to_the_end: bool) -> None:

@@ -22,7 +22,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.output_file import Output, OutputFile
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.transports.base import Receive, ReportError, Transport
+from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
 
 Item = TypeVar("Item", bytes, CanFrame)
@@ -221,19 +221,16 @@ class _RecordedTransport(Transport[Item]):
         self._name = name
         self._recorder = recorder
 
-    async def start(self, on_receive: Receive[Item], on_error: ReportError | None = None) -> None:
-        def received(item: Item) -> None:
-            def entry() -> None:
-                self._recorder.enter("in", link=self._name, data=as_json(item))
-                on_receive(item)
-
-            self._recorder.when_open(entry)
-
-        await self._inner.start(received, on_error)
+    async def _open(self) -> None:
+        await self._inner.start(self._received, self._on_error)
         self.description = self._inner.description
 
-    async def _open(self) -> None:
-        """Do nothing: `start` opens the inner transport."""
+    def _received(self, item: Item) -> None:
+        def entry() -> None:
+            self._recorder.enter("in", link=self._name, data=as_json(item))
+            self._receive(item)
+
+        self._recorder.when_open(entry)
 
     def send(self, item: Item) -> bool:
         self._recorder.write("out", link=self._name, data=as_json(item))

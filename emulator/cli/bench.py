@@ -7,14 +7,18 @@ import json
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
 
 import typer
 
+from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import DIALECTS, DeviceAddress, SerialDialect, Unit
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.cli.options import AsJson, one_of
 from starid.cli.output import Column, output_help, prepare_output, print_table, progress
+
+if TYPE_CHECKING:
+    from starhil.emulator.cli.bench_bus import Target
 
 Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 
@@ -170,21 +174,40 @@ def frame(
         print_table(_BODIES_COLUMNS if bodies else _FRAME_COLUMNS, rows)
 
 
+@dataclasses.dataclass(frozen=True)
+class TargetOptions:
+    """The links of a running device, or the rate of those of the device that is started."""
+
+    baud: Annotated[int, typer.Option(min=1200, help="Bit rate of the serial line.")] = 921_600
+    can: Annotated[str | None, typer.Option(help="CAN channel of a running device, e.g. vcan0.")] = None
+    serial: Annotated[str | None, typer.Option(help="Serial port of a running device.")] = None
+    canopen: Annotated[
+        int | None, typer.Option(min=1, max=127, help="CANopen node ID of a running device.")
+    ] = None
+    device_address: DeviceAddress = 4
+    dialect: SerialDialect = None
+
+    def target(self) -> Target:
+        """Return the links."""
+        from starhil.emulator.cli.bench_bus import Target
+        from starhil.protocol.serial_interface import Dialect
+
+        if self.dialect is not None:
+            one_of("--dialect", self.dialect, DIALECTS)
+        dialect = Dialect(self.dialect or "b")
+        return Target(self.can, self.serial, self.canopen, self.device_address, self.baud, dialect)
+
+
 @group.command("bus")
+@with_option_groups
 def bus(
+    *,
     seconds: Annotated[float, typer.Option(min=1.0, help="Time per link.")] = 60.0,
     rate: Annotated[float, typer.Option(min=0.0, help="CAN frames per second from other nodes.")] = 7000.0,
-    baud: Annotated[int, typer.Option(min=1200, help="Bit rate of the serial line.")] = 921_600,
     p99_limit_ms: Annotated[
         float, typer.Option(help="Limit for the 99th percentile of CAN reply latency, milliseconds.")
     ] = 5.0,
-    can: Annotated[str | None, typer.Option(help="CAN channel of a running device, e.g. vcan0.")] = None,
-    serial: Annotated[str | None, typer.Option(help="Serial port of a running device.")] = None,
-    canopen: Annotated[
-        int | None, typer.Option(min=1, max=127, help="CANopen node ID of a running device.")
-    ] = None,
-    device_address: DeviceAddress = 4,
-    dialect: SerialDialect = None,
+    device: TargetOptions,
     unit: Unit = DEFAULT_UNIT,
     realtime: Annotated[
         bool,
@@ -203,19 +226,16 @@ def bus(
     """
     from contextlib import nullcontext
 
-    from starhil.emulator.cli.bench_bus import Target, check_rows, measure, print_figures, started_device
+    from starhil.emulator.cli.bench_bus import check_rows, measure, print_figures, started_device
     from starhil.hil_tests.realtime import set_realtime_priority
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.serial_interface import Dialect
 
-    if dialect is not None:
-        one_of("--dialect", dialect, DIALECTS)
+    running = device.target()
     icd = load_unit(unit)
     check_rows(icd)
     report = progress()
-    running = Target(can, serial, canopen, device_address, baud, Dialect(dialect or "b"))
-    start = can is None and serial is None
-    with started_device(unit, baud, realtime, report) if start else nullcontext(running) as target:
+    start = device.can is None and device.serial is None
+    with started_device(unit, device.baud, realtime, report) if start else nullcontext(running) as target:
         if realtime and not start:
             set_realtime_priority()
         figures = measure(icd, target, seconds, rate, report, realtime=realtime)

@@ -5,14 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import names_of
 from starid.cli.options import AsJson
+
+if TYPE_CHECKING:
+    from starhil.emulator.benchmarks.campaign import CampaignPlan
 
 group = typer.Typer(
     help="Measure the accuracy and reliability of attitudes over many rendered images (for speed and solvers, see bench).",
@@ -96,24 +101,55 @@ def campaigns(
         raise typer.Exit(1)
 
 
-@group.command("lost-in-space")
-def lost_in_space(
-    frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
-    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0,
+@dataclass(frozen=True)
+class PlanOptions:
+    """The images of a campaign."""
+
+    frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 1000
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1
+    fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
     unknown_field: Annotated[
         bool,
         typer.Option("--unknown-field", help="Identify without knowing --fov, like `identify --fov auto`."),
-    ] = False,
+    ] = False
     rate: Annotated[
         float, typer.Option(min=0, help="Body rate during the exposure, deg/s, about a random axis.")
-    ] = 0.0,
-    blocked: Annotated[
-        float, typer.Option(help="Fraction of the field hidden by a dark body, 0 to 0.9.")
-    ] = 0.0,
-    algorithm: Annotated[
-        str, typer.Option(help="Star identification algorithm: geometric, lsi or rsi.")
-    ] = "geometric",
+    ] = 0.0
+    blocked: Annotated[float, typer.Option(help="Fraction of the field hidden by a dark body, 0 to 0.9.")] = (
+        0.0
+    )
+    algorithm: Annotated[str, typer.Option(help="Star identification algorithm: geometric, lsi or rsi.")] = (
+        "geometric"
+    )
+    sky: Annotated[
+        str,
+        typer.Option(
+            help="clear, or hard: 100 false stars to about 50 true ones, planets, hot pixels, the Moon or glare, "
+            "and rates up to 2 deg/s."
+        ),
+    ] = "clear"
+
+    def plan(self) -> CampaignPlan:
+        """Return the plan."""
+        from starhil.emulator.benchmarks.campaign import CampaignPlan
+
+        return CampaignPlan(
+            self.frames,
+            self.seed,
+            self.fov,
+            self.rate,
+            self.blocked,
+            self.algorithm,
+            sky=self.sky,
+            unknown_field=self.unknown_field,
+        )
+
+
+@group.command("lost-in-space")
+@with_option_groups
+def lost_in_space(
+    *,
+    images: PlanOptions,
     require_valid: Annotated[
         float, typer.Option(help="Exit with status 1 if a lower percentage of images is valid.")
     ] = 99.5,
@@ -121,13 +157,6 @@ def lost_in_space(
     dask: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler, or `local` to start one.")
     ] = None,
-    sky: Annotated[
-        str,
-        typer.Option(
-            help="clear, or hard: 100 false stars to about 50 true ones, planets, hot pixels, the Moon or glare, "
-            "and rates up to 2 deg/s."
-        ),
-    ] = "clear",
     output: Annotated[
         Path | None,
         typer.Option(
@@ -145,13 +174,13 @@ def lost_in_space(
     """
     import numpy as np
 
-    from starhil.emulator.benchmarks.campaign import CampaignPlan, run_campaign, summarise
+    from starhil.emulator.benchmarks.campaign import run_campaign, summarise
 
-    plan = CampaignPlan(frames, seed, fov, rate, blocked, algorithm, sky=sky, unknown_field=unknown_field)
+    plan = images.plan()
     with _backend(dask, jobs):
         chunks = list(_with_progress(run_campaign(plan, folder=output, jobs=jobs), plan.chunks))
     rows = np.concatenate(chunks)
-    figures: dict[str, Any] = {"seed": seed, **summarise(rows, fov)}
+    figures: dict[str, Any] = {"seed": images.seed, **summarise(rows, images.fov)}
     if as_json:
         print(json.dumps(figures))
     else:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from starhil.emulator.console.obc import HOST_ADDRESS, Exchange, ObcPort
+from starhil.emulator.console.obc import Exchange, ObcPort
+from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
@@ -27,7 +28,7 @@ class ConsoleClient:
         self._settings = self._present_settings()
         link: HostLink[Any]
         if port.bus == "can":
-            link = CanHostLink(port.where, host_address=HOST_ADDRESS, device_address=port.device_address())
+            link = CanHostLink(port.where, host_address=CONSOLE_ADDRESS, device_address=port.device_address())
         elif port.bus == "serial":
             link = SerialHostLink(port.icd, port.where, dialect=port.dialect())
         else:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import names_of
 from starhil.emulator.errors import EmulatorError
 from starid.cli.output import output_help, prepare_output, report_stream
@@ -26,31 +27,90 @@ _NARROWEST_DEG = 0.1
 _FASTEST_DEG_S = 1000.0
 
 
-def command(
-    ra: Annotated[float, typer.Option(help="Right ascension of the boresight, degrees.")],
-    dec: Annotated[float, typer.Option(help="Declination of the boresight, degrees.")],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", help=output_help("Image to write: .png or .tiff."))
-    ],
+@dataclass(frozen=True)
+class PointingOptions:
+    """Where the sensor points and how it turns."""
+
+    ra: Annotated[float, typer.Option(help="Right ascension of the boresight, degrees.")]
+    dec: Annotated[float, typer.Option(help="Declination of the boresight, degrees.")]
     roll: Annotated[
         float, typer.Option(help="Angle of celestial north in the image, counter-clockwise from up, degrees.")
-    ] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
+    ] = 0.0
     rate: Annotated[
         tuple[float, float, float],
         typer.Option(metavar="X Y Z", help="Body rate during the exposure, sensor frame, degrees/s."),
-    ] = (0.0, 0.0, 0.0),
-    exposure: Annotated[float | None, typer.Option(help="Exposure, seconds.")] = None,
-    limit: Annotated[float | None, typer.Option(help="Limiting magnitude of the stars, V.")] = None,
-    bits: Annotated[int | None, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = None,
-    gain: Annotated[float | None, typer.Option(help="Analog gain, as a factor.")] = None,
-    fov: Annotated[
-        float | None, typer.Option(help="Horizontal field of view, edge to edge, degrees.")
-    ] = None,
+    ] = (0.0, 0.0, 0.0)
+
+    def check(self) -> None:
+        """Check the angles and the rate."""
+        for name, value in (("ra", self.ra), ("dec", self.dec), ("roll", self.roll)):
+            if not -_TURN_DEG <= value <= _TURN_DEG:
+                raise EmulatorError(f"--{name} {value:g}: must be between -360 and 360 degrees")
+        if not -90.0 <= self.dec <= 90.0:
+            raise EmulatorError(f"--dec {self.dec}: must be between -90 and 90 degrees")
+        if not math.hypot(*self.rate) <= _FASTEST_DEG_S:
+            raise EmulatorError(
+                f"--rate {' '.join(f'{value:g}' for value in self.rate)}: must be at most {_FASTEST_DEG_S:g} degrees/s in total"
+            )
+
+
+@dataclass(frozen=True)
+class ExposureOptions:
+    """What replaces keys of the sensor."""
+
+    exposure: Annotated[float | None, typer.Option(help="Exposure, seconds.")] = None
+    limit: Annotated[float | None, typer.Option(help="Limiting magnitude of the stars, V.")] = None
+    bits: Annotated[int | None, typer.Option(help="Bits per pixel: 8, 12 or 16.")] = None
+    gain: Annotated[float | None, typer.Option(help="Analog gain, as a factor.")] = None
+
+    def applied(self, sensor: SensorModel) -> SensorModel:
+        """Return the sensor with the given values."""
+        changes = {
+            "exposure_s": self.exposure,
+            "limiting_magnitude": self.limit,
+            "bits": self.bits,
+            "gain": self.gain,
+        }
+        return sensor.with_(**{name: value for name, value in changes.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class LensOptions:
+    """What replaces keys of the camera."""
+
+    fov: Annotated[float | None, typer.Option(help="Horizontal field of view, edge to edge, degrees.")] = None
     size: Annotated[
         str | None, typer.Option(metavar="WIDTH[xHEIGHT]", help="Size in pixels, such as 1024x768.")
-    ] = None,
-    model: Annotated[str | None, typer.Option(help="Projection: pinhole or equidistant.")] = None,
+    ] = None
+    model: Annotated[str | None, typer.Option(help="Projection: pinhole or equidistant.")] = None
+
+    def applied(self, camera: Camera) -> Camera:
+        """Return the camera with the given values."""
+        from starid.camera import Camera
+
+        if self == LensOptions():
+            return camera
+        width, height = (camera.width, camera.height) if self.size is None else _size(self.size)
+        values = {
+            "fov_deg": camera.fov_deg if self.fov is None else self.fov,
+            "width": width,
+            "height": height,
+            "model": camera.model if self.model is None else self.model,
+            "distortion": camera.distortion,
+        }
+        return Camera.from_dict(values)
+
+
+@with_option_groups
+def command(
+    *,
+    pointing: PointingOptions,
+    output: Annotated[
+        Path, typer.Option("--output", "-o", help=output_help("Image to write: .png or .tiff."))
+    ],
+    light: ExposureOptions,
+    lens: LensOptions,
+    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 0,
     profile: Annotated[
         str | None,
         typer.Option(
@@ -69,28 +129,18 @@ def command(
     from starid.catalog import load_catalog
     from starid.imaging.image_io import image_suffix, write_image
 
-    for name, value in (("ra", ra), ("dec", dec), ("roll", roll)):
-        if not -_TURN_DEG <= value <= _TURN_DEG:
-            raise EmulatorError(f"--{name} {value:g}: must be between -360 and 360 degrees")
-    if not -90.0 <= dec <= 90.0:
-        raise EmulatorError(f"--dec {dec}: must be between -90 and 90 degrees")
-    if not math.hypot(*rate) <= _FASTEST_DEG_S:
-        raise EmulatorError(
-            f"--rate {' '.join(f'{value:g}' for value in rate)}: must be at most {_FASTEST_DEG_S:g} degrees/s in total"
-        )
+    pointing.check()
     image_suffix(output)
     prepare_output(output, "-o")
-    if fov is not None and not fov >= _NARROWEST_DEG:
-        raise EmulatorError(f"--fov {fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
-    scene = _scene(profile, fov, size, model)
-    camera = scene.camera
-    changes = {"exposure_s": exposure, "limiting_magnitude": limit, "bits": bits, "gain": gain}
-    sensor = scene.sensor.with_(**{name: value for name, value in changes.items() if value is not None})
+    if lens.fov is not None and not lens.fov >= _NARROWEST_DEG:
+        raise EmulatorError(f"--fov {lens.fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
+    scene = _scene(profile)
+    camera, sensor = lens.applied(scene.camera), light.applied(scene.sensor)
     catalog = load_catalog(scene.catalog_path or None, scene.epoch)
     renderer = Renderer(camera, catalog, sensor, seed, scene.sky.objects)
     frame = renderer.render(
-        Attitude.from_radec_roll(ra, dec, roll),
-        [math.radians(value) for value in rate],
+        Attitude.from_radec_roll(pointing.ra, pointing.dec, pointing.roll),
+        [math.radians(value) for value in pointing.rate],
         observer=scene.sky.observer,
     )
     write_image(output, _marked(frame) if as_annotated else frame.image)
@@ -115,8 +165,8 @@ class _Scene:
     epoch: float
 
 
-def _scene(profile: str | None, fov: float | None, size: str | None, model: str | None) -> _Scene:
-    """Return the scene for the device of a profile, or the default, with the camera options applied."""
+def _scene(profile: str | None) -> _Scene:
+    """Return the scene for the device of a profile, or the default."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sky.objects import SkyObjects
     from starhil.emulator.sky.view import Sky, SkyView
@@ -124,44 +174,31 @@ def _scene(profile: str | None, fov: float | None, size: str | None, model: str 
     from starid.catalog import DEFAULT_EPOCH
 
     if profile is None:
-        scene = _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
-    else:
-        from starhil.emulator.device.device import profile_defaults
-        from starhil.emulator.device.parameters import Parameters
-        from starhil.emulator.device.surroundings import orbit_of
-        from starhil.emulator.pipeline_setup import pipeline_setup
-        from starhil.emulator.profile import load_profile
-        from starhil.protocol.icd import load_unit
+        return _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
+    from starhil.emulator.device.device import profile_defaults
+    from starhil.emulator.device.parameters import Parameters
+    from starhil.emulator.device.surroundings import orbit_of
+    from starhil.emulator.pipeline_setup import pipeline_setup
+    from starhil.emulator.profile import load_profile
+    from starhil.protocol.icd import load_unit
 
-        loaded = load_profile(profile)
-        icd = load_unit(loaded.unit_source)
-        parameters = Parameters(icd, profile_defaults(loaded, icd))
-        setup = pipeline_setup(loaded)
-        sensor = SensorModel().with_(**setup.sensor)
-        orbit = orbit_of(loaded)
-        at_start = None if orbit is None else orbit.state(loaded.start_unix_s)
-        place = (None, None) if at_start is None else (at_start.position_m, at_start.velocity_m_s)
-        scene = _Scene(
-            Camera.from_dict(setup.camera),
-            sensor.with_(
-                exposure_s=float(parameters["exposure"]) / 1000.0, gain=float(parameters["analog_gain"])
-            ),
-            Sky(setup.sky).view(loaded.start_unix_s, *place),
-            setup.catalog_path,
-            setup.epoch,
-        )
-    if fov is None and size is None and model is None:
-        return scene
-    old = scene.camera
-    width, height = (old.width, old.height) if size is None else _size(size)
-    values = {
-        "fov_deg": old.fov_deg if fov is None else fov,
-        "width": width,
-        "height": height,
-        "model": old.model if model is None else model,
-        "distortion": old.distortion,
-    }
-    return replace(scene, camera=Camera.from_dict(values))
+    loaded = load_profile(profile)
+    icd = load_unit(loaded.unit_source)
+    parameters = Parameters(icd, profile_defaults(loaded, icd))
+    setup = pipeline_setup(loaded)
+    sensor = SensorModel().with_(**setup.sensor)
+    orbit = orbit_of(loaded)
+    at_start = None if orbit is None else orbit.state(loaded.start_unix_s)
+    place = (None, None) if at_start is None else (at_start.position_m, at_start.velocity_m_s)
+    return _Scene(
+        Camera.from_dict(setup.camera),
+        sensor.with_(
+            exposure_s=float(parameters["exposure"]) / 1000.0, gain=float(parameters["analog_gain"])
+        ),
+        Sky(setup.sky).view(loaded.start_unix_s, *place),
+        setup.catalog_path,
+        setup.epoch,
+    )
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -2,17 +2,171 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import DIALECTS, UnitChoice, list_option, names_of
 from starhil.emulator.cli.output import report_slow_start
+from starhil.emulator.errors import EmulatorError
 from starid.cli.options import one_of
 from starid.cli.output import output_help, prepare_output
 
+if TYPE_CHECKING:
+    from starhil.emulator.launch import Emulator, RunOptions
+    from starhil.emulator.profile import Profile
 
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """What replaces keys of the profile of every head."""
+
+    unit: UnitChoice = None
+    serial: Annotated[
+        str | None,
+        typer.Option(
+            help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off. Default: the profile's (auto)."
+        ),
+    ] = None
+    dialect: Annotated[
+        str | None,
+        typer.Option(
+            help="Format of serial replies: a for OBC software written for the CubeComputer (replies begin with the "
+            "row ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
+            "one byte. Default: the profile's (b)."
+        ),
+    ] = None
+    can: Annotated[
+        str | None,
+        typer.Option(
+            help="CAN link: auto (vcan0 if available, else the TCP hub), a channel, or off. Default: the profile's (auto)."
+        ),
+    ] = None
+    canopen: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=127, help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0)."
+        ),
+    ] = None
+    seed: Annotated[int | None, typer.Option(help="Random seed. Default: the profile's (1).")] = None
+    clock: Annotated[
+        str | None,
+        typer.Option(
+            help="Simulation clock: real, scaled:FACTOR, or stepped (advances only on request, for repeatable runs). "
+            "Default: the profile's (real)."
+        ),
+    ] = None
+    state_dir: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept."
+        ),
+    ] = None
+    symlink: Annotated[Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")] = None
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
+    ] = None
+
+    def profile(self, name: str, number: int) -> Profile:
+        """Load the profile of the nth head, with the options in place of its keys; folders and links differ by head."""
+        from starhil.emulator.launch import path_of_head
+        from starhil.emulator.profile import load_profile
+
+        state_dir, symlink = self.state_dir, self.symlink
+        values = {
+            "unit": None if self.unit is None else _absolute_folder(self.unit),
+            "links.serial.port": self.serial,
+            "links.serial.dialect": self.dialect,
+            "links.can.channel": self.can,
+            "links.canopen.node": self.canopen,
+            "run.clock": self.clock,
+            "run.seed": self.seed,
+            "run.state_dir": None if state_dir is None else str(_folder_of_head(state_dir.resolve(), number)),
+            "links.serial.symlink": None
+            if symlink is None
+            else str(path_of_head(symlink.absolute(), number)),
+        }
+        overrides = [f"{key}={_as_toml(value)}" for key, value in values.items() if value is not None]
+        return load_profile(name, [*(self.settings or ()), *overrides])
+
+
+@dataclass(frozen=True)
+class AroundOptions:
+    """What is opened around the run: files, scenario, control channel and console."""
+
+    control: Annotated[
+        str,
+        typer.Option(
+            help="Control channel: off, auto (a Unix socket that only this user can open), unix:/PATH, "
+            "or HOST:PORT (open to all local users)."
+        ),
+    ] = "off"
+    control_token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="STARHIL_CONTROL_TOKEN", help="Token required in each request on the control channel."
+        ),
+    ] = None
+    truth_log: Annotated[
+        Path | None,
+        typer.Option(help=output_help("CSV file of true and measured attitudes, one row per frame.")),
+    ] = None
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Overwrite an existing truth log or recording.")
+    ] = False
+    scenario: Annotated[
+        str,
+        typer.Option(
+            help="Scenario of timed faults and attitude changes: the name of a bundled scenario, or a TOML file.",
+            autocompletion=names_of("scenario"),
+        ),
+    ] = ""
+    view: Annotated[
+        str,
+        typer.Option(
+            metavar="[HOST:PORT]",
+            help="Serve the console, a web page; the ready line has its address. Without HOST:PORT: a free port of "
+            "127.0.0.1.",
+        ),
+    ] = "off"
+    record: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove). Missing folders are created. "
+            "Repeatable."
+        ),
+    ] = None
+
+    def run_options(self) -> RunOptions:
+        """Return the options of the run; the folders of its files are created."""
+        from starhil.emulator.cli.console_client import ConsoleClient
+        from starhil.emulator.launch import RunOptions
+
+        if self.control_token is not None and not self.control_token:
+            raise EmulatorError("--control-token: empty; give a text, or omit the option")
+        folder, mcap = (_one_path(self.record, mcap=mcap) for mcap in (False, True))
+        for path, option in ((self.truth_log, "--truth-log"), (mcap, "--record")):
+            if path is not None:
+                prepare_output(path, option)
+        return RunOptions(
+            self.truth_log,
+            self.overwrite,
+            self.control,
+            self.control_token or "",
+            self.scenario,
+            record=folder,
+            view=self.view,
+            mcap=mcap,
+            make_client=ConsoleClient,
+        )
+
+
+@with_option_groups
 def command(
     profile: Annotated[
         str | None,
@@ -22,7 +176,6 @@ def command(
             autocompletion=names_of("profile"),
         ),
     ] = None,
-    unit: UnitChoice = None,
     head: Annotated[
         list[str] | None,
         typer.Option(
@@ -31,95 +184,9 @@ def command(
             autocompletion=names_of("profile"),
         ),
     ] = None,
-    serial: Annotated[
-        str | None,
-        typer.Option(
-            help="Serial link: auto (a pty), a device path, listen://HOST:PORT, or off. Default: the profile's (auto)."
-        ),
-    ] = None,
-    dialect: Annotated[
-        str | None,
-        typer.Option(
-            help="Format of serial replies: a for OBC software written for the CubeComputer (replies begin with the "
-            "row ID), b for a stand-alone node (no ID), c for generation 2. With the wrong dialect, values are shifted by "
-            "one byte. Default: the profile's (b)."
-        ),
-    ] = None,
-    can: Annotated[
-        str | None,
-        typer.Option(
-            help="CAN link: auto (vcan0 if available, else the TCP hub), a channel, or off. Default: the profile's (auto)."
-        ),
-    ] = None,
-    canopen: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=127, help="Also run a CANopen node with this ID; 0: off. Default: the profile's (0)."
-        ),
-    ] = None,
-    seed: Annotated[int | None, typer.Option(help="Random seed. Default: the profile's (1).")] = None,
-    clock: Annotated[
-        str | None,
-        typer.Option(
-            help="Simulation clock: real, scaled:FACTOR, or stepped (advances only on request, for repeatable runs). "
-            "Default: the profile's (real)."
-        ),
-    ] = None,
-    state_dir: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder for state that survives restarts, such as saved parameters. Default: no state is kept."
-        ),
-    ] = None,
-    symlink: Annotated[
-        Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")
-    ] = None,
-    control: Annotated[
-        str,
-        typer.Option(
-            help="Control channel: off, auto (a Unix socket that only this user can open), unix:/PATH, "
-            "or HOST:PORT (open to all local users)."
-        ),
-    ] = "off",
-    control_token: Annotated[
-        str | None,
-        typer.Option(
-            envvar="STARHIL_CONTROL_TOKEN", help="Token required in each request on the control channel."
-        ),
-    ] = None,
-    truth_log: Annotated[
-        Path | None,
-        typer.Option(help=output_help("CSV file of true and measured attitudes, one row per frame.")),
-    ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Overwrite an existing truth log or recording.")
-    ] = False,
-    scenario: Annotated[
-        str,
-        typer.Option(
-            help="Scenario of timed faults and attitude changes: the name of a bundled scenario, or a TOML file.",
-            autocompletion=names_of("scenario"),
-        ),
-    ] = "",
-    view: Annotated[
-        str,
-        typer.Option(
-            metavar="[HOST:PORT]",
-            help="Serve the console, a web page; the ready line has its address. Without HOST:PORT: a free port of "
-            "127.0.0.1.",
-        ),
-    ] = "off",
-    record: Annotated[
-        list[Path] | None,
-        typer.Option(
-            help="Record to a folder (for `starhil replay`) or to FILE.mcap (for Foxglove). Missing folders are created. "
-            "Repeatable."
-        ),
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
-    ] = None,
+    *,
+    device: DeviceOptions,
+    around: AroundOptions,
     log: Annotated[str, typer.Option(help="Log level on stderr: debug, info, warning or error.")] = "warning",
     _list: Annotated[bool, list_option("profile", "scenario")] = False,
 ) -> int:
@@ -134,103 +201,68 @@ def command(
     worker = take_worker()  # first, to start up in parallel with the imports below
 
     import asyncio
-    import gc
     import logging
 
-    from starhil.emulator.cli.console_client import ConsoleClient
-    from starhil.emulator.errors import EmulatorError
-    from starhil.emulator.guard import log_loop_errors_once
-    from starhil.emulator.launch import Emulator, RunOptions, path_of_head, with_own_seeds
-    from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starhil.emulator.launch import Emulator, with_own_seeds
+    from starhil.emulator.profile import DEFAULT_PROFILE
 
     levels = ("debug", "info", "warning", "error")
     if log not in levels:
         raise EmulatorError(f"--log {log}: must be one of {', '.join(levels)}")
     logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
-    if dialect is not None:
-        one_of("--dialect", dialect, DIALECTS)
+    if device.dialect is not None:
+        one_of("--dialect", device.dialect, DIALECTS)
     if head and profile is not None:
         raise EmulatorError(
             f"{profile}: a profile and --head exclude each other; give it as --head {profile}"
         )
-    values = {
-        "unit": None if unit is None else _absolute_folder(unit),
-        "links.serial.port": serial,
-        "links.serial.dialect": dialect,
-        "links.can.channel": can,
-        "links.canopen.node": canopen,
-        "run.clock": clock,
-        "run.seed": seed,
-    }
-    profiles = []
-    for number, name in enumerate(head or [profile or DEFAULT_PROFILE], start=1):
-        own = {
-            "run.state_dir": None if state_dir is None else str(_folder_of_head(state_dir.resolve(), number)),
-            "links.serial.symlink": None
-            if symlink is None
-            else str(path_of_head(symlink.absolute(), number)),
-        }
-        overrides = list(settings or ())
-        overrides += [
-            f"{key}={_as_toml(value)}" for key, value in (values | own).items() if value is not None
-        ]
-        profiles.append(load_profile(name, overrides))
-    profiles = with_own_seeds(profiles)
+    names = head or [profile or DEFAULT_PROFILE]
+    profiles = with_own_seeds([device.profile(name, number) for number, name in enumerate(names, start=1)])
     links = [each.links for each in profiles]
     reachable = any((on.serial.port, on.can.channel, on.canopen.node) != ("off", "off", 0) for on in links)
-    if (control, view) == ("off", "off") and not (truth_log or record or reachable):
+    observed = around.truth_log or around.record or (around.control, around.view) != ("off", "off")
+    if not reachable and not observed:
         raise EmulatorError(
             "no link: the device could not be reached, and nothing would be recorded; "
             "give --serial auto, --can auto, --canopen NODE, --view, --control auto or --truth-log FILE"
         )
+    options = around.run_options()
+    return asyncio.run(_serve(lambda: Emulator(profiles, options, worker)))
 
-    if control_token is not None and not control_token:
-        raise EmulatorError("--control-token: empty; give a text, or omit the option")
-    options = RunOptions(
-        truth_log,
-        overwrite,
-        control,
-        control_token or "",
-        scenario,
-        record=_one_path(record, mcap=False),
-        view=view,
-        mcap=_one_path(record, mcap=True),
-        make_client=ConsoleClient,
-    )
-    for path, option in ((truth_log, "--truth-log"), (options.mcap, "--record")):
-        if path is not None:
-            prepare_output(path, option)
 
-    async def run() -> int:
-        import signal
+async def _serve(make: Callable[[], Emulator]) -> int:
+    """Run an emulator, made in the event loop, until a signal or the control channel ends it; return the exit status."""
+    import asyncio
+    import gc
+    import signal
 
-        emulator = Emulator(profiles, options, worker)
-        loop = asyncio.get_running_loop()
-        log_loop_errors_once(loop)
-        ends = [signal.SIGINT, signal.SIGTERM]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
-            ends.append(signal.SIGHUP)
-        for number in ends:
-            loop.add_signal_handler(number, emulator.ended.set)
-        try:
-            await emulator.start()
-            line = asyncio.create_task(emulator.ready())
-            stop = asyncio.create_task(emulator.ended.wait())
-            progress = asyncio.create_task(report_slow_start())
-            await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
-            progress.cancel()
-            if line.done():
-                gc.collect()
-                gc.freeze()  # long-lived objects: garbage collection would pause the links
-                print(line.result(), flush=True)
-                await stop
-            else:
-                line.cancel()
-        finally:
-            await emulator.close()
-        return int(emulator.failed)
+    from starhil.emulator.guard import log_loop_errors_once
 
-    return asyncio.run(run())
+    emulator = make()
+    loop = asyncio.get_running_loop()
+    log_loop_errors_once(loop)
+    ends = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored under nohup
+        ends.append(signal.SIGHUP)
+    for number in ends:
+        loop.add_signal_handler(number, emulator.ended.set)
+    try:
+        await emulator.start()
+        line = asyncio.create_task(emulator.ready())
+        stop = asyncio.create_task(emulator.ended.wait())
+        progress = asyncio.create_task(report_slow_start())
+        await asyncio.wait({line, stop}, return_when=asyncio.FIRST_COMPLETED)
+        progress.cancel()
+        if line.done():
+            gc.collect()
+            gc.freeze()  # long-lived objects: garbage collection would pause the links
+            print(line.result(), flush=True)
+            await stop
+        else:
+            line.cancel()
+    finally:
+        await emulator.close()
+    return int(emulator.failed)
 
 
 def _absolute_folder(unit: str) -> str:
@@ -242,8 +274,6 @@ def _absolute_folder(unit: str) -> str:
 
 def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
     """Return the MCAP file of `--record`, or its folder; None without the option."""
-    from starhil.emulator.errors import EmulatorError
-
     found = [path for path in paths or () if (path.suffix == ".mcap") == mcap]
     if len(found) > 1:
         kind = "MCAP file" if mcap else "folder"

@@ -13,7 +13,7 @@ from typing import Any, Final
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.describe import describe, load_bright_stars
 from starhil.emulator.console.history import History, frame_message
-from starhil.emulator.console.obc import HOST_ADDRESS, ConsoleObc, Exchange, ObcClient
+from starhil.emulator.console.obc import ConsoleObc, Exchange, ObcClient
 from starhil.emulator.console.pointing import pointing_request
 from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.stepping import StepRunner
@@ -24,6 +24,7 @@ from starhil.emulator.device.modes import Transition
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import log_internal_error, one_line
 from starhil.emulator.head import Head
+from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.emulator.run import Run
 from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
@@ -56,8 +57,9 @@ class Console:
         runs.listeners.append(self._broadcast)
         self.trace = WireTrace(
             device.icd,
-            head.links,
-            lambda: None if head.serial is None else head.serial.dialect,
+            head.traffic,
+            head.serial_dialect,
+            lambda: next((link.transport.description for link in head.links if link.bus == "can"), ""),
         )
         self.stepping = stepping
         self._requests = RequestEncoder(device.icd)
@@ -280,7 +282,7 @@ class Console:
     async def _encode(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
         address = int(self._head.device.parameters[self._address])
-        return {"problem": problem, **self._requests.encode(row, data, HOST_ADDRESS, address)}
+        return {"problem": problem, **self._requests.encode(row, data, CONSOLE_ADDRESS, address)}
 
     async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         exchange = await self.obc.send(str(request.get("row")), _table(request, "values"))

@@ -21,10 +21,21 @@ COLUMNS: Final = (
     "detected", "matched", "render_ms", "detect_ms", "identify_ms", "latency_ms",
     "qx", "qy", "qz", "qw", "ra", "dec", "roll", "true_ra", "true_dec", "true_roll", "reason",
 )  # fmt: skip
-"""Columns of a row: times in seconds, errors and sigmas in arcseconds, rates in degrees/s, angles in degrees.
+"""Columns of a row, in `UNITS`.
 
 `mode` is an index into `MODES`, `reason` an index into the `reasons` of the history. NaN: unknown.
 """
+
+UNITS: Final = {
+    **dict.fromkeys(("run_s", "unix_s"), "s"),
+    **dict.fromkeys(
+        ("error_x", "error_y", "error_roll", "error_cross", "sigma_cross", "sigma_roll"), "arcsec"
+    ),
+    **dict.fromkeys(("rate_x", "rate_y", "rate_z", "true_rate_x", "true_rate_y", "true_rate_z"), "deg/s"),
+    **dict.fromkeys(("render_ms", "detect_ms", "identify_ms", "latency_ms"), "ms"),
+    **dict.fromkeys(("ra", "dec", "roll", "true_ra", "true_dec", "true_roll"), "deg"),
+}
+"""Unit of each column that has one."""
 
 MODES: Final = tuple(mode.value for mode in Mode)
 

@@ -19,9 +19,6 @@ from starhil.protocol.values import FieldError, Value
 
 Bus = Literal["can", "canopen", "serial"]
 
-HOST_ADDRESS: Final = 253
-"""CAN address of the console as an OBC."""
-
 KEPT_STEPS: Final = 1000
 """Number of latest transactions that can be saved as a session."""
 

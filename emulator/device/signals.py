@@ -6,6 +6,7 @@
     modes ──mode_changed──► device, CANopen, console        parameters ──parameters_changed──► device, subscriptions, links
     device ──started──► subscriptions      device ──restarted──► links, revival of the pipeline
     subscriptions ──row_due──► requests    requests ──unsolicited──► links
+    faults ──faults_changed──► recording
 
 Two parts that know nothing of the device have a signal of their own: `Scheduler.added` wakes a sleeping pump, and
 `PipelineImager.ended` starts the pipeline again.
@@ -17,6 +18,7 @@ first the device, so that every other part finds it up to date.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
@@ -41,5 +43,7 @@ class Signals:
     """A reset is complete; the cause."""
     row_due: Signal[Row] = field(default_factory=lambda: Signal("unsolicited row"))
     """A telemetry row is due to be sent unsolicited."""
+    faults_changed: Signal[dict[str, Any]] = field(default_factory=lambda: Signal("faults"))
+    """Faults were injected, as requested, or all were ended: {}."""
     unsolicited: Signal[Reply] = field(default_factory=lambda: Signal("unsolicited telemetry"))
     """A message for every link."""

@@ -78,9 +78,8 @@ class Transport(ABC, Generic[Item]):
     def send(self, item: Item) -> bool:
         """Queue an item without blocking. Returns False if it was dropped; drops are counted."""
 
-    @abstractmethod
     async def drain(self) -> None:
-        """Wait until the queue has been sent."""
+        """Wait until the queue has been sent; without a queue (`immediate`), return at once."""
 
     @abstractmethod
     async def close(self) -> None:

@@ -114,6 +114,26 @@ def test_every_signal_has_its_sender_and_its_observers_in_the_drawing():
         assert f"──{name}──►" in signals.__doc__
 
 
+def changes():
+    """Return the rows of the table of changes: what is new, the files, and the names that stand in them."""
+    for new, files in re.findall(r"^\| (\w[\w ]*) \| (.*) \|$", section("What to change for"), re.MULTILINE):
+        quoted = set(re.findall(r"`([^`]+)`", files))
+        paths = {text for text in quoted if "/" in text}
+        names = {text for text in quoted - paths if text.isidentifier()}
+        if new != "a new":
+            yield new, paths, names
+
+
+def test_the_table_of_changes_names_what_stands_in_its_files():
+    rows = list(changes())
+    assert len(rows) >= 11
+    for new, paths, names in rows:
+        files = [file for path in paths for file in ([ROOT / path, *(ROOT / path).glob("*.py")])]
+        text = "".join(file.read_text(encoding="utf-8") for file in files if file.is_file())
+        for name in names:
+            assert re.search(rf"\b{name}\b", text), (new, name)
+
+
 @pytest.mark.parametrize(("heading", "most"), [("The way of an image", 14), ("The way of a telecommand", 7)])
 def test_a_way_visits_no_file_twice(heading, most):
     steps = re.findall(r"^\d+\. `([\w/.]+\.py)`", section(heading), re.MULTILINE)

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 
 import pytest
 
@@ -158,6 +159,56 @@ def test_a_scenario_is_part_of_the_recording(record, tmp_path):
     assert "0.5" in (folder / "truth.csv").read_text()
 
 
+def changed_byte(folder, link, changed):
+    """Change the last recorded item of a link by a function; return its time, seconds."""
+    events = folder / EVENTS_FILE
+    lines = [json.loads(line) for line in events.read_text().splitlines()]
+    entry = [entry for entry in lines if entry["do"] == "out" and entry["link"] == link][-1]
+    entry["data"] = changed(entry["data"])
+    events.write_text("".join(json.dumps(entry) + "\n" for entry in lines))
+    return entry["ns"] / 1e9
+
+
+def test_a_changed_byte_is_named_by_time_row_and_place(record):
+    async def scenario(emulation, _line):
+        await talk(emulation, 2)  # device_status is the last row that is read
+
+    folder = record(scenario)
+    at_s = changed_byte(folder, "serial", lambda data: data[:8] + "a9" + data[10:])
+    (difference,) = report_of(folder).differences
+    place = re.escape(f"serial: at {at_s:.3f} s, device_status, byte 2: recorded a9, now ")
+    assert re.fullmatch(place + "[0-9a-f]{2}", difference)
+
+
+def test_a_changed_can_frame_is_named_by_its_row_or_its_meaning_in_canopen(record):
+    bus = "virtual:changed"
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd)
+        await client.start()
+        await client.telemetry("device_status")
+        await client.close()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": bus}, "canopen": {"node": 5}}
+    folder = record(scenario, clock="real", links=links)
+    for link, name in (("can", "device_status"), ("canopen", "node 5 heartbeat")):
+        at_s = changed_byte(folder, link, lambda data: [data[0], "a9" + data[1][2:], *data[2:]])
+        (difference,) = (found for found in report_of(folder).differences if found.startswith(link + ":"))
+        assert difference.startswith(f"{link}: at {at_s:.3f} s, {name}, byte ")
+        assert ": recorded a9, now " in difference
+
+
+def test_traffic_is_reported_while_it_is_recorded(record):
+    passed = []
+
+    async def scenario(emulation, _line):
+        emulation.traffic.passed.connect(passed.append)
+        await talk(emulation, 2)
+
+    record(scenario)
+    assert {item.outgoing for item in passed} == {True, False}
+
+
 def test_a_changed_device_is_found(record):
     async def scenario(emulation, _line):
         await talk(emulation, 3)
@@ -168,7 +219,7 @@ def test_a_changed_device_is_found(record):
     run["profile"]["device"]["firmware_minor"] = 9
     run_file.write_text(json.dumps(run))
     (difference,) = report_of(folder).differences
-    assert difference.startswith("serial: differs")
+    assert re.fullmatch(r"serial: at \d+\.\d{3} s, identification, byte 3: recorded 00, now 09", difference)
 
 
 @pytest.mark.parametrize("rest", [0, 8])
@@ -204,7 +255,7 @@ def test_a_missing_truth_log_is_a_difference(record):
     ("override", "said"),
     [
         ("device.firmware_minor=0", "identical"),
-        ("device.firmware_minor=9", "serial: differs from byte"),
+        ("device.firmware_minor=9", "identification, byte 3: recorded 00, now 09"),
         ("truth={kind='fixed', attitude={ra_deg=10.0, dec_deg=0.0}}", "truth log: row 1 differs"),
         ("parameters.update_rate=0.5", "the device behaves differently"),
     ],

@@ -11,9 +11,13 @@ from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.console import recorder as recorder_module
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from starhil.protocol.icd import load_unit
 from tests.emulator.conftest import ORION, PREVIEW
-from tests.emulator.runs import command
+from tests.emulator.runs import Control, command
 
+ICD = load_unit()
 WITHIN_S = 20.0
 JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": int, "boolean": bool}
 
@@ -77,6 +81,63 @@ def test_images_truth_measurements_telemetry_and_events_are_read_back(run, tmp_p
     assert found["/telemetry/device_status"][0][2]["mode"] in ("boot", "standby", "lost_in_space", "tracking")
 
 
+def test_faults_traffic_units_and_what_identifies_the_run_are_read_back(run, tmp_path):
+    path = tmp_path / "run.mcap"
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+        )
+        await client.start()
+        async with Control(emulation) as control:
+            await control.do("fault", optical={"false_stars": 3})
+        await emulation.stepper.step(1.0)
+        await client.command("set_mode", mode="lost_in_space")
+        async with Control(emulation) as control:
+            await control.do("clear_faults")
+        await client.close()
+        await record(emulation)
+
+    run(scenario, options=options(path, control="auto"))
+    found = messages(path)
+    events = [event["message"] for _, _, event in found["/events"]]
+    assert 'fault {"optical": {"false_stars": 3}}' in events
+    assert "faults ended" in events
+    assert [faults for _, _, faults in found["/faults"]] == [{"optical": {"false_stars": 3}}, {}]
+    serial = [(line["out"], line["kind"], line["text"]) for _, _, line in found["/bus/serial"]]
+    assert (False, "telecommand", "set_mode mode=lost_in_space") in serial
+    assert (True, "ack", "set_mode accepted") in serial
+    with path.open("rb") as stream:
+        reader = make_reader(stream)
+        (metadata,) = reader.iter_metadata()
+        schemas = {schema.name: json.loads(schema.data) for schema in reader.get_summary().schemas.values()}
+    assert metadata.name == "starhil.run"
+    assert (metadata.metadata["unit"], metadata.metadata["seed"]) == ("cubestar", "1")
+    assert schemas["starhil.Measurement"]["properties"]["rate_x"]["unit"] == "deg/s"
+    rate = schemas["starhil.Telemetry.precise_attitude"]["properties"]["rate_x"]
+    assert (rate["unit"], rate["description"]) == (
+        "deg/s",
+        ICD.telemetry["precise_attitude"].named_fields["rate_x"].doc,
+    )
+
+
+def test_the_recorders_own_requests_are_not_recorded(run, tmp_path):
+    path = tmp_path / "run.mcap"
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(CanHostLink("virtual:recorded-bus"), emulation.icd)
+        await client.start()
+        await client.telemetry("identification")
+        await record(emulation)
+        await client.close()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": "virtual:recorded-bus"}}
+    run(scenario, options=options(path), links=links)
+    texts = [line["text"] for _, _, line in messages(path)["/bus/can"]]
+    assert texts[0] == "1→4 identification?"
+    assert all(text.startswith(("1→4", "4→1")) for text in texts)
+
+
 def test_nothing_is_replaced_unless_asked_for(run, tmp_path):
     path = tmp_path / "run.mcap"
     path.write_bytes(b"kept")
@@ -106,6 +167,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_run(run, tmp_path, caplog):
         def __init__(self, *_args, **_options):
             self.register_schema = self.register_channel = lambda **_options: 1
             self.start = lambda **_options: None
+            self.add_metadata = lambda *_options: None
 
         def add_message(self, **_options):
             raise OSError(28, "No space left on device")

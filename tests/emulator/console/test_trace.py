@@ -2,7 +2,7 @@
 
 import pytest
 
-from starhil.emulator.console.trace import Decoder, WireItem, canopen_text
+from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request

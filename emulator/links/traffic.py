@@ -1,0 +1,240 @@
+"""The traffic on the links of a head: reported as it passes, and decoded for people."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Final
+
+from starhil.emulator.links.base import Link
+from starhil.emulator.signals import Signal
+from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanHostReceiver, CanId, MessageType
+from starhil.protocol.codec import Row
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
+from starhil.protocol.values import Value
+
+SHOWN_VALUES: Final = 8
+"""Maximum number of values in a line."""
+
+CONSOLE_ADDRESS: Final = 253
+"""CAN address of the OBC of console and recording, whose own requests are told apart by it."""
+
+MAX_ADDRESSES: Final = 64
+"""Maximum number of addresses whose segments are joined: a link fault can cause many random CAN IDs."""
+
+_REQUEST_TYPES: Final = (
+    MessageType.TELECOMMAND,
+    MessageType.TELEMETRY_REQUEST,
+    MessageType.TELECOMMAND_EXTENDED,
+)
+
+_CANOPEN: Final = (
+    (0x080, "SYNC or EMCY"), (0x180, "TPDO 1"), (0x200, "RPDO 1"), (0x280, "TPDO 2"), (0x300, "RPDO 2"),
+    (0x380, "TPDO 3"), (0x400, "RPDO 3"), (0x480, "TPDO 4"), (0x500, "RPDO 4"), (0x580, "SDO reply"),
+    (0x600, "SDO request"), (0x700, "heartbeat"),
+)  # fmt: skip
+"""Function codes of CANopen's predefined connection set."""
+
+
+@dataclass(frozen=True, slots=True)
+class WireItem:
+    """Bytes or a CAN frame on a link.
+
+    Attributes
+    ----------
+    at_s
+        Unix time.
+    bus
+        `serial` or `can`.
+    outgoing
+        True if the device sent it.
+    item
+        Bytes, or a CAN frame.
+    """
+
+    at_s: float
+    bus: str
+    outgoing: bool
+    item: bytes | CanFrame
+
+
+class Traffic:
+    """Reports each item on the links of a head, with the signal `passed`.
+
+    On a bus with two links, both receive the same frames, which are reported once.
+    """
+
+    def __init__(self) -> None:
+        self.passed: Signal[WireItem] = Signal("traffic")
+        self._buses: set[str] = set()
+
+    def add(self, link: Link) -> None:
+        """Report the items of a link."""
+        link.wire.listener = partial(self._report, link.bus, True)  # noqa: FBT003 (outgoing)
+        if link.bus not in self._buses:
+            self._buses.add(link.bus)
+            link.transport.listener = partial(self._report, link.bus, False)  # noqa: FBT003 (incoming)
+
+    def _report(self, bus: str, outgoing: bool, item: bytes | CanFrame) -> None:
+        if self.passed.observers:
+            self.passed.emit(WireItem(time.time(), bus, outgoing, item))
+
+
+class Decoder:
+    """Decodes the items of a trace, in order."""
+
+    def __init__(self, icd: InterfaceDefinition, dialect: Callable[[], Dialect | None]) -> None:
+        self._icd = icd
+        self._dialect = dialect
+        self._stack = build_serial_stack(icd) if icd.link.serial is not None else None
+        self._to_device = self._stack.device() if self._stack is not None else None
+        self._from_device: tuple[Dialect | None, HostReceiver] | None = None
+        self._can: dict[tuple[bool, int], CanDeviceReceiver | CanHostReceiver] = {}
+
+    def line(self, entry: WireItem) -> dict[str, Any]:
+        """Decode one item to a line of the trace, as JSON data."""
+        events, item, own = self.events(entry), entry.item, False
+        kind, text = self._text_of(events) if events else ("part", self._part(item))
+        if isinstance(item, CanFrame):
+            raw = cansend(item)
+            if item.extended and self._icd.link.can is not None:
+                can_id = CanId.unpack(item.id)
+                text = f"{can_id.source}→{can_id.destination} {text}"
+                own = CONSOLE_ADDRESS in (can_id.source, can_id.destination)
+            elif not item.extended:
+                kind = "canopen"
+        else:
+            raw = item.hex(" ").upper()
+        return {
+            "t": entry.at_s,
+            "bus": entry.bus,
+            "out": entry.outgoing,
+            "raw": raw,
+            "kind": kind,
+            "text": text,
+            "own": own,
+        }
+
+    def events(self, entry: WireItem) -> Sequence[Request | Reply | LinkFault]:
+        """Return the messages that are complete with an item; none in 11-bit CAN frames."""
+        if isinstance(entry.item, CanFrame):
+            return self._can_events(entry.item, entry.at_s)
+        return self._serial_events(entry.item, entry.at_s, outgoing=entry.outgoing)
+
+    def _serial_events(
+        self, data: bytes, now: float, *, outgoing: bool
+    ) -> Sequence[Request | Reply | LinkFault]:
+        if self._stack is None or self._to_device is None:
+            return ()
+        dialect = self._dialect()
+        if self._from_device is None or self._from_device[0] is not dialect:
+            self._from_device = (dialect, self._stack.host(dialect))
+        host = self._from_device[1]
+        if outgoing:
+            return host.feed(data, now)
+        requests = self._to_device.feed(data, now)
+        for event in requests:
+            if isinstance(event, Request):
+                row = self.row_of(event)
+                telemetry = row is not None and row.kind == "telemetry"
+                host.expect(event, row.size if row is not None and telemetry else 0)
+        return requests
+
+    def _can_events(self, frame: CanFrame, now: float) -> Sequence[Request | Reply | LinkFault]:
+        if not frame.extended or self._icd.link.can is None:
+            return ()
+        can_id = CanId.unpack(frame.id)
+        request = can_id.type in _REQUEST_TYPES
+        key = (request, can_id.destination)
+        if key not in self._can:
+            if len(self._can) >= MAX_ADDRESSES:
+                self._can.clear()
+            self._can[key] = (CanDeviceReceiver if request else CanHostReceiver)(can_id.destination)
+        return self._can[key].feed(frame, now)
+
+    def _part(self, item: bytes | CanFrame) -> str:
+        """Return the text of an item without a complete message."""
+        if not isinstance(item, CanFrame):
+            return "bytes" if self._stack is None else "part of a message"
+        if not item.extended:
+            return canopen_text(item)
+        if self._icd.link.can is None:
+            return "29-bit frame"
+        number = CanId.unpack(item.id).id
+        row = self._icd.row_by_id(number)
+        return f"segment of {row.name if row is not None else number}"
+
+    def _text_of(self, events: Sequence[Request | Reply | LinkFault]) -> tuple[str, str]:
+        found = [self._text(event) for event in events]
+        return found[-1][0], "; ".join(text for _, text in found)
+
+    def row_of(self, message: Request | Reply) -> Row | None:
+        """Return the row of a message by class and ID, or else by ID alone."""
+        if message.id is None:
+            return None
+        return self._icd.rows_by_key.get((message.klass, message.id)) or self._icd.row_by_id(message.id)
+
+    def _text(self, event: Request | Reply | LinkFault) -> tuple[str, str]:
+        if isinstance(event, LinkFault):
+            return "fault", f"{event.kind.value}: {event.detail}"
+        row = self.row_of(event)
+        name = row.name if row is not None else f"id {event.id}"
+        if isinstance(event, Request):
+            if event.kind is RequestKind.TELEMETRY:
+                return "telemetry", f"{name}?"
+            return "telecommand", f"{name}{_values(row, event.data)}"
+        if event.kind is ReplyKind.NACK:
+            return "nack", f"{name} refused: {self._icd.error_name(int(event.code))}"
+        if event.kind is ReplyKind.ACK:
+            return "ack", f"{name} accepted"
+        return "reply", f"{name}{_values(row, event.data)}"
+
+
+def _values(row: Row | None, data: bytes) -> str:
+    """Format the first values of a row."""
+    if row is None or not data:
+        return ""
+    try:
+        values = list(row.decode(data, check=False).items())
+    except ProtocolError as error:
+        return f" {error}"
+    text = " ".join(f"{name}={short(value)}" for name, value in values[:SHOWN_VALUES])
+    return f" {text}{' …' if len(values) > SHOWN_VALUES else ''}"
+
+
+def short(value: Value) -> str:
+    """Format a value."""
+    return (
+        value.hex(" ").upper()
+        if isinstance(value, bytes)
+        else f"{value:.6g}"
+        if isinstance(value, float)
+        else str(value)
+    )
+
+
+def canopen_text(frame: CanFrame) -> str:
+    """Return the meaning of an 11-bit frame in CANopen."""
+    if frame.id == 0:
+        return "NMT command"
+    if frame.id in (0x7E4, 0x7E5):
+        return "LSS reply" if frame.id == 0x7E4 else "LSS request"
+    node, function = frame.id & 0x7F, frame.id & 0x780
+    for code, name in _CANOPEN:
+        if code == function:
+            if name == "SYNC or EMCY":
+                return "SYNC" if node == 0 else f"node {node} EMCY"
+            return f"node {node} {name}"
+    return f"COB-ID {frame.id:03X}"
+
+
+def cansend(frame: CanFrame) -> str:
+    """Return a frame as an argument of cansend."""
+    number = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
+    return f"{number}#{'R' if frame.remote else frame.data.hex().upper()}"
