@@ -118,12 +118,32 @@ class _Classes:
         return item
 
 
-@dataclass(frozen=True)
+@dataclass
 class ReplyFormat:
-    """The framing of the replies of a link or of one of its dialects, and the header of each kind of reply."""
+    """The framing of the replies of a link or of one of its dialects, and the header of each kind of reply.
+
+    In a dialect, all replies to a request with the same start byte have the ID in the same place.
+    """
 
     framing: Framing
     headers: Mapping[ReplyKind, Header]
+    starts: dict[int | None, list[ReplyKind]] = field(init=False)
+    """First byte of a header, None if any → kinds of replies to a request."""
+    ids: dict[ReplyKind, int] = field(init=False)
+    """Kind → place of the ID in the header, if it has one."""
+    sizes: dict[ReplyKind, int] = field(init=False)
+    """Kind → size of the header in messages without a class."""
+
+    def __post_init__(self) -> None:
+        self.starts, self.ids, self.sizes = {}, {}, {}
+        for kind, header in self.headers.items():
+            roles = [item.role for item in header.fields]
+            self.sizes[kind] = header.size("")
+            if "id" in roles:
+                self.ids[kind] = roles.index("id")
+            if kind is not ReplyKind.BURST:
+                start = header.fields[0].const if header.fields else None
+                self.starts.setdefault(start, []).append(kind)
 
 
 class SerialStack:
@@ -180,11 +200,9 @@ class SerialStack:
         self.request_header: Final = self._header(
             "request_header", cubespace.REQUEST_HEADER if self.dialects else link.request_header
         )
-        self._formats: Final[Mapping[Dialect | None, ReplyFormat]] = (
-            {dialect: self._dialect(dialect) for dialect in self.dialects}
-            if self.dialects
-            else {None: self._one_format()}
-        )
+        self._formats: Final = {dialect: self._dialect(dialect) for dialect in self.dialects}
+        default = default_dialect(self.dialects)
+        self._default_format: Final = self._one_format() if default is None else self._formats[default]
         self.reply_header: Final = self.format().headers[ReplyKind.NACK]
         self._check_headers()
         longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)
@@ -214,10 +232,7 @@ class SerialStack:
 
     def format(self, dialect: Dialect | None = None) -> ReplyFormat:
         """Return the format of the replies."""
-        return self._formats[self._chosen(dialect)]
-
-    def _chosen(self, dialect: Dialect | None) -> Dialect | None:
-        return dialect if dialect in self.dialects else default_dialect(self.dialects)
+        return self._default_format if dialect is None else self._formats.get(dialect, self._default_format)
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
@@ -285,7 +300,8 @@ class SerialStack:
         form = self.format(dialect)
         if self.dialects:
             if reply.kind not in form.headers:
-                raise ProtocolError(_no_such_reply(reply.kind, self._chosen(dialect)))
+                chosen = dialect if dialect in self.dialects else default_dialect(self.dialects)
+                raise ProtocolError(_no_such_reply(reply.kind, chosen))
             if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) and reply.id in self._silent:
                 return b""
         elif reply.kind is ReplyKind.ECHO:
@@ -320,6 +336,8 @@ class SerialStack:
 
     def close(self, header: bytes, data: bytes) -> bytes:
         """Return header, data and check of a message."""
+        if not self.check.size:
+            return header + data
         return header + data + self.check.compute(self._covered(header, data))
 
     def _covered(self, header: bytes, data: bytes) -> bytes:
@@ -346,9 +364,9 @@ class SerialStack:
         if not self._checks(body, envelope.size, end):
             return self._bad_check(body[end:])
         address = envelope.values.get("address")
-        own = header.defaults.get("address")
-        if address is not None and address != own:
-            return LinkFault(FaultKind.UART_ADDRESS, f"message to address {address:#04x}, not {own:#04x}")
+        if address is not None and address != header.defaults["address"]:
+            text = f"message to address {address:#04x}, not {header.defaults['address']:#04x}"
+            return LinkFault(FaultKind.UART_ADDRESS, text)
         found = end - envelope.size
         if "length" in header.roles and envelope.values["length"] != header.length(envelope.size, found):
             text = f"{found} bytes of data, but length {envelope.values['length']}"
@@ -356,6 +374,8 @@ class SerialStack:
         return envelope, body[envelope.size : end]
 
     def _checks(self, body: bytes, header_size: int, end: int) -> bool:
+        if not self.check.size:
+            return True
         covered = self._covered(body[:header_size], body[header_size:end])
         return self.check.compute(covered) == body[end:]
 
@@ -369,11 +389,13 @@ class SerialStack:
             return opened
         envelope, data = opened
         values = envelope.values
-        row = self.row(envelope.klass, values["id"])
-        klass = envelope.klass or (row.klass if row is not None else "")
+        row_id, klass = values["id"], envelope.klass
+        if not klass:
+            row = self.row(klass, row_id)
+            klass = row.klass if row is not None else ""
         return Request(
-            self.kind_of(values["id"], klass) or RequestKind.TELECOMMAND,
-            values["id"],
+            self.kind_of(row_id, klass) or RequestKind.TELECOMMAND,
+            row_id,
             data,
             values.get("source", 0),
             klass,
@@ -426,7 +448,7 @@ class HostReceiver:
 
     def __init__(self, stack: SerialStack, replies: ReplyFormat) -> None:
         self._stack = stack
-        self._headers = replies.headers
+        self._format = replies
         self._deframer: Deframer[Reply] = replies.framing.deframer(
             stack.receiving(self._reply_of, self._size)
         )
@@ -477,10 +499,11 @@ class HostReceiver:
     def _reply_of(self, body: bytes) -> Reply | LinkFault | None:
         if self._echo is not None:
             return self._check_echo(body)
-        told = self._kind_in_dialect(body) if self._stack.dialects else ReplyKind.TELEMETRY
+        stack = self._stack
+        told = self._kind_in_dialect(body) if stack.dialects else ReplyKind.TELEMETRY
         if isinstance(told, LinkFault):
             return told
-        opened = self._stack.open(self._headers[told], body)
+        opened = stack.open(self._format.headers[told], body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened
@@ -506,8 +529,8 @@ class HostReceiver:
             sequence=values.get("sequence", 0),
             flags=values.get("flags", 0),
             final=bool(values.get("final", 1)),
-            uptime_ns=self._nanoseconds("ticks", values),
-            time_ns=self._nanoseconds("time", values),
+            uptime_ns=values["ticks"] * stack.reply_header.count_ns("ticks") if "ticks" in values else 0,
+            time_ns=values["time"] * stack.reply_header.count_ns("time") if "time" in values else 0,
         )
 
     def _check_echo(self, body: bytes) -> Reply | LinkFault | None:
@@ -534,55 +557,43 @@ class HostReceiver:
 
     def _kind_in_dialect(self, body: bytes) -> ReplyKind | LinkFault:
         """Return the kind of a reply by its start byte, row and size; an ACK may be a NACK by its code."""
-        headers, pending = self._headers, self._pending
-        if self._is_burst(body):
+        form, pending = self._format, self._pending
+        if len(body) == form.sizes[ReplyKind.BURST] + cubespace.BURST_SIZE and self._is_burst(body):
             return ReplyKind.BURST
-        kinds = [
-            kind for kind, header in headers.items() if kind is not ReplyKind.BURST and _begins(header, body)
-        ]
-        if not kinds:
+        kinds = form.starts.get(body[0]) or form.starts.get(None)
+        if kinds is None:
             text = f"message {body[1]} with the start byte of a request"
             return LinkFault(FaultKind.UART_PROTOCOL, text)
-        roles = [field.role for field in headers[kinds[0]].fields]  # the others have the ID in the same place
-        if "id" in roles:
-            row_id = body[roles.index("id")]
+        if kinds[0] in form.ids:
+            row_id = body[form.ids[kinds[0]]]
         elif pending is not None:
             row_id = pending.id
         else:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
         if ReplyKind.ACK not in kinds:
             (kind,) = kinds  # the start byte tells it
-        elif self._stack.kind_of(row_id) is RequestKind.TELECOMMAND:
+        elif row_id < FIRST_TELEMETRY_ID:
             kind = ReplyKind.ACK
         else:
             known = pending is not None and pending.id == row_id
-            coded = ReplyKind.NACK in kinds and len(body) == headers[ReplyKind.NACK].size("")
+            coded = ReplyKind.NACK in kinds and len(body) == form.sizes[ReplyKind.NACK]
             refused = coded and known and self._reply_size != 1
             kind = ReplyKind.NACK if refused else ReplyKind.TELEMETRY
-        codes = len(body) - headers[kind].size("") + 1
-        if "status" in headers[kind].roles and codes != 1:
+        codes = len(body) - form.sizes[kind] + 1
+        if codes != 1 and "status" in form.headers[kind].roles:
             name = "ACK of telecommand" if kind is ReplyKind.ACK else "NACK of"
             return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
         return kind
 
     def _is_burst(self, body: bytes) -> bool:
-        header = self._headers[ReplyKind.BURST]
-        if len(body) != header.size("") + cubespace.BURST_SIZE or not _begins(header, body):
+        """Return whether a body with the size of a burst packet is one."""
+        form, pending = self._format, self._pending
+        start = form.headers[ReplyKind.BURST].fields[0].const
+        if start not in (None, body[0]) or body[form.ids[ReplyKind.BURST]] != BURST_ID:
             return False
-        if body[header.size("") - 1] != BURST_ID:
-            return False
-        if "id" in self._headers[ReplyKind.TELEMETRY].roles or self._pending is None:
+        if ReplyKind.TELEMETRY in form.ids or pending is None:
             return True
-        return self._pending.kind is RequestKind.TELECOMMAND or self._reply_size != len(body)
-
-    def _nanoseconds(self, role: str, values: Mapping[str, int]) -> int:
-        return values[role] * self._stack.reply_header.count_ns(role) if role in values else 0
-
-
-def _begins(header: Header, body: bytes) -> bool:
-    """Return whether a body has the constant, if any, with which a header begins."""
-    constant = header.fields[0].const if header.fields else None
-    return constant in (None, body[0])
+        return pending.kind is RequestKind.TELECOMMAND or self._reply_size != len(body)
 
 
 def _no_such_reply(kind: ReplyKind, dialect: Dialect | None) -> str:
