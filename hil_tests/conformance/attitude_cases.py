@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, Protocol, Self
 
-from starhil.hil_tests.attitude import Quaternion, attitude_error
+from starhil.hil_tests.attitude import Quaternion, attitude_error, unit
 from starhil.hil_tests.conformance.case import CaseSkipped, check
 from starhil.hil_tests.judge.messages import Value
-from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.rows import Field, Row
 
 ATTITUDE_S: Final = 20.0
 """Maximum time until an attitude is valid."""
@@ -35,6 +35,9 @@ class RowAccess(Protocol):
 
     def telemetry_rows(self) -> Iterable[Row]:
         """Return the telemetry that the link carries."""
+
+    def carries(self, row: Row, item: Field) -> bool:
+        """Return whether the link carries a field of a row."""
 
     def values(self, row: Row) -> dict[str, Value]:
         """Read the values of a row; one outside its limits fails the case."""
@@ -85,8 +88,8 @@ class AttitudeRow:
         """Fail the case if an attitude is valid in standby, not of length 1, or not the truth."""
         if not self.is_valid(seen):
             return
-        if reported_mode(access) == STANDBY:
-            still = self.is_valid(access.values(self.row)) and reported_mode(access) == STANDBY
+        if in_standby(access):
+            still = self.is_valid(access.values(self.row)) and in_standby(access)
             check(not still, "no valid attitude in standby (R11, docs/rules.md)", "a valid one")
         parts = [float(seen[self.names[name]]) for name in QUATERNION]
         step = max(abs(self.row.named[self.names[name]].scale) for name in QUATERNION)
@@ -95,24 +98,31 @@ class AttitudeRow:
         check(abs(length - 1.0) < tolerance, "a quaternion of length 1", f"{length:.7f}")
         if access.truth is not None:
             truth = access.truth()
-            error_deg = (
-                attitude_error(Quaternion(*(part / length for part in parts)), truth).total_arcsec / 3600.0
-            )
-            wanted = f"the true attitude {tuple(round(part, 4) for part in truth)}, to {TRUTH_DEG:g} deg"
-            check(
-                error_deg <= TRUTH_DEG,
-                wanted,
-                f"{tuple(round(part, 4) for part in parts)}, {error_deg:.2f} deg off",
-            )
+            error_deg = attitude_error(unit(parts), truth).total_arcsec / 3600.0
+            wanted, seen_parts = (tuple(round(part, 4) for part in each) for each in (truth, parts))
+            expected = f"the true attitude {wanted}, to {TRUTH_DEG:g} deg"
+            check(error_deg <= TRUTH_DEG, expected, f"{seen_parts}, {error_deg:.2f} deg off")
+
+
+def _mode_fields(access: RowAccess) -> Iterator[tuple[Row, Field]]:
+    for row in access.telemetry_rows():
+        yield from (
+            (row, item) for item in row.named.values() if item.value == "mode" and access.carries(row, item)
+        )
 
 
 def reported_mode(access: RowAccess) -> Value | None:
-    """Return the mode that a row reports; None if there is none."""
-    for row in access.telemetry_rows():
-        for name, item in row.named.items():
-            if item.value == "mode":
-                return access.values(row)[name]
-    return None
+    """Return the mode that a row reports, the first of several with one number; None if no row does."""
+    row, item = next(_mode_fields(access), (None, None))
+    return None if row is None or item is None else access.values(row)[item.name]
+
+
+def in_standby(access: RowAccess) -> bool:
+    """Return whether a row reports standby, by a number that stands for no other mode."""
+    for row, item in _mode_fields(access):
+        if STANDBY not in item.shared:
+            return access.values(row)[item.name] == STANDBY
+    return False
 
 
 def mode_command(access: RowAccess, mode: Value | None) -> Callable[[], None] | None:

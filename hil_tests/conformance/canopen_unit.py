@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from starhil.hil_tests.conformance.attitude_cases import (
     ATTITUDE_S,
+    QUATERNION,
     AttitudeRow,
     identifying_stars,
     reported_mode,
@@ -93,6 +94,11 @@ def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Va
     probe.set(entry.index, entry.subindex, written(entry, command, command.encode(values)))
 
 
+def _carries(found: list[Entry], row: Row, item: Field) -> bool:
+    slots = [entry.slot for entry in found if entry.row is row and entry.slot is not None]
+    return item.offset in {slot.offset for slot in slots}
+
+
 class EntryAccess:
     """The rows that entries of the object dictionary hold."""
 
@@ -107,6 +113,10 @@ class EntryAccess:
     def telemetry_rows(self) -> Iterable[Row]:
         """Return the rows that entries read."""
         return {entry.row.name: entry.row for entry in self._found if entry.row is not None}.values()
+
+    def carries(self, row: Row, item: Field) -> bool:
+        """Return whether an entry reads a field of a row."""
+        return _carries(self._found, row, item)
 
     def values(self, row: Row) -> dict[str, Value]:
         """Read the values of a row; one outside its limits fails the case."""
@@ -140,6 +150,10 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         if not any(entry.row is row for entry in found):
             continue
         attitude = AttitudeRow.of(row)
+        if attitude is not None and not all(
+            _carries(found, row, row.named[attitude.names[name]]) for name in ("attitude.valid", *QUATERNION)
+        ):
+            attitude = None
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
         yield _case("rows", row.name, title, _values(row, attitude, found), row, safe=True)
         if attitude is not None:

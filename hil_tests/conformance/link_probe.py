@@ -16,7 +16,7 @@ from starhil.hil_tests.conformance.case import CaseFailed, check, check_equal
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request, Value
-from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.rows import Field, Row
 
 INVALID_ID: Final = "invalid_id"
 INVALID_LENGTH: Final = "invalid_length"
@@ -198,6 +198,10 @@ class LinkProbe(ABC):
     def telecommands(self) -> Iterable[Row]:
         """Return the telecommands of the unit."""
         return self.unit.telecommands.values()
+
+    def carries(self, row: Row, item: Field) -> bool:  # noqa: ARG002 -- every row whole
+        """Return whether the link carries a field of a row."""
+        return True
 
     def telemetry_rows(self) -> Iterable[Row]:
         """Return the telemetry of the unit."""

@@ -173,7 +173,7 @@ def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
                 item.name, item.kind, slot.type, slot.order, offset, size, shift, item.width, item.scale, item.bias,
                 bound.minimum if item.minimum is None else item.minimum,
                 bound.maximum if item.maximum is None else item.maximum, None if item.enum is None else item.enum.values, default, item.const,
-                item.value, item.argument, item.telecommand, item.unit,
+                item.value, item.argument, item.telecommand, item.unit, frozenset(item.aliases.values()),
             )  # fmt: skip
             shift += item.width
         offset += size

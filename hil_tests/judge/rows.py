@@ -48,6 +48,8 @@ class Field:
         Physical value; limits None if only the type limits it.
     value, argument, telecommand
         Quantity that it reports, argument of the action that it sets, telecommand whose value it reports.
+    shared
+        Names of the enumeration whose number stands for further values too.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Field:
     argument: str | None = None
     telecommand: str | None = None
     unit: str = ""
+    shared: frozenset[str] = frozenset()
 
     @property
     def type_limits(self) -> tuple[int, int]:

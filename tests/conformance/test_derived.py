@@ -144,8 +144,13 @@ def test_a_valid_quaternion_that_is_not_of_length_1_fails_a_safe_case(tmp_path):
 class Rows:
     """Rows of a unit with given values, and the commands sent."""
 
-    def __init__(self, folder: Path, mode: str) -> None:
-        self.unit = read_unit(commanded(folder))
+    def __init__(self, folder: Path, mode: str, numbers: str = "") -> None:
+        folder = commanded(folder)
+        if numbers:
+            file = folder / "unit.toml"
+            before, _, after = file.read_text().partition('map = { 0 = "boot"')
+            file.write_text(f"{before}map = {numbers}{after.partition('}')[2]}")
+        self.unit = read_unit(folder)
         self.mode = mode
         self.sent: list[str] = []
         self.truth = None
@@ -155,6 +160,9 @@ class Rows:
 
     def telemetry_rows(self):
         return self.unit.telemetry.values()
+
+    def carries(self, _row, _item):
+        return True
 
     def values(self, _row):
         return {"mode": self.mode, "x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0, "valid": True}
@@ -169,6 +177,15 @@ def test_an_attitude_that_is_valid_in_standby_fails(tmp_path):
     with pytest.raises(CaseFailed, match="in standby"):
         attitude.check(rows, rows.values(attitude.row))
     rows.mode = "tracking"
+    attitude.check(rows, rows.values(attitude.row))
+
+
+def test_a_number_that_stands_for_several_modes_is_not_standby(tmp_path):
+    """Read back, it has the name of the first."""
+    rows = Rows(
+        tmp_path, "standby", '{ 0 = "boot", 3 = ["standby", "lost_in_space", "tracking"], 4 = "error" }'
+    )
+    attitude = AttitudeRow.of(rows.unit.telemetry["attitude"])
     attitude.check(rows, rows.values(attitude.row))
 
 
