@@ -87,12 +87,13 @@ def compute(context: Context, part: Part) -> Results:
     noise = identification_noise(v["factor"], false_stars=v["false_stars"])
     if v["scale"] == PRINTED:
         noise = NoiseModel.of("both", v["factor"], false_stars=v["false_stars"])
-    settings = RsiSettings(tau=v["tau"], memory=v["memory"])
     if v["tau"] == LSI_ONLY:
         settings = RsiSettings(tau=1.0, gamma_lsi_deg=1e-9)
     elif v["side"] == BY_TABLE:
         side = RECURSION[v["overlap"], v["factor"], v["tau"]]["side_mean"]
         settings = RsiSettings(tau=v["tau"], gamma_min_deg=side, gamma_scale=0.0)
+    else:
+        settings = RsiSettings(tau=v["tau"], memory=v["memory"])
     track = track_filter(noise, 0.002, 0.005, max_rotation_deg=4.0, max_shift_deg=4.0)
     recursion = RecursiveIdentification(lsi, track, settings)
     count = int(context.parameters["frames"])
