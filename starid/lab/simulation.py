@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -69,21 +69,25 @@ class NoiseModel:
         return (self.magnitude_range[1] - self.magnitude_range[0]) / INTENSITY_UNITS
 
     @classmethod
-    def factor(
-        cls,
-        noise: float,
-        false_stars: int = 0,
-        *,
-        position: bool = True,
-        brightness: bool = True,
-        magnitude_range: tuple[float, float] = (11.5, FAINTEST_MAGNITUDE),
-    ) -> NoiseModel:
-        """Make a noise model for a noise factor μ_j (pixels, intensity units) and f_i false stars."""
+    def of(cls, kind: str, level: float = 0.0, **others: Any) -> NoiseModel:
+        """Make a noise model of one kind.
+
+        Parameters
+        ----------
+        kind
+            "position" or "brightness" with a standard deviation in pixels or intensity units, or "both"; "false" or
+            "missing" with a number of stars; "none".
+        level
+            Standard deviation or number.
+        **others
+            Other fields.
+        """
+        if kind in ("false", "missing"):
+            others[f"{kind}_stars"] = int(level)
         return cls(
-            position_sigma_px=noise if position else 0.0,
-            brightness_sigma=noise if brightness else 0.0,
-            false_stars=false_stars,
-            magnitude_range=magnitude_range,
+            position_sigma_px=level if kind in ("position", "both") else 0.0,
+            brightness_sigma=level if kind in ("brightness", "both") else 0.0,
+            **others,
         )
 
 

@@ -21,7 +21,8 @@ from starid.single_camera import CheckedDetections, SingleCameraIdentifier
 from starid.solution import Reason, Solution
 from starid.thesis.cme import matched_motion
 from starid.thesis.false_stars import ObservedFrame
-from starid.thesis.lsi_identifier import WINDOW_PX, FieldStars, LsiIdentifier, LsiOptions
+from starid.thesis.feature_search import FieldStars
+from starid.thesis.lsi_identifier import WINDOW_PX, LsiIdentifier, LsiOptions
 from starid.thesis.rsi import RsiSettings, region_side
 from starid.thesis.scalable_filter import MAX_OBJECTS, TrackFilter, TrackFilterSettings
 
@@ -204,30 +205,29 @@ class RsiIdentifier(SingleCameraIdentifier):
         self, measured: CheckedDetections, true_stars: Mask, predicted: Attitude, side_deg: float
     ) -> Solution:
         """Try the cells of the region, most likely first; return the first verified answer."""
-        lsi = self.lsi
-        zero_point = lsi.zero_point
+        search, zero_point = self.lsi.search, self.lsi.zero_point
         if zero_point is None:
             return Solution.invalid(Reason.NO_MATCH, mode="tracking")
-        field = lsi.field_stars(measured.xy, measured.flux, zero_point)
+        field = search.field_stars(measured.xy, measured.flux, zero_point)
         trusted = true_stars[field.row]
         chosen = FieldStars(field.place[trusted], field.magnitude[trusted], field.row[trusted])
-        features = lsi.features(chosen)
+        features = search.features(chosen)
         if features is None:
             return Solution.invalid(Reason.TOO_FEW_STARS, mode="tracking")
-        observation = lsi.database.normalise(features)
-        cell, distance, _ = lsi.lost_in_space.nearest_in_region(
+        observation = search.database.normalise(features)
+        cell, distance, _ = search.lost_in_space.nearest_in_region(
             observation, predicted.ra_deg, predicted.dec_deg, side_deg
         )
         centres = _spots(predicted, side_deg)
         if cell >= 0:
-            answer = lsi.lost_in_space.estimate(observation, cell, distance).mse
+            answer = search.lost_in_space.estimate(observation, cell, distance).mse
             centres = np.concatenate([[[answer.right_ascension_deg, answer.declination_deg]], centres])
-        for attitude, _ in lsi.attitudes(chosen, centres):
+        for attitude, _ in search.attitudes(chosen, centres):
             if attitude is None:
                 continue
-            solution = lsi.verify(measured, attitude, WINDOW_PX)
+            solution = self.lsi.verify(measured, attitude, WINDOW_PX)
             if solution.valid:
-                lsi.learn(solution, measured.flux)
+                self.lsi.learn(solution, measured.flux)
                 return dataclasses.replace(solution, mode="tracking")
         return Solution.invalid(Reason.NO_MATCH, mode="tracking")
 

@@ -49,9 +49,4 @@ def filter_noise(
 
 def identification_noise(factor: float, kind: Kind = "both", false_stars: int = 0) -> NoiseModel:
     """Noise of the experiments on LSI and RSI."""
-    return NoiseModel.factor(
-        IDENTIFICATION_ROOT * math.sqrt(factor),
-        false_stars,
-        position=kind != "brightness",
-        brightness=kind != "position",
-    )
+    return NoiseModel.of(kind, IDENTIFICATION_ROOT * math.sqrt(factor), false_stars=false_stars)

@@ -16,34 +16,16 @@ from starid.lab.experiments.experiment import Context, Evaluation, Parameters, P
 from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.lsi_noise import IDENTIFIED_DEG
 from starid.lab.experiments.lsi_trials import centres, error_of, share, stars_of
+from starid.lab.experiments.tables import published, read_lines
 from starid.lab.simulation import NoiseModel
 from starid.thesis.metrics import boresight_error
 
-SHORT: Final = {
-    "pyramid": "PA",
-    "grid": "GA",
-    "modified-grid": "MGA",
-    "improved-grid": "IG",
-    "match-group": "MG",
-    "geometric-voting": "GV",
-    "iterative": "IA",
-    "subgraph": "SGS",
-    "log-polar": "LPT",
-    "vector-pattern": "VP",
-    "svd": "SVD",
-    "oriented-svd": "OSV",
-    "pole-star": "PS",
-    "radial-cyclic": "RC",
-    "radial-dynamic-cyclic": "RDC",
-    "multi-poles": "MP",
-    "ant-colony": "AAC",
-    "correlation": "CA",
-    "lsi": "LSI (thesis)",
-    "geometric": "geometric (ours)",
-}
-IN_TABLE_6_2: Final = (
-    "pyramid", "modified-grid", "log-polar", "vector-pattern", "grid", "svd", "oriented-svd", "lsi",
-)  # fmt: skip
+_COMPETITORS: Final = {line["name"]: line for line in read_lines("competitors.csv")}
+
+SHORT: Final = {name: line["short"] for name, line in _COMPETITORS.items()}
+"""Name of an algorithm → its abbreviation in the thesis."""
+
+IN_TABLE_6_2: Final = tuple(name for name in SHORT if published("classics", f"table 6.2, {name}"))
 
 _LABELS: Final = {
     "position": "position noise, σ = {} px",
@@ -57,15 +39,6 @@ _OWN_SKY: Final = {"lsi": "flat", "geometric": "sphere"}
 _SKY_LABELS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars on the sphere"}
 _SENSOR: Final = (12.0, 1024, 6.0)
 """Sensor that most of the papers simulate: field in degrees, pixels, faintest star."""
-_FLOORS: Final = {
-    **dict.fromkeys(
-        ("modified-grid", "improved-grid", "match-group", "subgraph", "oriented-svd", "geometric"), 98.0
-    ),
-    **dict.fromkeys(
-        ("pyramid", "grid", "iterative", "geometric-voting", "log-polar", "vector-pattern", "lsi"), 95.0
-    ),
-}
-"""Share of clean frames that a faithful implementation of an algorithm must identify, %."""
 
 
 def parts(parameters: Parameters) -> list[Part]:
@@ -80,12 +53,7 @@ def parts(parameters: Parameters) -> list[Part]:
 
 def _noise(case: str) -> NoiseModel:
     kind, _, level = case.partition("-")
-    return NoiseModel(
-        position_sigma_px=float(level) if kind == "position" else 0.0,
-        brightness_sigma=float(level) if kind == "brightness" else 0.0,
-        false_stars=int(level) if kind == "false" else 0,
-        missing_stars=int(level) if kind == "missing" else 0,
-    )
+    return NoiseModel.of(kind, float(level or 0))
 
 
 def _identify_frames(
@@ -203,12 +171,12 @@ def _compare(e: Evaluation) -> None:
                 continue
             name, result = part.values["algorithm"], e.results[part.key]
             wrong = _wrong(result, case)
-            e.require(
+            e.compare(
                 f"{SHORT[name]}, {_SKY_LABELS[sky]}, {_case_label(case)}: identified",
-                published=next(iter(e.published(f"{name}, {case}")), None),
-                ours=_rate(result, case),
+                text=next(iter(e.published(f"{name}, {case}")), None),
                 unit="%",
-                at_least=_FLOORS.get(name) if case == "none" else None,
+                check=f"≥ {floor}" if (floor := _COMPETITORS[name]["least_clean"]) and case == "none" else "",
+                ours=_rate(result, case),
                 remark=f"{wrong:.1f} % wrong" if wrong > 0.0 else "",
             )
     # the first sky is the flat one if both are selected
@@ -219,10 +187,9 @@ def _compare(e: Evaluation) -> None:
         size, milliseconds = e.published(f"table 6.2, {name}")
         here, papers, build = (float(figure) for figure in found["kb"])
         at_sensor = "" if math.isnan(papers) else f"12° sensor: {papers:.0f} kB, built in {build:.2f} s"
-        database = {"ours": here, "unit": "kB", "digits": 0, "remark": at_sensor}
-        e.require(f"{SHORT[name]}: database", published=size, **database)
+        e.compare(f"{SHORT[name]}: database", text=size, unit="kB", digits=0, ours=here, remark=at_sensor)
         median = float(np.median(found["ms_none"]))
-        e.require(f"{SHORT[name]}: median time, no noise", published=milliseconds, ours=median, unit="ms")
+        e.compare(f"{SHORT[name]}: median time, no noise", text=milliseconds, unit="ms", ours=median)
 
 
 def _figures(e: Evaluation) -> None:

@@ -13,7 +13,8 @@ a word and its arguments, in a column of `published.csv` or formed by an experim
 ``X ORIGIN``       at most X, and why
 ``same``           equal, each of several numbers
 ``> X``, ``< X``   larger or smaller than X; the thesis has a phrase
-``more, less``     ours is better, as it is larger or smaller
+``more``, ``less`` ours is better, as it is larger or smaller
+``≥ X``, ``≤ X``   a requirement of this project on ours
 =================  ===============================================================================
 
 An agreement says little if one constant answer agrees with a whole column of a table: `null_model` finds the best one
@@ -23,9 +24,12 @@ and marks the checks that it meets as weak. (Constants fitted to published numbe
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Literal, TypedDict
+
+import numpy as np
 
 from starid.errors import StaridError
 
@@ -40,30 +44,20 @@ class ReproduceError(StaridError):
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """A row of the report.
+    """A row of the report: a quantity with the published value and ours, "—" if there is none, and a check, if any.
 
     Attributes
     ----------
-    quantity
-        What was measured, and under what conditions.
-    published, ours, author, printed
-        The published value, this project's, and those from the author's version of the algorithm and from the
-        printed one, as printed in the report; "—" if there is none.
-    target
-        What is checked, and the tolerance and its origin; "" without a check.
-    passed
-        Outcome of the check; None if there is none.
-    remark
-        Why the values differ, or how to read them.
-    kind
-        Class of the check.
+    author, printed
+        The values from the author's version of the algorithm, and from the printed one.
+    target, passed, kind
+        What is checked, with the tolerance and its origin; the outcome, None without a check; class of the check.
     met, of
         How many of the published numbers in the row agree, and how many there are.
     interval
         Lowest and highest value that agrees, for one published number.
     weak, weak_met
-        How many of the published numbers the best constant answer of the null model meets as well, and how
-        many of these agree.
+        How many of the numbers the best constant answer of the null model meets as well, and how many of these agree.
     """
 
     quantity: str
@@ -108,18 +102,9 @@ class Outcome:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """What the thesis prints of a quantity.
+    """What the thesis prints of a quantity: a number, several separated by spaces, a phrase, or "" for nothing.
 
-    Attributes
-    ----------
-    text
-        The number, several numbers separated by spaces, or a phrase; "" for nothing.
-    unit, digits
-        Unit, and decimals with which the report shows it.
-    check
-        How it is checked; "" if it is only shown.
-    remark
-        Remark in the report.
+    `digits` are the decimals with which the report shows it; without a check it is only shown.
     """
 
     text: str
@@ -150,39 +135,40 @@ def space_before(unit: str) -> str:
     return "" if unit in ("", "°", "″") else " "
 
 
-def value_text(value: float | str | None, unit: str, digits: int) -> str:
-    """Format a value for the report; "—" for None."""
-    if value is None:
-        return "—"
-    return value if isinstance(value, str) else f"{value:.{digits}f}{space_before(unit)}{unit}"
+def value_text(value: Any, unit: str, digits: int) -> str:
+    """Format a number, several numbers or a text for the report; "—" for None."""
+    if value is None or isinstance(value, str):
+        return value or "—"
+    if np.ndim(value) > 0:
+        return ", ".join(f"{each:.{digits}f}" for each in value) + unit
+    return f"{value:.{digits}f}{space_before(unit)}{unit}"
 
+
+_ROUNDING_ERROR: Final = 1e-12
+"""A published deviation below this is a rounding error."""
 
 Tolerance = tuple[float, str]
 """Largest difference from the published number, and its origin."""
 
 
-def rounding(digits: int, unit: str = "") -> Tolerance:
-    """Half a unit of the last printed digit."""
+def _rounding(digits: int, unit: str) -> Tolerance:
     return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
 
 
-def sampling(percent: float, trials: float, sigmas: float = 3.0) -> Tolerance:
-    """Tolerance for two shares (percent) counted in equally many trials, as a multiple of the standard error.
-
-    The standard error is computed for (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too.
-    """
+def _share(percent: float, trials: float) -> Tolerance:
+    """The standard error is that of (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too."""
     share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
-    error = 100.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
-    return sigmas * error, f"{sigmas:g} standard errors of two shares of {trials:g}, {sigmas * error:.2g} %"
+    error = 300.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
+    return error, f"3 standard errors of two shares of {trials:g}, {error:.2g} %"
 
 
 def _mean(_: float, sigma: float, trials: float) -> Tolerance:
-    error = 3.0 * sigma * math.sqrt(2.0 / trials)
+    error = 3.0 * max(sigma, _ROUNDING_ERROR) * math.sqrt(2.0 / trials)
     return error, f"3 standard errors of two means of {trials:g}, {error:.2g}"
 
 
 def _deviation(_: float, sigma: float, trials: float) -> Tolerance:
-    error = 3.0 * sigma / math.sqrt(trials - 1.0)
+    error = 3.0 * max(sigma, _ROUNDING_ERROR) / math.sqrt(trials - 1.0)
     return error, f"3 standard errors of two deviations of {trials:g}, {error:.2g}"
 
 
@@ -193,105 +179,126 @@ def _coefficient(published: float, trials: float) -> Tolerance:
 
 
 _SAMPLED: Final[dict[str, Callable[..., Tolerance]]] = {
-    "sampling": sampling,
+    "sampling": _share,
     "mean": _mean,
     "deviation": _deviation,
     "coefficient": _coefficient,
+}
+_BOUNDS: Final[dict[str, tuple[Kind, Callable[[Any, Any], bool]]]] = {
+    ">": ("agrees", operator.gt),
+    "<": ("agrees", operator.lt),
+    "≥": ("ours", operator.ge),
+    "≤": ("ours", operator.le),
 }
 
 
 def _tolerance(known: Published, trials: int) -> Tolerance:
     word, _, rest = known.check.partition(" ")
+    if word == "same":
+        return 0.0, "the same"
     if word in ("digit", "rounding"):
-        return rounding(known.digits if word == "digit" else int(rest), known.unit)
+        return _rounding(known.digits if word == "digit" else int(rest), known.unit)
     if word in _SAMPLED:
-        numbers = [float(each) for each in rest.split()] or [float(trials)]
-        return _SAMPLED[word](known.numbers[0], *numbers)
+        return _SAMPLED[word](known.numbers[0], *(map(float, rest.split()) if rest else [trials]))
     return float(word), rest
 
 
-def row(
+def compared(
     quantity: str,
+    known: Published,
     *,
-    ours: float | str,
-    published: float | str | None = None,
-    unit: str = "",
-    digits: int = 2,
-    at_least: float | None = None,
-    at_most: float | None = None,
-    passed: bool | None = None,
-    target: str = "",
+    author: Any = None,
+    printed: Any = None,
+    ours: Any = None,
+    trials: int = 0,
     remark: str = "",
 ) -> Row:
-    """Make a row for the report; with a bound it becomes a check of class "ours".
+    """Compare what was measured with what the thesis prints.
 
-    `starid.lab.experiments.comparison` makes the checks against published numbers.
+    `author`, `printed` and `ours` are a number, as many as are published, or a text; the first that is given is
+    checked. `trials` is the number of trials for the tolerance ``sampling``; the remark is added to that of the table.
 
-    Parameters
-    ----------
-    quantity
-        What was measured.
-    ours, published
-        Values: numbers (printed with `digits` decimals and `unit`) or text; published may be None.
-    at_least, at_most
-        Bounds on `ours`, set by this project; `ours` must then be a number.
-    passed, target
-        Result of another kind of check, and its description.
-    remark
-        Why the two values differ.
+    Raises
+    ------
+    ReproduceError
+        There is no number to check.
     """
-    space = space_before(unit)
-    if isinstance(ours, str) and not (at_least is None and at_most is None):
-        raise ReproduceError(f"reproduce: {quantity}: text cannot have bounds; give a number")
-    bounds = []
-    if at_least is not None and not isinstance(ours, str):
-        bounds.append(f"≥ {at_least:g}{space}{unit}")
-        passed = bool(ours >= at_least) and passed is not False
-    if at_most is not None and not isinstance(ours, str):
-        bounds.append(f"≤ {at_most:g}{space}{unit}")
-        passed = bool(ours <= at_most) and passed is not False
-    verdict = None if passed is None else bool(passed)
-    return Row(
-        quantity,
-        value_text(published, unit, digits),
-        value_text(ours, unit, digits),
-        target or ", ".join(bounds),
-        verdict,
-        remark,
-        kind="" if verdict is None else "ours",
-        met=int(verdict is True),
-        of=int(verdict is not None),
+    numbers, unit = known.numbers, known.unit
+    published = known.text if not numbers else numbers[0] if len(numbers) == 1 else numbers
+    one, two, three, four = (
+        value_text(each, unit, known.digits) for each in (published, ours, author, printed)
     )
-
-
-def shown(
-    quantity: str,
-    *,
-    published: float | str | None = None,
-    author: float | str | None = None,
-    printed: float | str | None = None,
-    ours: float | str | None = None,
-    unit: str = "",
-    digits: int = 2,
-    remark: str = "",
-) -> Row:
-    """Make a row without a check."""
-    values = (value_text(value, unit, digits) for value in (published, ours, author, printed))
-    one, two, three, four = values
-    return Row(quantity, one, two, author=three, printed=four, remark=remark)
+    informing = Row(quantity, one, two, author=three, printed=four, remark=f"{known.remark} {remark}".strip())
+    if not known.check:
+        return informing
+    checked = next((value for value in (author, printed, ours) if value is not None), None)
+    if checked is None or isinstance(checked, str):
+        raise ReproduceError(
+            f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
+        )
+    word, _, rest = known.check.partition(" ")
+    if word in _BOUNDS:
+        kind, holds = _BOUNDS[word]
+        return _checked(
+            informing,
+            kind,
+            f"{word} {float(rest):g}{space_before(unit)}{unit}",
+            [holds(checked, float(rest))],
+        )
+    if word in ("more", "less"):
+        return _improved(informing, known, checked, numbers[0], larger=word == "more")
+    largest, origin = _tolerance(known, trials)
+    matches = [bool(abs(a - b) <= largest) for a, b in zip(np.atleast_1d(checked), numbers, strict=True)]
+    target = origin if word == "same" else f"± {origin}" if len(numbers) == 1 else f"each ± {origin}"
+    interval = (numbers[0] - largest, numbers[0] + largest) if len(numbers) == 1 else ()
+    return replace(_checked(informing, "agrees", target, matches), interval=interval)
 
 
 def _checked(informing: Row, kind: Kind, target: str, matches: Sequence[bool]) -> Row:
-    """Turn a row into a check that passes if all its published numbers match."""
+    """Turn a row into a check that passes if all its numbers match."""
     met, of = sum(map(bool, matches)), len(matches)
-    return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of)
+    remark = f"{met} of {of} agree. {informing.remark}".strip() if of > 1 else informing.remark
+    return replace(informing, kind=kind, target=target, passed=met == of, met=met, of=of, remark=remark)
+
+
+def _improved(informing: Row, known: Published, ours: float, published: float, *, larger: bool) -> Row:
+    """Check that ours is better than a published number; the remark states by how much."""
+    gain = ours - published if larger else published - ours
+    better = f"by {value_text(gain, known.unit, known.digits)}"
+    if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:
+        better = f"by a factor of {published / ours:.3g}"
+    made = _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [gain >= 0.0])
+    return replace(made, remark=f"Better {better}. {made.remark}".strip()) if made.passed else made
+
+
+def claimed(
+    quantity: str,
+    *,
+    matches: Sequence[bool],
+    target: str,
+    published: str = "—",
+    author: str = "—",
+    printed: str = "—",
+    ours: str = "—",
+    remark: str = "",
+    null: Sequence[bool] = (),
+    kind: Kind = "agrees",
+) -> Row:
+    """Make a row for what no number states; `target` names the rule by which each of several claims holds or not.
+
+    `null` says which of them the null model meets.
+    """
+    made = _checked(
+        Row(quantity, published, ours, author=author, printed=printed, remark=remark), kind, target, matches
+    )
+    weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
+    return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
 
 
 def best_constant(intervals: Iterable[Sequence[float]]) -> float:
     """Value in most of the intervals: the best answer that ignores all that varies within a table."""
     known = list(intervals)
-    lows = [low for low, _ in known]
-    return max(lows, key=lambda value: sum(low <= value <= high for low, high in known))
+    return max((low for low, _ in known), key=lambda value: sum(low <= value <= high for low, high in known))
 
 
 def null_model(rows: Sequence[Row]) -> list[Row]:
@@ -306,156 +313,3 @@ def null_model(rows: Sequence[Row]) -> list[Row]:
         else row
         for row in rows
     ]
-
-
-def agreement(
-    quantity: str,
-    *,
-    published: float,
-    tolerance: Tolerance,
-    author: float | None = None,
-    printed: float | None = None,
-    ours: float | str | None = None,
-    unit: str = "",
-    digits: int = 2,
-    remark: str = "",
-) -> Row:
-    """Make a check for agreement with a published number.
-
-    The value checked is the author's version, or else the printed one, or else ours.
-
-    Raises
-    ------
-    ReproduceError
-        There is no number to check.
-    """
-    checked = author if author is not None else printed if printed is not None else ours
-    if checked is None or isinstance(checked, str):
-        raise ReproduceError(
-            f"reproduce: {quantity}: there is no number to compare; give author, printed or ours"
-        )
-    largest, origin = tolerance
-    readings = {"published": published, "author": author, "printed": printed, "ours": ours}
-    informing = shown(quantity, **readings, unit=unit, digits=digits, remark=remark)
-    made = _checked(informing, "agrees", f"± {origin}", [abs(checked - published) <= largest])
-    return replace(made, interval=(published - largest, published + largest))
-
-
-def same(
-    quantity: str,
-    *,
-    published: str,
-    author: str | None = None,
-    printed: str | None = None,
-    ours: str | None = None,
-    matches: Sequence[bool],
-    target: str,
-    remark: str = "",
-    null: Sequence[bool] = (),
-) -> Row:
-    """Make one row for several published numbers; `target` names the rule by which each agrees or not.
-
-    `null` says which of the numbers the null model meets.
-    """
-    met, of = sum(map(bool, matches)), len(matches)
-    remark = f"{met} of {of} agree. {remark}".strip() if of > 1 else remark
-    informing = shown(quantity, published=published, author=author, printed=printed, ours=ours, remark=remark)
-    made = _checked(informing, "agrees", target, matches)
-    weak_met = sum(bool(a and b) for a, b in zip(matches, null, strict=True)) if null else 0
-    return replace(made, weak=sum(map(bool, null)), weak_met=weak_met)
-
-
-def improvement(
-    quantity: str,
-    *,
-    published: float,
-    ours: float,
-    larger: bool,
-    unit: str = "",
-    digits: int = 2,
-    remark: str = "",
-) -> Row:
-    """Make a check that ours is better than a published number; the remark states by how much."""
-    gain = ours - published if larger else published - ours
-    better = f"by {value_text(gain, unit, digits)}"
-    if ours > 0.0 and published > 0.0 and not larger and published >= 2.0 * ours:
-        better = f"by a factor of {published / ours:.3g}"
-    passed = bool(ours >= published if larger else ours <= published)
-    remark = f"Better {better}. {remark}".strip() if passed else remark
-    informing = shown(quantity, published=published, ours=ours, unit=unit, digits=digits, remark=remark)
-    return _checked(informing, "better", f"{'≥' if larger else '≤'} {informing.published}", [passed])
-
-
-def compared(
-    quantity: str,
-    known: Published,
-    *,
-    author: Any = None,
-    printed: Any = None,
-    ours: Any = None,
-    trials: int = 0,
-    remark: str = "",
-) -> Row:
-    """Check what was measured against what the thesis prints, or show both.
-
-    Parameters
-    ----------
-    quantity, known
-        What was measured, and what the thesis prints.
-    author, printed, ours
-        The number, or as many as are published; the first that is given is checked.
-    trials
-        Number of trials, for the tolerance ``sampling``.
-    remark
-        Added to that of the table.
-    """
-    numbers, unit, digits = known.numbers, known.unit, known.digits
-    remark = f"{known.remark} {remark}".strip()
-    readings = {"author": author, "printed": printed, "ours": ours}
-    word, _, rest = known.check.partition(" ")
-    if word in ("more", "less"):
-        return improvement(
-            quantity,
-            published=numbers[0],
-            ours=ours,
-            larger=word == "more",
-            unit=unit,
-            digits=digits,
-            remark=remark,
-        )
-    if len(numbers) == 1 and known.check not in ("", "same"):
-        values = {name: None if value is None else float(value) for name, value in readings.items()}
-        tolerance = _tolerance(known, trials)
-        return agreement(
-            quantity,
-            published=numbers[0],
-            tolerance=tolerance,
-            **values,
-            unit=unit,
-            digits=digits,
-            remark=remark,
-        )
-    if len(numbers) <= 1 and known.check != "same":
-        published = numbers[0] if numbers else known.text or None
-        informing = shown(quantity, published=published, **readings, unit=unit, digits=digits, remark=remark)
-        if not known.check:
-            return informing
-        checked = next(value for value in readings.values() if value is not None)
-        agrees = checked > float(rest) if word == ">" else checked < float(rest)
-        return _checked(informing, "agrees", f"{known.check}{space_before(unit)}{unit}", [agrees])
-
-    def text(values: Any) -> str | None:
-        return None if values is None else ", ".join(f"{value:.{digits}f}" for value in values) + unit
-
-    checked = next(values for values in readings.values() if values is not None)
-    largest, origin = (0.0, "the same") if known.check == "same" else rounding(digits, unit)
-    return same(
-        quantity,
-        published=text(numbers) or "",
-        author=text(author),
-        printed=text(printed),
-        ours=text(ours),
-        matches=[bool(abs(a - b) <= largest) for a, b in zip(checked, numbers, strict=True)],
-        target=origin if known.check == "same" else f"each ± {origin}",
-        remark=remark,
-    )

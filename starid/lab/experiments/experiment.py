@@ -26,12 +26,12 @@ from starid.lab.experiments.comparison import (
     Published,
     ReproduceError,
     Row,
+    claimed,
     compared,
     null_model,
-    row,
 )
-from starid.lab.experiments.figures import Panel, draw
-from starid.lab.experiments.tables import PUBLISHED, published
+from starid.lab.experiments.figures import Panel, Picture, draw
+from starid.lab.experiments.tables import COLUMNS, PUBLISHED, published
 
 if TYPE_CHECKING:
     from starid.catalog import StarCatalog
@@ -51,15 +51,7 @@ EPOCH: Final = 1991.25
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """Trials that are computed together, apart from all others.
-
-    Attributes
-    ----------
-    key
-        Name of the part, unique in its experiment; also used as a file name.
-    values
-        Values that distinguish this part from the others.
-    """
+    """Trials that are computed together: a name, also used as a file name, and what distinguishes them from others."""
 
     key: str
     values: Parameters = field(default_factory=dict)
@@ -89,22 +81,11 @@ def parts_of(parameters: Parameters) -> list[Part]:
 class Experiment:
     """One experiment: an entry of `experiments.toml` with the functions of its module.
 
-    Attributes
-    ----------
-    name, title
-        Name on the command line, and heading in the report.
-    parts, compute, evaluate
-        List the parts for given parameters; compute one; make an outcome from the results of all, by key. They
-        must be defined at module level.
-    full, quick
-        Parameters of the full run and of the quick one; None leaves the experiment out of the quick run.
-    alone
-        The experiment measures time: in the full run nothing else runs at the same time.
-    start_order
-        Experiments with smaller numbers start first. These are experiments that compile different kernels
-        which others need: two processes that work on the same experiment compile everything twice.
-    revision
-        Incremented when a change of the code changes the results, so that they are computed again.
+    The functions must be defined at module level. `full` and `quick` are the parameters of the two runs; None leaves
+    the experiment out of the quick one. In the full run nothing else runs at the same time if it measures time
+    (`alone`). Experiments with a smaller `start_order` start first: these compile different kernels which others
+    need, and two processes that work on the same experiment compile everything twice. `revision` is incremented
+    when a change of the code changes the results, so that they are computed again.
     """
 
     name: str
@@ -138,19 +119,7 @@ def _without_lists(parameters: Parameters) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Folders, seed and parameters of a run of an experiment.
-
-    Attributes
-    ----------
-    folder
-        Folder of the experiment.
-    databases
-        Folder of the feature databases of all experiments.
-    name, seed, parameters
-        Name of the experiment, seed of the run, parameters of this run of the experiment.
-    quick
-        Whether this is the quick run.
-    """
+    """A run of an experiment: its folder, that of the databases of all experiments, name, seed and parameters."""
 
     folder: Path
     databases: Path
@@ -183,13 +152,7 @@ class Context:
 
 
 class Evaluation:
-    """Rows, tables, figures and notes of an experiment in the making, from the results of all its parts.
-
-    Parameters
-    ----------
-    context, parts, results
-        The run, its parts, and their results by key.
-    """
+    """Rows, tables, figures and notes of an experiment in the making, from the results of all its parts, by key."""
 
     def __init__(self, context: Context, parts: Sequence[Part], results: Mapping[str, Results]) -> None:
         self.context, self.parts, self.results = context, parts, results
@@ -221,28 +184,41 @@ class Evaluation:
     ) -> None:
         """Add a row that compares what was measured with the line of `published.csv`, as the line says.
 
-        Parameters
-        ----------
-        quantity
-            Key in `published.csv`.
-        text, unit, digits, check
-            The line, if the file has none (see `Published`); without a check, the row is only shown.
-        column
-            Column of a table; its rows are reported together, and those that a constant meets are marked.
-        author, printed, ours, trials, remark
-            See `compared`.
+        If the file has no line for the quantity, `text`, `unit`, `digits` and `check` stand for it (see `Published`).
+        Rows of one `column` of a table are reported together, and those that a constant meets are marked. The others
+        are the arguments of `compared`.
         """
         line = PUBLISHED.get((self.context.name, quantity))
         if line is None:
             line = Published("" if text is None else str(text), unit, digits, check)
         if column:
             self._columns[len(self.rows)] = column
-        readings = {"author": author, "printed": printed, "ours": ours}
-        self.rows.append(compared(quantity, line, **readings, trials=trials, remark=remark))
+        readings = {"author": author, "printed": printed, "ours": ours, "trials": trials}
+        self.rows.append(compared(quantity, line, **readings, remark=remark))
 
-    def require(self, quantity: str, **values: Any) -> None:
-        """Add a row with a value of this project and, if given, a bound; see `row`."""
-        self.rows.append(row(quantity, **values))
+    def compare_line(
+        self, table: str, part: str, where: str, known: Mapping[str, float], measured: Mapping[str, Any]
+    ) -> None:
+        """Add a row for each measured column of a line of a large table, as `columns.csv` describes the column.
+
+        One constant may answer for a column of a `part` of the table; `where` names the line in the report. Measured
+        is a number as the author ran it for each column, or the readings of `compare`.
+        """
+        for name, values in measured.items():
+            column = COLUMNS[table][name]
+            self.compare(
+                column["words"].format(where=where),
+                text=known[name],
+                unit=column["unit"],
+                digits=int(column["digits"]),
+                check=column["check"].format(**known),
+                column=f"{table} {part} {name}",
+                **(values if isinstance(values, Mapping) else {"author": values}),
+            )
+
+    def claim(self, quantity: str, **values: Any) -> None:
+        """Add a row with a check that no number states; see `claimed`."""
+        self.rows.append(claimed(quantity, **values))
 
     def write(self, name: str, table: Sequence[Mapping[str, Any]] | Mapping[str, Any]) -> None:
         """Write a CSV file from lines with the same keys, or from columns."""
@@ -251,7 +227,7 @@ class Evaluation:
         )
         self.files.append(write_csv(self.context.folder / name, columns))
 
-    def draw(self, name: str, panels: Sequence[Panel], **options: Any) -> None:
+    def draw(self, name: str, panels: Sequence[Panel | Picture], **options: Any) -> None:
         """Draw a figure; see `starid.lab.experiments.figures.draw`."""
         self.files.append(draw(self.context.folder / name, panels, **options))
 

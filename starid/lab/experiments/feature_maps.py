@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from starid.arrays import Array
-from starid.lab.experiments.comparison import same
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, planar_sky
-from starid.lab.experiments.figures import Curve, Panel
-from starid.plots import figure, save
+from starid.lab.experiments.figures import Curve, Panel, Picture
 
 FRAME_DEG: Final = 42.0
 """Frame width of these figures, degrees: their zones, δ −6° … 36° and α 0° … 42°, are 42° wide."""
@@ -63,17 +61,21 @@ def compute(context: Context, part: Part) -> Results:
 def _maps(e: Evaluation) -> None:
     result = e.results["map"]
     shape = (result["dec"].size, result["ra"].size)
-    for i, name in enumerate(_COLUMNS):
+    half = 0.5 * FRAME_DEG * (1.0 - e.parameters["map_percent"] / 100.0)
+    extent = (-half, result["ra"][-1] + half, -90.0 - half, result["dec"][-1] + half)
+    settings = {
+        "xlabel": "α of the centre / °",
+        "ylabel": "δ of the centre / °",
+        "xlim": (0, 360),
+        "ylim": (-90, 90),
+    }
+    settings |= {"xticks": range(0, 361, 60), "yticks": range(-90, 91, 30)}
+    for values, name in zip(result["features"].T, _COLUMNS, strict=True):
         number, quantity, symbol = _MAPS[name]
-        fig, axis = figure(width=7.0, height=3.6)
-        options: dict[str, Any] = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}
-        values = result["features"][:, i].reshape(shape)
-        image = axis.pcolormesh(result["ra"], result["dec"], values, shading="nearest", **options)
-        fig.colorbar(image, ax=axis, label=f"{quantity} {symbol}")
-        axis.grid(visible=False)
-        axis.set(xlabel="α of the centre / °", ylabel="δ of the centre / °", xlim=(0, 360), ylim=(-90, 90))
-        axis.set(xticks=range(0, 361, 60), yticks=range(-90, 91, 30))
-        e.files.append(save(fig, e.context.folder / f"figure_{number}.png"))
+        options = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}
+        scale = {"aspect": "auto", **options}
+        picture = Picture("", values.reshape(shape), extent, settings, f"{quantity} {symbol}", scale)
+        e.draw(f"figure_{number}.png", [picture], height=3.6)
     columns = {"ra_deg": result["places"][:, 0], "dec_deg": result["places"][:, 1]}
     e.write("feature_maps.csv", columns | dict(zip(_COLUMNS, result["features"].T, strict=True)))
 
@@ -113,14 +115,12 @@ def _compare_map(e: Evaluation) -> None:
         "figure 2.3: mean number of stars, southern over northern hemisphere (whole frames)",
         printed=south / north,
     )
-    e.rows.append(
-        same(
-            "figure 2.4: least and greatest brightness mean A over the map",
-            published="within (8, 9) mag",
-            printed=f"{brightness.min():.2f} … {brightness.max():.2f} mag",
-            matches=[bool(brightness.min() > 8.0), bool(brightness.max() < 9.0)],
-            target="> 8 and < 9 mag",
-        )
+    e.claim(
+        "figure 2.4: least and greatest brightness mean A over the map",
+        published="within (8, 9) mag",
+        printed=f"{brightness.min():.2f} … {brightness.max():.2f} mag",
+        matches=[bool(brightness.min() > 8.0), bool(brightness.max() < 9.0)],
+        target="> 8 and < 9 mag",
     )
     e.compare("figure 2.5: greatest polar radius r", printed=radius.max())
     e.compare(
@@ -145,12 +145,10 @@ def evaluate(e: Evaluation) -> None:
     counts, means = (
         [float(np.nanmean(table[:, column])) for table in (everything, bright)] for column in (0, 1)
     )
-    e.rows.append(
-        same(
-            f"figure 2.11: mean n and A without a limit, and with κ = {limits[-1]:g}",
-            published="n falls, A rises sharply",
-            printed=f"n {counts[0]:.0f} → {counts[1]:.0f}, A {means[0]:.2f} → {means[1]:.2f} mag",
-            matches=[counts[1] < counts[0], means[1] > means[0]],
-            target="n falls, A rises",
-        )
+    e.claim(
+        f"figure 2.11: mean n and A without a limit, and with κ = {limits[-1]:g}",
+        published="n falls, A rises sharply",
+        printed=f"n {counts[0]:.0f} → {counts[1]:.0f}, A {means[0]:.2f} → {means[1]:.2f} mag",
+        matches=[counts[1] < counts[0], means[1] > means[0]],
+        target="n falls, A rises",
     )

@@ -27,7 +27,8 @@ class Curve:
 class Panel:
     """Curves with common axes; `settings` are those of `matplotlib.axes.Axes.set`.
 
-    Curves without a colour get one each, from dark to light; `cycle` leaves them to matplotlib.
+    Curves without a colour get one each, from dark to light; `cycle` leaves them to matplotlib. Those in `right` have
+    a scale of their own, up to `right_limit`.
     """
 
     title: str
@@ -35,6 +36,22 @@ class Panel:
     settings: dict[str, Any] = field(default_factory=dict)
     legend: str = ""
     cycle: bool = False
+    right: Sequence[Curve] = ()
+    right_limit: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """Values (h, w) over the plane, the first row at the bottom; `options` are those of `imshow`, `label` the scale's."""
+
+    title: str
+    values: Any
+    extent: tuple[float, float, float, float]
+    settings: dict[str, Any] = field(default_factory=dict)
+    label: str = ""
+    options: dict[str, Any] = field(default_factory=dict)
+    beyond: str = "neither"
+    """Which end of the scale values may exceed."""
 
 
 def precision(errors: Any, limit: float, label: str = "", style: str = "-", **options: Any) -> Curve:
@@ -55,9 +72,40 @@ def precision_axes(symbol: str, limit: float) -> dict[str, Any]:
     }
 
 
+def _picture(fig: Any, axis: Any, picture: Picture) -> list[Any]:
+    place = {"origin": "lower", "extent": picture.extent, "interpolation": "nearest"}
+    image = axis.imshow(picture.values, **place, **picture.options)
+    axis.grid(visible=False)
+    if picture.label:
+        fig.colorbar(image, ax=axis, label=picture.label, extend=picture.beyond)
+    return []
+
+
+def _curves(axis: Any, panel: Panel) -> list[Any]:
+    """Draw the curves; return those with a label."""
+    curves = list(panel.curves)
+    free = [curve for curve in curves if "color" not in curve.options]
+    shades = dict(zip(map(id, free), [] if panel.cycle else colours(len(free)), strict=False))
+    drawn = []
+    for curve in curves:
+        colour = {"color": shades[id(curve)]} if id(curve) in shades else {}
+        drawn += axis.plot(
+            curve.x, curve.y, curve.style, label=curve.label or None, **(colour | curve.options)
+        )
+    if panel.right:
+        right = axis.twinx()
+        for curve in panel.right:
+            drawn += right.plot(curve.x, curve.y, curve.style, label=curve.label, **curve.options)
+        right.grid(visible=False)
+        right.set_ylim(0.0, panel.right_limit)
+    if panel.legend:
+        axis.legend(loc=panel.legend)
+    return [line for line in drawn if not line.get_label().startswith("_")]
+
+
 def draw(
     path: Path,
-    panels: Sequence[Panel],
+    panels: Sequence[Panel | Picture],
     *,
     columns: int = 1,
     width: float = 7.0,
@@ -67,35 +115,20 @@ def draw(
     legend_columns: int = 1,
     **options: Any,
 ) -> str:
-    """Draw the panels row by row; return the name of the file.
+    """Draw the panels row by row, `columns` in a row; return the name of the file.
 
-    Parameters
-    ----------
-    path, panels
-        File, and the panels.
-    columns, width, height
-        Number of panels in a row; size of the figure, inches.
-    title
-        Title of the figure.
-    legend, legend_columns
-        Place of one legend for all panels, with the labels of the first, and its columns.
-    **options
-        Options of `matplotlib.pyplot.subplots`.
+    `legend` is the place of one legend for all panels, with the labels of the first. The other options are those of
+    `matplotlib.pyplot.subplots`.
     """
     rows = -(-len(panels) // columns)
     fig, axes = figure(rows, columns, width=width, height=height, squeeze=False, **options)
     for axis, panel in zip(axes.ravel(), panels, strict=False):
-        curves = list(panel.curves)
-        free = [curve for curve in curves if "color" not in curve.options]
-        shades = dict(zip(map(id, free), [] if panel.cycle else colours(len(free)), strict=False))
-        for curve in curves:
-            colour = {"color": shades[id(curve)]} if id(curve) in shades else {}
-            axis.plot(curve.x, curve.y, curve.style, label=curve.label or None, **(colour | curve.options))
+        handles = _picture(fig, axis, panel) if isinstance(panel, Picture) else _curves(axis, panel)
         axis.set(title=panel.title, **panel.settings)
-        if panel.legend:
-            axis.legend(loc=panel.legend)
-    if legend:
-        fig.legend(*axes[0, 0].get_legend_handles_labels(), loc=legend, ncols=legend_columns)
+        if "sharex" in options or "sharey" in options:
+            axis.label_outer()
+        if axis is axes[0, 0] and legend:
+            fig.legend(handles=handles, loc=legend, ncols=legend_columns)
     if title:
         fig.suptitle(title)
     return save(fig, path)

@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 
 from starid.arrays import Array, Mask
-from starid.lab.experiments.comparison import same
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
+from starid.lab.experiments.figures import Picture
 from starid.lab.simulation import INTENSITY_UNITS, PIXEL_DEG, turned
 from starid.plots import figure, save
 from starid.thesis.cme import matched_motion
@@ -112,29 +112,20 @@ def _image(brightness: Array, pixels: Array) -> Array:
     return np.clip(image, 0.0, INTENSITY_UNITS)
 
 
-def _noise_figure(context: Context) -> str:
-    rng = context.rng("figure 5.3")
+def _noise_figure(e: Evaluation) -> None:
+    rng = e.context.rng("figure 5.3")
     brightness, places = _field(_FAINTEST)
     pixels = places / PIXEL_DEG
     clean = _image(brightness, pixels)
     dim = brightness + rng.normal(0.0, _BRIGHTNESS_SIGMA, brightness.size) * _FAINTEST / INTENSITY_UNITS
     noisy = _image(dim, pixels + rng.normal(0.0, 1.0, pixels.shape))
-    fig, axes = figure(2, 2, width=8.0, height=8.0)
-    left, right, low, high = _PATCH
-    for column, (image, title) in enumerate(((clean, "without noise"), (noisy, "σ_p = 1 px, σ_m = 5"))):
-        for row, window in enumerate(((0.0, _FIELD_DEG, 0.0, _FIELD_DEG), (left, right, low, high))):
-            axis = axes[row, column]
-            axis.imshow(
-                image,
-                origin="lower",
-                cmap="gray",
-                extent=(0.0, _FIELD_DEG, 0.0, _FIELD_DEG),
-                interpolation="nearest",
-            )
-            axis.set(xlim=window[:2], ylim=window[2:], title=title, xlabel="α / °", ylabel="δ / °")
-            axis.grid(visible=False)
-    fig.suptitle("Figure 5.3")
-    return save(fig, context.folder / "figure_5_3.png")
+    panels = []
+    for window in ((0.0, _FIELD_DEG, 0.0, _FIELD_DEG), _PATCH):
+        for image, title in ((clean, "without noise"), (noisy, "σ_p = 1 px, σ_m = 5")):
+            settings = {"xlim": window[:2], "ylim": window[2:], "xlabel": "α / °", "ylabel": "δ / °"}
+            extent = (0.0, _FIELD_DEG, 0.0, _FIELD_DEG)
+            panels.append(Picture(title, image, extent, settings, options={"cmap": "gray"}))
+    e.draw("figure_5_3.png", panels, columns=2, width=8.0, height=8.0, title="Figure 5.3")
 
 
 def _pair_figure(context: Context, result: Results) -> str:
@@ -161,14 +152,12 @@ def evaluate(e: Evaluation) -> None:
         "figure 3.2: feature vectors of a frame, disparities", printed=[pair_count(_STARS + 1), disparities]
     )
     kept = result["stars_exact"]
-    e.rows.append(
-        same(
-            "figure 5.4: objects taken for stars; the false one is rejected",
-            published="all six stars, not the false one",
-            printed=", ".join(str(i + 1) for i in np.flatnonzero(kept)),
-            matches=[bool(kept[:-1].all()), not kept[-1]],
-            target="1 to 6, not 7",
-        )
+    e.claim(
+        "figure 5.4: objects taken for stars; the false one is rejected",
+        published="all six stars, not the false one",
+        printed=", ".join(str(i + 1) for i in np.flatnonzero(kept)),
+        matches=[bool(kept[:-1].all()), not kept[-1]],
+        target="1 to 6, not 7",
     )
     for name, label in (("exact", "exact places"), ("pixels", "places to whole pixels")):
         turns = np.abs(result[f"disparities_{name}"][result[f"chosen_{name}"], 2])
@@ -177,7 +166,9 @@ def evaluate(e: Evaluation) -> None:
             printed=f"{turns.min():.2f}° … {turns.max():.2f}°",
             ours=f"{abs(float(result[f'turn_{name}'])):.3f}°",
         )
-    e.files += [_cluster_figure(e.context, result), _noise_figure(e.context), _pair_figure(e.context, result)]
+    e.files.append(_cluster_figure(e.context, result))
+    _noise_figure(e)
+    e.files.append(_pair_figure(e.context, result))
     points = result["disparities_pixels"]
     columns = dict(zip(("brightness_mag", "separation_deg", "slope_deg"), points.T, strict=True))
     e.write("figure_3_2.csv", {**columns, "in_cluster": result["chosen_pixels"].astype(int)})

@@ -12,7 +12,7 @@ import numpy as np
 
 from starid.arrays import Array, Mask
 from starid.lab.experiments.author_noise import filter_noise
-from starid.lab.experiments.comparison import best_constant, same
+from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.tables import CONFUSION
@@ -56,13 +56,7 @@ def frames_of_seven(
 
 def noise_of(kind: str, factor: float, false_stars: int) -> NoiseModel:
     """Noise model of one set, as printed."""
-    return NoiseModel.factor(
-        factor,
-        false_stars,
-        position=kind != "brightness",
-        brightness=kind != "position",
-        magnitude_range=_MAGNITUDES,
-    )
+    return NoiseModel.of(kind, factor, false_stars=false_stars, magnitude_range=_MAGNITUDES)
 
 
 def track_filter(noise: NoiseModel, least_deg: float, least_magnitude: float, **limits: Any) -> TrackFilter:
@@ -284,17 +278,15 @@ def _compare_tables(e: Evaluation) -> None:
             intervals.append((theirs - largest, theirs + largest))
         constant = best_constant(intervals)
         null = [low <= constant <= high for low, high in intervals]
-        e.rows.append(
-            same(
-                f"tables A.1–A.18, {_KINDS[kind]} noise: {indicator} of the sets",
-                published=f"{len(sets)} values",
-                author=f"{sum(matches)} of {len(sets)}",
-                printed=f"{printed} of {len(sets)}",
-                matches=matches,
-                null=null,
-                target="within 3 standard errors at the published 1 000 frames about one first frame",
-                remark=f"A constant {constant:.1f} % agrees with {sum(null)}.",
-            )
+        e.claim(
+            f"tables A.1–A.18, {_KINDS[kind]} noise: {indicator} of the sets",
+            published=f"{len(sets)} values",
+            author=f"{sum(matches)} of {len(sets)}",
+            printed=f"{printed} of {len(sets)}",
+            matches=matches,
+            null=null,
+            target="within 3 standard errors at the published 1 000 frames about one first frame",
+            remark=f"A constant {constant:.1f} % agrees with {sum(null)}.",
         )
 
 
@@ -319,15 +311,13 @@ def _compare_predictions(e: Evaluation, law: str, kinds: Sequence[str]) -> None:
             trials[int(np.argmin([sum(min(1.0, away(case, x) ** 2) for case in fitted) for x in trials]))]
         )
         matches = [away(case, best) <= 1.0 for case in others]
-        e.rows.append(
-            same(
-                f"recall, {law} constant fitted to the sets with {words}: the other {len(others)} sets",
-                published=f"{len(others)} values",
-                author=f"{sum(matches)} of {len(others)}",
-                matches=matches,
-                target="as above",
-                remark=f"The fit is {best:.3f} of the constant used.",
-            )
+        e.claim(
+            f"recall, {law} constant fitted to the sets with {words}: the other {len(others)} sets",
+            published=f"{len(others)} values",
+            author=f"{sum(matches)} of {len(others)}",
+            matches=matches,
+            target="as above",
+            remark=f"The fit is {best:.3f} of the constant used.",
         )
 
 
@@ -352,14 +342,12 @@ def _compare_motion(e: Evaluation) -> None:
     clean = max(float(np.nanmedian(values[0])) for values in distances)
     greatest = max(float(values.max()) for values in means)
     e.compare("figure 6.18: greatest mean μ_d of all sets", author=greatest)
-    e.rows.append(
-        same(
-            "figure 6.18: μ_d without noise, median",
-            published="of the order of 1e-15°",
-            author=f"{clean:.1e}°",
-            matches=[1e-16 < clean < 1e-14],
-            target="within a factor of ten",
-        )
+    e.claim(
+        "figure 6.18: μ_d without noise, median",
+        published="of the order of 1e-15°",
+        author=f"{clean:.1e}°",
+        matches=[1e-16 < clean < 1e-14],
+        target="within a factor of ten",
     )
     greatest = max(float(values[0]) for values in means)
     e.compare("figure 6.18: greatest mean μ_d without noise, with false stars", author=greatest)

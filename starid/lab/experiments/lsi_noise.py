@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -48,22 +49,13 @@ def compute(context: Context, part: Part) -> Results:
     kind, level = values.get("kind"), values.get("level", 0.0)
 
     def noise(rng: np.random.Generator) -> NoiseModel:
-        if kind in ("false", "missing"):
-            return NoiseModel(
-                false_stars=int(level) if kind == "false" else 0,
-                missing_stars=int(level) if kind == "missing" else 0,
-            )
         mean = float(rng.normal()) if values.get("mean") else 0.0
         if values.get("root"):
             return identification_noise(level, str(kind))
-        moved, dimmed = float(kind in ("position", "both")), float(kind in ("brightness", "both"))
-        return NoiseModel(
-            position_sigma_px=level * moved,
-            position_mean_px=mean * moved,
-            brightness_sigma=level * dimmed,
-            brightness_mean=mean * dimmed,
-            magnitude_range=_UNIT_RANGE if values.get("six") else NoiseModel().magnitude_range,
-        )
+        made = NoiseModel.of(str(kind), level)
+        moved, dimmed = (mean * (sigma > 0.0) for sigma in (made.position_sigma_px, made.brightness_sigma))
+        scale = _UNIT_RANGE if values.get("six") else made.magnitude_range
+        return replace(made, position_mean_px=moved, brightness_mean=dimmed, magnitude_range=scale)
 
     return solve_frames(
         context,

@@ -93,30 +93,16 @@ def solve_frames(
 ) -> Results:
     """Run LSI, with the exact LASSO and with MATLAB's, and then the sub-cell search, on the test frames.
 
-    Parameters
-    ----------
-    context, overlap
-        Provides the databases; overlap ratio p as a fraction.
-    grid, every
-        "on" or "off"; use only every n-th frame.
-    rng, noise
-        Random generator for the shift of the frames and their noise; noise of the stars, called for each frame,
-        so that it can draw a mean.
-    roll_deg
-        Roll of the camera, degrees.
-    compares
-        Also run the sub-cell search that compares the stars.
-    with_angle
-        Also find the nearest cell with the polar angle as a sixth feature.
+    `noise` is called for each frame, so that it can draw a mean; `rng` serves it and the shift of the frames.
 
     Returns
     -------
     Results
         `frames` (n, 2) degrees; `f_…` (n,): ε_f in degrees of the estimates `mse` and `1se` with the exact
         LASSO, `author_mse` and `author_1se` with MATLAB's, `fine` of the sub-cell search, and, if requested,
-        `stars` of the search that compares the stars and `six` of the nearest cell in six features;
-        `theta_…`: ε_θ in degrees of the same; `psi_mse`, `psi_author`, `residual`: ε_ψ of both kinds of LSI
-        and the sub-cell search.
+        `stars` of the search that compares the stars (`compares`) and `six` of the nearest cell in six features,
+        with the polar angle (`with_angle`); `theta_…`: ε_θ in degrees of the same; `psi_mse`, `psi_author`,
+        `residual`: ε_ψ of both kinds of LSI and the sub-cell search.
     """
     lsi, author = context.lost_in_space(overlap), context.lost_in_space(overlap, "matlab")
     fine, compared = SubcellSearch(lsi), SubcellSearch(lsi, neighbours=_COMPARED_NEIGHBOURS)

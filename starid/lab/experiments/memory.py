@@ -34,12 +34,12 @@ def evaluate(e: Evaluation) -> None:
     for percent in e.parameters["percent"]:
         loaded, peak = (1e-6 * float(e.results[f"p{percent:g}"][name]) for name in ("loaded", "peak"))
         lines.append({"percent": percent, "loaded_mb": loaded, "peak_mb": peak})
-        e.require(
+        e.compare(
             f"greatest memory of the process, database of {percent:g} %",
             ours=peak,
             unit="MB",
             digits=0,
-            at_most=_LIMIT_MB,
+            check=f"≤ {_LIMIT_MB}",
             remark=f"{loaded:.0f} MB once the database is loaded and its tree is built",
         )
     e.write("memory.csv", lines)

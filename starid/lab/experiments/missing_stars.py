@@ -51,9 +51,7 @@ def _with_changed_stars(
         seen = positions[:, 0] < _COVERED_FROM_DEG
         return ObservedFrame(brightness[seen], positions[seen])
     kind, _, count = case.partition("-")
-    noise = NoiseModel(
-        missing_stars=int(count) if kind == "missing" else 0, false_stars=int(count) if kind == "false" else 0
-    )
+    noise = NoiseModel.of(kind, float(count or 0))
     mags, noisy, _ = add_noise(rng, brightness, positions, noise, _HALF_WIDTH_DEG)
     return ObservedFrame(mags, noisy)
 
@@ -128,14 +126,14 @@ def evaluate(e: Evaluation) -> None:
             lines.append({"case": part.key, "method": name, **within, "no_answer": lost})
         label = _LABELS.get(part.key, "one star missing, put back from the frame before")
         seen, regained = (share(one, 1.0) for one in errors)
-        e.require(
+        e.claim(
             f"{label}, off the grid: share with ε_f ≤ 1°",
-            ours=regained,
-            unit="%",
-            passed=regained > seen or (part.key == "none" and regained >= seen),
+            ours=f"{regained:.2f} %",
+            matches=[regained > seen or (part.key == "none" and regained >= seen)],
             target=f"more than the features as seen, {seen:.2f} %",
             remark=f"{names[1].capitalize()}: {share(errors[1], 0.3):.1f} % within 0.3°, {lost:.1f} % without "
             f"an answer, {100.0 * np.mean(errors[1] > 1.0):.1f} % wrong by more than 1°.",
+            kind="ours",
         )
         close, closer = (share(one, 0.3) for one in errors)
         e.compare(f"{label}: share with ε_f ≤ 0.3°", printed=close, ours=closer, unit="%")

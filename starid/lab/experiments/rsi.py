@@ -35,15 +35,15 @@ SETTLING: Final = 5
 
 _BYTES_PER_CELL: Final = 5
 _FIELD_DEG: Final = 40.0
-_ERRORS: Final = {
-    "error_mean": "ε_f mean / °",
-    "error_sigma": "σ",
-    "roll_mean": "ε_θ mean / °",
-    "roll_sigma": "σ",
-    "psi_mean": "ε_ψ mean",
-    "psi_sigma": "σ",
-}
-"""Columns of tables H.1 and H.2."""
+_ERRORS: Final = (
+    ("error_mean", "error_mean", 2, "ε_f mean / °"),
+    ("error_sigma", "error_sigma", 2, "σ"),
+    ("roll_mean", "roll_mean", 2, "ε_θ mean / °"),
+    ("roll_sigma", "roll_sigma", 2, "σ"),
+    ("psi_mean", "psi_mean", 2, "ε_ψ mean"),
+    ("psi_sigma", "psi_sigma", 2, "σ"),
+)
+"""Columns of tables H.1 and H.2: name of the published value, name of the computed one, decimals, head."""
 _UPDATES: Final = (
     ("trigger_percent", "trigger_percent", 1, "triggers / %"),
     ("exceeded_percent", "exceeded_percent", 1, "ε_ψ > τ / %"),
@@ -53,9 +53,9 @@ _UPDATES: Final = (
     ("search_ms", "search_ms_median", 3, "1NN / ms, mean / median"),
     ("lasso_ms", "lasso_ms_median", 3, "LASSO / ms, mean / median"),
 )
-"""Columns of tables 6.7 to 6.9: name of the published value, name of the computed one, decimals, head."""
+"""The same of tables 6.7 to 6.9."""
 _PUBLISHED: Final = (
-    *_ERRORS,
+    *(name for name, *_ in _ERRORS),
     *("trigger_percent", "exceeded_percent", "side_mean", "side_sigma"),
     *("search_ms", "search_ms_sigma", "lasso_ms", "lasso_ms_sigma"),
 )
@@ -86,13 +86,14 @@ def compute(context: Context, part: Part) -> Results:
     lsi = context.lost_in_space(v["overlap"])
     noise = identification_noise(v["factor"], false_stars=v["false_stars"])
     if v["scale"] == PRINTED:
-        noise = NoiseModel.factor(v["factor"], v["false_stars"])
-    settings = RsiSettings(tau=v["tau"], memory=v["memory"])
+        noise = NoiseModel.of("both", v["factor"], false_stars=v["false_stars"])
     if v["tau"] == LSI_ONLY:
         settings = RsiSettings(tau=1.0, gamma_lsi_deg=1e-9)
     elif v["side"] == BY_TABLE:
         side = RECURSION[v["overlap"], v["factor"], v["tau"]]["side_mean"]
         settings = RsiSettings(tau=v["tau"], gamma_min_deg=side, gamma_scale=0.0)
+    else:
+        settings = RsiSettings(tau=v["tau"], memory=v["memory"])
     track = track_filter(noise, 0.002, 0.005, max_rotation_deg=4.0, max_shift_deg=4.0)
     recursion = RecursiveIdentification(lsi, track, settings)
     count = int(context.parameters["frames"])
@@ -130,8 +131,8 @@ def evaluate(e: Evaluation) -> None:
     matrices = [_matrix(e, found, overlap) for overlap in e.parameters["overlaps"]]
     e.note = {
         "matrices": "\n\n".join(matrix for matrix in matrices if matrix),
-        "errors": _error_table(diagonal, found),
-        "updates": _update_table(diagonal, found),
+        "errors": _table("tables H.1 and H.2", _ERRORS, diagonal, found),
+        "updates": _table("tables 6.7, 6.8 and 6.9", _UPDATES, diagonal, found),
         "sides": sides,
     }
 
@@ -163,6 +164,8 @@ def _sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, f
         sides = [f"{side:.2f}" for side in (printed, root, published)]
         label = f"μ = f = {v['factor']:g}, {noise_label(v['scale'])}"
         cells.append([label, f"{mean:.2g}", f"{sigma:.2g}", *sides, f"{published - least:.2f}°"])
+    if not lines:
+        return ""
     e.write("equation_6_5.csv", lines)
     head = ["Γ / °: noise", "μ_d / °", "σ_d / °", "eq. 6.5 as printed", "Γ_min + √(μ_d·σ_d)", "table 6.8"]
     return _markdown([*head, "√(μ_d·σ_d) it needs"], cells)
@@ -179,21 +182,18 @@ def _pair(theirs: float | None, ours: float, digits: int) -> str:
     return f"{left} / " + ("—" if math.isnan(ours) else f"{ours:.{digits}f}")
 
 
-def _error_table(parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> str:
+def _table(
+    title: str,
+    columns: Sequence[tuple[str, str, int, str]],
+    parts: Sequence[Part],
+    found: Mapping[str, dict[str, float]],
+) -> str:
     lines = []
     for part in parts:
         s, theirs = found[part.key], _published(part.values)
-        lines.append([_label(part.values), *(_pair(theirs.get(name), s[name], 2) for name in _ERRORS)])
-    return _markdown(["tables H.1 and H.2: published / ours", *_ERRORS.values()], lines)
-
-
-def _update_table(parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> str:
-    lines = []
-    for part in parts:
-        s, theirs = found[part.key], _published(part.values)
-        cells = [_pair(theirs.get(name), s[ours], digits) for name, ours, digits, _ in _UPDATES]
+        cells = [_pair(theirs.get(name), s[ours], digits) for name, ours, digits, _ in columns]
         lines.append([_label(part.values), *cells])
-    return _markdown(["tables 6.7, 6.8 and 6.9: published / ours", *(head for *_, head in _UPDATES)], lines)
+    return _markdown([f"{title}: published / ours", *(head for *_, head in columns)], lines)
 
 
 def _matrix(e: Evaluation, found: Mapping[str, dict[str, float]], overlap: float) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
@@ -11,7 +10,7 @@ import numpy as np
 from starid.lab.experiments.experiment import Evaluation, Part
 from starid.lab.experiments.figures import Curve, Panel, precision, precision_axes
 from starid.lab.experiments.rsi_trials import BY_TABLE, FIELDS, LSI_ONLY, method_of, noise_label
-from starid.plots import colours, figure, save
+from starid.plots import colours
 
 _SHOWN: Final = 40
 _LEAST: Final = 1e-4
@@ -53,8 +52,7 @@ def draw_sequences(e: Evaluation, parts: Sequence[Part], settling: int) -> None:
         and part.values["tau"] != LSI_ONLY
         and not part.values["memory"]
     }
-    _draw_errors(e, sequences)
-    _draw_run_times(e, sequences)
+    _draw_sequences(e, sequences)
 
 
 def _method(part: Part) -> str:
@@ -87,10 +85,19 @@ def _draw_precision(
     e.draw(name, panels, columns=2, width=9.0, height=7.0, title=title, sharey=True)
 
 
-def _draw_errors(e: Evaluation, sequences: dict[tuple[int, float], dict[str, Any]]) -> None:
-    """Draw ε_ψ and ε_f frame by frame: figures 6.33 to 6.36 and E."""
+def _draw_by_frame(
+    e: Evaluation, name: str, number: str, panels: Sequence[Panel], taus: int, **options: Any
+) -> None:
+    title = f"Figures {number}: p = {100 * e.parameters['overlaps'][-1]:g} %"
+    size = {"columns": taus, "width": 10.0, "height": 2.2 * len(panels) / taus, "sharex": True}
+    legend = {"legend": "outside lower center", "legend_columns": 4}
+    e.draw(name, panels, title=title, **size, **legend, **options)
+
+
+def _draw_sequences(e: Evaluation, sequences: dict[tuple[int, float], dict[str, Any]]) -> None:
+    """Draw frame by frame ε_ψ and ε_f (figures 6.33 to 6.36, E), and run times (6.42, 6.43, G)."""
     frames = np.arange(1, _SHOWN + 1)
-    panels = []
+    errors, times = [], []
     for (factor, tau), numbers in sequences.items():
         error, psi = (1.0 + np.log10(np.maximum(numbers[name], _LEAST)) for name in ("error", "psi"))
         hit = numbers["triggered"] > 0.0
@@ -101,31 +108,20 @@ def _draw_errors(e: Evaluation, sequences: dict[tuple[int, float], dict[str, Any
             Curve(frames[[0, -1]], threshold, "-", "τ", {"color": "0.5", "lw": 0.8}),
             Curve(frames[hit], psi[hit], "v", "update triggered", {"color": "black", "markersize": 5}),
         ]
-        panels.append(Panel(f"μ = f = {factor}, τ = {tau:g}", curves, {"xlabel": "frame"}))
+        words = f"μ = f = {factor}, τ = {tau:g}"
+        errors.append(Panel(words, curves, {"xlabel": "frame"}))
+        left = [
+            Curve(frames, numbers["error"], "-", "ε_f / °", {"color": "red"}),
+            Curve(frames, numbers["side"], "-.", "Γ / °", {"color": "green"}),
+        ]
+        right = [
+            Curve(frames, numbers["search_ms"], "b--", "1NN / ms (right)"),
+            Curve(frames, numbers["lasso_ms"], "k:", "LASSO / ms (right)"),
+        ]
+        times.append(
+            Panel(words, left, {"xlabel": "frame", "ylim": (0.0, 4.0)}, right=right, right_limit=_MAX_MS)
+        )
     taus = len({tau for _, tau in sequences})
-    title = f"Figures 6.33 to 6.36 and E: p = {100 * e.parameters['overlaps'][-1]:g} %"
-    size = {"columns": taus, "width": 10.0, "height": 2.2 * len(panels) / taus}
-    legend = {"legend": "outside lower center", "legend_columns": 4}
-    name = "figures_6_33_to_6_36_and_e.png"
-    e.draw(name, panels, title=title, sharex=True, sharey=True, **size, **legend)
-
-
-def _draw_run_times(e: Evaluation, sequences: dict[tuple[int, float], dict[str, Any]]) -> None:
-    """Draw ε_f, side of the region and run times frame by frame: figures 6.42, 6.43 and G."""
-    factors, taus = (list(dict.fromkeys(values)) for values in zip(*sequences, strict=True))
-    size = {"width": 10.0, "height": 2.2 * len(factors)}
-    fig, axes = figure(len(factors), len(taus), squeeze=False, sharex=True, **size)
-    frames = np.arange(1, _SHOWN + 1)
-    for axis, (factor, tau) in zip(axes.ravel(), itertools.product(factors, taus), strict=True):
-        numbers, right = sequences[factor, tau], axis.twinx()
-        lines = axis.plot(frames, numbers["error"], "r-", label="ε_f / °")
-        lines += axis.plot(frames, numbers["side"], "g-.", label="Γ / °")
-        lines += right.plot(frames, numbers["search_ms"], "b--", label="1NN / ms (right)")
-        lines += right.plot(frames, numbers["lasso_ms"], "k:", label="LASSO / ms (right)")
-        axis.set(title=f"μ = f = {factor}, τ = {tau:g}", xlabel="frame", ylim=(0.0, 4.0))
-        axis.label_outer()
-        right.grid(visible=False)
-        right.set_ylim(0.0, _MAX_MS)
-    fig.legend(handles=lines, loc="outside lower center", ncols=4)
-    fig.suptitle(f"Figures 6.42, 6.43 and G: p = {100 * e.parameters['overlaps'][-1]:g} %")
-    e.files.append(save(fig, e.context.folder / "figures_6_42_6_43_and_g.png"))
+    name, number = "figures_6_33_to_6_36_and_e.png", "6.33 to 6.36 and E"
+    _draw_by_frame(e, name, number, errors, taus, sharey=True)
+    _draw_by_frame(e, "figures_6_42_6_43_and_g.png", "6.42, 6.43 and G", times, taus)

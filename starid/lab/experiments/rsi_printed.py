@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -36,9 +36,7 @@ _SIDE_DEG: Final = 4.0
 _ROLL_DEG: Final = 2.5
 _UNFILTERED: Final = 1
 """Number of first frames that are not filtered."""
-_PUBLISHED_FRAMES: Final = 1001
 _TAUS: Final = (LSI_ONLY, 0.5, 1.0)
-_QUANTITIES: Final = (("error", "ε_f", "°"), ("roll", "ε_θ", "°"), ("psi", "ε_ψ", ""))
 _EXCEEDED_PSI: Final = 0.5
 """Table 6.7 has the same share of frames "with ε_ψ > τ" for both τ: that of τ = 0.5."""
 _BYTES_PER_CELL: Final = 5
@@ -123,7 +121,7 @@ def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]
 def _sequences(context: Context, part: Part) -> Results:
     """Distances of the filter, and measurements (fields, n) of each database, reading and threshold."""
     m, author = part.values["factor"], part.values["reading"] == "author"
-    noise = identification_noise(m, false_stars=m) if author else NoiseModel.factor(m, m)
+    noise = identification_noise(m, false_stars=m) if author else NoiseModel.of("both", m, false_stars=m)
     rng, count = context.rng(part.key), int(context.parameters["frames"])
     made = sky_sequence(rng, context.sky(), *START, noise, count=count, margin_deg=_MARGIN_DEG)
     frames = list(made)
@@ -141,88 +139,50 @@ def _sequences(context: Context, part: Part) -> Results:
 
 def _compare_errors(e: Evaluation, overlap: float, m: int, tau: float) -> None:
     """Compare a line of tables H.1 and H.2: means and deviations."""
-    published = RECURSION[overlap, m, tau]
     found = _answers(e.results[f"table-p{overlap:g}-m{m}"]["numbers"], tau)
-    table = _TABLES[overlap]
-    for (name, symbol, unit), values in zip(_QUANTITIES, found, strict=True):
-        sigma = published[f"{name}_sigma"]
-        for what, check, words, value, remark in (
-            ("mean", "mean", "mean", values.mean(), f"Median {np.median(values):.2f}{unit}."),
-            ("sigma", "deviation", "deviation of", values.std(), ""),
-        ):
-            e.compare(
-                f"table {table}, μ = f = {m}, {method_of(tau)}: {words} {symbol}",
-                text=published[f"{name}_{what}"],
-                unit=unit,
-                check=f"{check} {sigma} {_PUBLISHED_FRAMES}",
-                column=f"{table} {name} {what}",
-                author=value,
-                remark=remark,
-            )
+    measured: dict[str, Any] = {}
+    for (name, unit), values in zip((("error", "°"), ("roll", "°"), ("psi", "")), found, strict=True):
+        remark = f"Median {np.median(values):.2f}{unit}."
+        measured[f"{name}_mean"] = {"author": values.mean(), "remark": remark}
+        measured[f"{name}_sigma"] = values.std()
+    table = f"table {_TABLES[overlap]}"
+    where = f"{table}, μ = f = {m}, {method_of(tau)}"
+    e.compare_line("H", table, where, RECURSION[overlap, m, tau], measured)
 
 
 def _compare_updates(e: Evaluation, overlap: float, m: int, tau: float) -> None:
     """Compare a line of table 6.7: shares of frames."""
     psi = e.results[f"table-p{overlap:g}-m{m}"]["numbers"][0, 2]
-    for name, words, limit in (
-        ("trigger_percent", "triggers", tau),
-        ("exceeded_percent", "share with ε_ψ > τ", _EXCEEDED_PSI),
-    ):
-        e.compare(
-            f"table 6.7, p = {100 * overlap:g} %, μ = f = {m}, {method_of(tau)}: {words}",
-            text=RECURSION[overlap, m, tau][name],
-            unit="%",
-            digits=1,
-            check=f"sampling {_PUBLISHED_FRAMES}",
-            column=f"{overlap} {name}",
-            author=100.0 * float(np.mean(psi > limit)),
-        )
+    limits = {"trigger_percent": tau, "exceeded_percent": _EXCEEDED_PSI}
+    measured = {name: 100.0 * float(np.mean(psi > limit)) for name, limit in limits.items()}
+    where = f"table 6.7, p = {100 * overlap:g} %, μ = f = {m}, {method_of(tau)}"
+    e.compare_line("6.7", str(overlap), where, RECURSION[overlap, m, tau], measured)
 
 
 def _compare_sides(e: Evaluation, overlap: float, m: int, tau: float) -> None:
     """Compare a line of table 6.8: side, deviation and size of the region."""
     least, published = RsiSettings().gamma_min_deg, RECURSION[overlap, m, tau]
     literal, reduced = (e.results[f"m{m}-{run}"]["distances"] for run in ("printed", "author"))
-    mean, sigma, wide, spread = np.nanmean(literal, axis=0)
-    as_printed = side_as_printed(float(mean), float(sigma), least)
-    roots = [least + math.sqrt(float(product)) for product in (mean * sigma, wide * spread)]
+    mean, sigma, wide, spread = map(float, np.nanmean(literal, axis=0))
+    printed = side_as_printed(mean, sigma, least)
+    root, wide_root = least + math.sqrt(mean * sigma), least + math.sqrt(wide * spread)
     sides = least + np.sqrt(reduced[:, 2] * reduced[:, 3])
-    side, deviation = published["side_mean"], published["side_sigma"]
     sizes = {
-        name: 1e-3 * _BYTES_PER_CELL * (side / (field * (1.0 - overlap))) ** 2
+        name: 1e-3 * _BYTES_PER_CELL * (published["side_mean"] / (field * (1.0 - overlap))) ** 2
         for name, field in (("printed", 42.0), ("author", 40.0))
     }
+    measured = {
+        "side_mean": {
+            "author": np.nanmean(sides),
+            "printed": printed,
+            "remark": f"Noise as printed: (a) {printed:.2f}, (b) {root:.2f}, (c) {wide_root:.2f}°; "
+            f"μ_d {mean:.2g}°, σ_d {sigma:.2g}°.",
+        },
+        "side_sigma": np.nanstd(sides),
+        "region_kB": {**sizes, "remark": "Eq. 6.6 with the published side."},
+    }
     where = f"table 6.8, p = {100 * overlap:g} %, μ = f = {m}, {method_of(tau)}"
-    e.compare(
-        f"{where}: side Γ of the region",
-        text=side,
-        unit="°",
-        check=f"mean {deviation} {_PUBLISHED_FRAMES}",
-        column="side",
-        author=float(np.nanmean(sides)),
-        printed=as_printed,
-        remark=f"Noise as printed: (a) {as_printed:.2f}, (b) {roots[0]:.2f}, (c) {roots[1]:.2f}°; "
-        f"μ_d {mean:.2g}°, σ_d {sigma:.2g}°.",
-    )
-    e.compare(
-        f"{where}: deviation of the side",
-        text=deviation,
-        unit="°",
-        digits=3,
-        check=f"deviation {deviation} {_PUBLISHED_FRAMES}",
-        column="deviation of the side",
-        author=float(np.nanstd(sides)),
-    )
-    e.compare(
-        f"{where}: size of the region",
-        text=published["region_kB"],
-        unit="kB",
-        check="rounding 2",
-        column=f"size {overlap}",
-        author=sizes["author"],
-        printed=sizes["printed"],
-        remark="Eq. 6.6 with the published side.",
-    )
+    e.compare_line("6.8", str(overlap), where, published, measured)
 
 
 def _show_sequences(e: Evaluation, overlap: float, m: int, tau: float) -> None:

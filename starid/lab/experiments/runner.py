@@ -25,18 +25,10 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class FinishedExperiment:
-    """An experiment that has been run.
+    """An experiment that has been run, its outcome, and what it cost.
 
-    Attributes
-    ----------
-    experiment, outcome
-        The experiment and its outcome.
-    quick
-        Whether it ran with its quick parameters.
-    seconds
-        Processor time for its parts, summed over the processes, and for its tables and figures.
-    parts
-        Number of parts computed; 0 if all results were stored already.
+    `seconds` is the processor time for its parts, summed over the processes, and for its tables and figures; `parts`
+    the number of parts computed, 0 if all results were stored already.
     """
 
     experiment: Experiment
@@ -164,20 +156,8 @@ def run(
 ) -> list[FinishedExperiment]:
     """Run experiments; results in `folder` for the same parameters are reused.
 
-    Parameters
-    ----------
-    experiments
-        The experiments, in the order of the report.
-    folder
-        Folder for all results, with one subfolder per experiment.
-    quick
-        Use the quick parameters.
-    seed
-        Seed of all random numbers; results do not depend on `jobs`.
-    jobs
-        Number of processes. Experiments that measure time run afterwards, one at a time, unless `quick`.
-    progress
-        Called whenever a part is finished.
+    Results do not depend on `jobs`, the number of processes. Experiments that measure time run afterwards, one part at
+    a time, unless `quick`. `progress` is called whenever a part is finished.
 
     Raises
     ------

@@ -114,17 +114,17 @@ def evaluate(e: Evaluation) -> None:
         errors = found["cross_arcsec"][valid]
         for limit in (0.3, 1.0, 2.0) if name == "LSI" else ():
             quantity = f"one neighbour and LASSO, boresight within {limit:g}°, {label}"
-            e.require(quantity, ours=share(found["coarse_deg"], limit), unit="%", digits=1)
-        bound = {"at_least": 98.0} if noise["false"] <= 5 else {}
+            e.compare(quantity, ours=share(found["coarse_deg"], limit), unit="%", digits=1)
+        bound = "≥ 98" if noise["false"] <= 5 else ""
         right = 100.0 * float(valid.mean())
-        e.require(f"{name} verified and valid, {label}", ours=right, unit="%", digits=1, **bound)
+        e.compare(f"{name} verified and valid, {label}", ours=right, unit="%", digits=1, check=bound)
         wrong = float(np.count_nonzero(errors > _WRONG_ARCSEC))
-        e.require(f"{name} valid but wrong, {label}", ours=wrong, digits=0, at_most=0.0)
+        e.compare(f"{name} valid but wrong, {label}", ours=wrong, digits=0, check="≤ 0")
         if valid.any():
             middle = float(np.median(errors))
-            e.require(f"{name} median cross-boresight error, {label}", ours=middle, unit="″")
-        e.require(f"{name} median time a frame, {label}", ours=float(np.median(found["ms"])), unit="ms")
+            e.compare(f"{name} median cross-boresight error, {label}", ours=middle, unit="″")
+        e.compare(f"{name} median time a frame, {label}", ours=float(np.median(found["ms"])), unit="ms")
         if name == "RSI":
             inside = 100.0 * float(found["tracking"][1:].mean())
-            e.require(f"RSI answered from the region, {label}", ours=inside, unit="%", digits=1)
+            e.compare(f"RSI answered from the region, {label}", ours=inside, unit="%", digits=1)
     e.write("frames.csv", lines)

@@ -2,7 +2,7 @@
 
 `published.csv` holds a line for each quantity that the thesis prints in its text, or in a table of a few lines:
 the numbers, their unit and digits, how they are checked (see `comparison`), and where they stand in the thesis. The
-large tables have files of their own: `published_confusion.csv` (A.1 to A.18) and `published_recursion.csv`.
+large tables have files of their own (`published_*.csv`), whose columns `columns.csv` describes.
 
 A failed check listed in `known_misses.csv` is a known miss: the report shows it with its reason, and the exit status
 stays 0. A failed check that is not listed is a regression.
@@ -17,13 +17,15 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Final, Literal
 
 from starid.lab.experiments.comparison import Kind, Published, Row
 
 
-def _lines(name: str) -> list[dict[str, str]]:
+def read_lines(name: str) -> list[dict[str, str]]:
+    """Read a CSV file of this folder."""
     with Path(__file__).with_name(name).open(encoding="utf-8", newline="") as stream:
         return list(csv.DictReader(stream))
 
@@ -32,7 +34,7 @@ PUBLISHED: Final = {
     (line["experiment"], line["quantity"]): Published(
         line["published"], line["unit"], int(line["digits"]), line["check"], line["remark"]
     )
-    for line in _lines("published.csv")
+    for line in read_lines("published.csv")
 }
 """Experiment and quantity → what the thesis prints."""
 
@@ -45,7 +47,7 @@ def published(experiment: str, quantity: str) -> list[float]:
 
 def _confusion() -> dict[tuple[str, int], list[tuple[int, ...]]]:
     tables: dict[tuple[str, int], list[tuple[int, ...]]] = {}
-    for kind, false_stars, _, *counts in (line.values() for line in _lines("published_confusion.csv")):
+    for kind, false_stars, _, *counts in (line.values() for line in read_lines("published_confusion.csv")):
         tables.setdefault((kind, int(false_stars)), []).append(tuple(map(int, counts)))
     return tables
 
@@ -57,11 +59,21 @@ Tables A.1 to A.18. In table A.2 (position noise, no false stars) the copy of th
 positives for μ = 1 … 5; here they are 6 620 minus the negatives.
 """
 
+
+def _numbers(line: Mapping[str, str], keys: int) -> dict[str, float]:
+    return {name: float(text) for name, text in list(line.items())[keys:] if text}
+
+
+CASE_STUDY: Final = {
+    (int(line["false_stars"]), line["noise"]): _numbers(line, 2)
+    for line in read_lines("published_case_study.csv")
+}
+"""Tables 6.3 and 6.4: number of false stars and kind of noise (factor 1) → indicators, percent, and mean and
+standard deviation of the errors of rotation and translation, degrees."""
+
 RECURSION: Final = {
-    (float(line["overlap"]), int(line["factor"]), float(line["tau"])): {
-        name: float(text) for name, text in list(line.items())[3:] if text
-    }
-    for line in _lines("published_recursion.csv")
+    (float(line["overlap"]), int(line["factor"]), float(line["tau"])): _numbers(line, 3)
+    for line in read_lines("published_recursion.csv")
 }
 """Tables of the recursive algorithm: overlap ratio p, noise factor μ (= number of false stars f) and threshold τ
 (0: LSI with the filter) → values, with the names of `rsi_trials.statistics`.
@@ -71,6 +83,13 @@ that trigger the update, and that have ε_ψ > τ, percent. 6.8, for τ > 0: mea
 side of the search region, degrees, and its size, kB. 6.9: mean and standard deviation of the time of the
 search and of the LASSO, milliseconds.
 """
+
+
+COLUMNS: Final = {
+    table: {line["column"]: line for line in lines}
+    for table, lines in groupby(read_lines("columns.csv"), key=lambda line: line["table"])
+}
+"""Table and column → words, unit, digits and check (with the names of columns in braces) of its numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +102,7 @@ class KnownMiss:
 
 KNOWN_MISSES: Final = {
     (line["experiment"], line["quantity"]): KnownMiss(line["reason"], int(line["agree"]))
-    for line in _lines("known_misses.csv")
+    for line in read_lines("known_misses.csv")
 }
 """Experiment and quantity → why the check fails."""
 
@@ -119,7 +138,7 @@ class Choice:
 
 CHOICES: Final[tuple[Choice, ...]] = tuple(
     Choice(**line)  # type: ignore[arg-type]
-    for line in _lines("choices.csv")
+    for line in read_lines("choices.csv")
 )
 
 

@@ -76,7 +76,7 @@ def test_without_noise_all_stars_are_found_and_the_motion_is_exact(false_stars):
 
 
 def test_scalable_filter_at_the_largest_published_noise():
-    noise = NoiseModel.factor(5.0, 5, magnitude_range=(-1.5, 3.0))
+    noise = NoiseModel.of("both", 5.0, false_stars=5, magnitude_range=(-1.5, 3.0))
     settings = TrackFilterSettings(
         position_sigma_deg=5.0 * PIXEL_DEG,
         brightness_sigma=5.0 * noise.magnitude_per_unit,

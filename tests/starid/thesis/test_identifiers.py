@@ -56,6 +56,36 @@ def test_lsi_is_right_or_invalid(false_stars):
     assert valid >= 28
 
 
+@pytest.mark.parametrize("algorithm", ["lsi", "rsi"])
+def test_a_half_covered_field_is_identified_by_the_circles_of_a_divided_field(algorithm):
+    identifier = make_identifier(algorithm, divided=True)
+    rng = np.random.default_rng(11)
+    valid = 0
+    for _ in range(15):
+        attitude, side = random_attitude(rng), rng.uniform(0.0, 2.0 * np.pi)
+        xy, flux = points(rng, attitude)
+        seen = (xy - DEFAULT_CAMERA.centre_px) @ [np.cos(side), np.sin(side)] < 0.0
+        solution = identifier.identify(xy[seen], flux[seen])
+        if solution.valid:
+            valid += 1
+            assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
+    assert valid >= 14
+
+
+def test_five_missing_stars_of_the_brightest_need_no_divided_field():
+    rng = np.random.default_rng(12)
+    valid = 0
+    for _ in range(20):
+        attitude = random_attitude(rng)
+        xy, flux = points(rng, attitude)
+        seen = np.delete(np.argsort(-flux), rng.choice(25, 5, replace=False))
+        solution = lsi().identify(xy[seen], flux[seen])
+        if solution.valid:
+            valid += 1
+            assert solution.attitude.error_to(attitude).total_arcsec < RIGHT_ARCSEC
+    assert valid >= 19
+
+
 @pytest.mark.parametrize(("ra", "dec"), [(0.0, 90.0), (123.0, -90.0), (0.01, 0.0), (359.99, 45.0)])
 def test_lsi_at_the_poles_and_at_the_wrap(ra, dec):
     attitude = Attitude.from_radec_roll(ra, dec, 77.0)

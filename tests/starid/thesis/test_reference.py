@@ -69,7 +69,7 @@ def test_the_path_reaches_scikit_learn_s_minimum(penalty):
 @pytest.mark.parametrize("false_stars", [0, 2, 5])
 @pytest.mark.parametrize("factor", [0.0, 1.0, 4.0])
 def test_the_filter_is_the_clustering_of_scikit_learn(false_stars, factor):
-    noise = NoiseModel.factor(factor, false_stars, magnitude_range=(-1.5, 3.0))
+    noise = NoiseModel.of("both", factor, false_stars=false_stars, magnitude_range=(-1.5, 3.0))
     frames = moved_frames(np.random.default_rng(3), BRIGHTNESS, STARS, noise, count=6, radius_deg=21.0)
     first = next(frames).observed
     for frame in frames:

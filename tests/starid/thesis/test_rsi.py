@@ -88,7 +88,7 @@ def test_the_same_seed_gives_the_same_frames():
     sky = lost_in_space(99.5).database.sky
 
     def run(seed):
-        noise = NoiseModel.factor(2.0, 2)
+        noise = NoiseModel.of("both", 2.0, false_stars=2)
         frames = sky_sequence(np.random.default_rng(seed), sky, 108.0, 12.0, noise, count=3)
         return np.concatenate([frame.observed.positions for frame in frames])
 
@@ -167,7 +167,7 @@ def test_the_memory_drops_old_answers_and_all_when_cleared():
 
 def test_a_wrong_start_is_recovered_from_and_gross_answers_are_outvoted():
     lsi = lost_in_space(99.5)
-    noise = NoiseModel.factor(0.34, 2)
+    noise = NoiseModel.of("both", 0.34, false_stars=2)
     settings = TrackFilterSettings(0.016, 0.01, max_rotation_deg=4.0, max_shift_deg=4.0)
     errors = {}
     for memory in (0, 15):

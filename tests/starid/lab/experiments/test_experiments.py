@@ -17,13 +17,9 @@ from starid.lab.experiments.comparison import (
     Outcome,
     Published,
     Row,
-    agreement,
+    claimed,
     compared,
-    improvement,
     null_model,
-    row,
-    same,
-    sampling,
 )
 from starid.lab.experiments.experiment import (
     Context,
@@ -71,7 +67,8 @@ def _compute(context: Context, part: Part) -> Results:
 def _evaluate(e: Evaluation) -> None:
     sums = {key: result["value"].sum() for key, result in e.results.items()}
     e.write("values.csv", {"key": list(sums), "sum": list(sums.values())})
-    e.require("total | of all", published=1.0, ours=float(sum(sums.values())), at_least=e.parameters["least"])
+    total = float(sum(sums.values()))
+    e.compare("total | of all", text=1.0, ours=total, check=f"≥ {e.parameters['least']}")
 
 
 def _experiment(name: str = "toy", least: float = -1e9) -> Experiment:
@@ -213,19 +210,19 @@ def test_progress_counts_up_to_all_parts(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("ours", "bounds", "passed", "target"),
+    ("ours", "check", "passed", "target"),
     [
-        (99.95, {"at_least": 99.9}, True, "≥ 99.9 %"),
-        (99.89, {"at_least": 99.9}, False, "≥ 99.9 %"),
-        (0.5, {"at_most": 0.5}, True, "≤ 0.5 %"),
-        (0.6, {"at_least": 0.0, "at_most": 0.5}, False, "≥ 0 %, ≤ 0.5 %"),
-        (float("nan"), {"at_least": 0.0}, False, "≥ 0 %"),
-        (1.0, {}, None, ""),
+        (99.95, "≥ 99.9", True, "≥ 99.9 %"),
+        (99.89, "≥ 99.9", False, "≥ 99.9 %"),
+        (0.5, "≤ 0.5", True, "≤ 0.5 %"),
+        (0.6, "≤ 0.5", False, "≤ 0.5 %"),
+        (float("nan"), "≥ 0", False, "≥ 0 %"),
+        (1.0, "", None, ""),
     ],
 )
-def test_a_bound_makes_a_row_a_check(ours, bounds, passed, target):
-    made = row("q", ours=ours, unit="%", **bounds)
-    assert (made.passed, made.target) == (passed, target)
+def test_a_bound_makes_a_row_a_check_of_our_own(ours, check, passed, target):
+    made = compared("q", Published("", "%", check=check), ours=ours)
+    assert (made.passed, made.target, made.kind) == (passed, target, "ours" if check else "")
 
 
 @pytest.mark.parametrize(
@@ -239,7 +236,7 @@ def test_a_bound_makes_a_row_a_check(ours, bounds, passed, target):
     ],
 )
 def test_agreement_is_two_sided(published, value, passed):
-    made = agreement("q", published=published, tolerance=(1.5, "1.5 points"), author=value, printed=0.0)
+    made = compared("q", Published(str(published), check="1.5 1.5 points"), author=value, printed=0.0)
     assert (made.passed, made.kind, made.met, made.of) == (passed, "agrees", int(passed), 1)
     assert made.target == "± 1.5 points"
 
@@ -254,12 +251,12 @@ def test_agreement_is_two_sided(published, value, passed):
     ],
 )
 def test_the_value_closest_to_the_author_s_version_is_compared(values, passed):
-    assert agreement("q", published=1.0, tolerance=(0.1, "a tenth"), **values).passed is passed
+    assert compared("q", Published("1", check="0.1 a tenth"), **values).passed is passed
 
 
 def test_an_agreement_needs_a_number():
     with pytest.raises(StaridError, match="no number to compare"):
-        agreement("q", published=1.0, tolerance=(0.1, "a tenth"), ours="many")
+        compared("q", Published("1", check="0.1 a tenth"), ours="many")
 
 
 @pytest.mark.parametrize(
@@ -273,20 +270,20 @@ def test_an_agreement_needs_a_number():
     ],
 )
 def test_an_improvement_is_one_sided_and_quantified(larger, ours, passed, words):
-    made = improvement("q", published=90.0, ours=ours, larger=larger)
+    made = compared("q", Published("90", check="more" if larger else "less"), ours=ours)
     assert (made.passed, made.kind) == (passed, "better")
     assert words in made.remark
 
 
 def test_a_row_of_several_numbers_counts_each():
-    made = same("q", published="1, 2, 3", author="1, 2, 4", matches=[True, True, False], target="the same")
+    made = claimed("q", published="1, 2, 3", author="1, 2, 4", matches=[True, True, False], target="the same")
     assert (made.passed, made.met, made.of) == (False, 2, 3)
     assert "2 of 3 agree" in made.remark
 
 
 def test_the_best_constant_marks_the_checks_that_it_meets():
     rows = [
-        agreement(f"q{x}", published=x, tolerance=(0.6, ""), author=value)
+        compared(f"q{x}", Published(str(x), check="0.6"), author=value)
         for x, value in ((98.0, 98.0), (100.0, 5.0), (100.5, 100.5), (90.0, 90.0))
     ]
     marked = null_model(rows)
@@ -297,22 +294,17 @@ def test_the_best_constant_marks_the_checks_that_it_meets():
 
 
 def test_numbers_that_a_null_model_meets_are_counted_apart():
-    made = same("q", published="", matches=[True, True, False], null=[True, False, True], target="")
+    made = claimed("q", published="", matches=[True, True, False], null=[True, False, True], target="")
     found = report.counts([_finished((made,))])
     assert found["weak"] == {"met": 1, "of": 2}
     assert found["agrees"] == {"met": 1, "of": 1}
 
 
 def test_the_sampling_error_combines_two_counts():
-    greatest, words = sampling(50.0, 1000)
-    assert greatest == pytest.approx(3.0 * np.sqrt(2.0 * 0.25 / 1000.0) * 100.0, rel=1e-2)
-    assert "two shares of 1000" in words
-    assert 0.0 < sampling(100.0, 1000)[0] < 1.0
-
-
-def test_text_cannot_have_bounds():
-    with pytest.raises(StaridError, match="text cannot have bounds"):
-        row("q", ours="many", at_least=1.0)
+    low, high = compared("q", Published("50", check="sampling 1000"), ours=50.0).interval
+    assert 0.5 * (high - low) == pytest.approx(3.0 * np.sqrt(2.0 * 0.25 / 1000.0) * 100.0, rel=1e-2)
+    low, high = compared("q", Published("100", check="sampling 1000"), ours=50.0).interval
+    assert 0.0 < high - low < 2.0
 
 
 def test_columns_of_unequal_length_are_rejected(tmp_path):
@@ -345,7 +337,7 @@ def test_a_known_miss_is_shown_with_its_reason_and_is_not_a_regression(tmp_path,
 def test_a_row_that_agrees_less_than_known_is_a_regression():
     entry = {("toy", "q"): KnownMiss("Two of them are not known.", 2)}
     for met, regression in ((2, False), (3, False), (1, True)):
-        made = same("q", published="", matches=[True] * met + [False] * (4 - met), target="")
+        made = claimed("q", published="", matches=[True] * met + [False] * (4 - met), target="")
         assert (known_miss("toy", made, entry) is None) is regression
 
 
@@ -499,6 +491,12 @@ def test_the_experiments_of_the_thesis_need_nothing_else_of_the_emulator():
         (Published("2", check="more"), {"ours": 1.0}, False, "≥ 2"),
         (Published("about 2"), {"ours": 9.0}, None, ""),
         (Published("2"), {"ours": 9.0}, None, ""),
+        (
+            Published("1e-14", check="deviation 1e-14 10"),
+            {"author": 9e-13},
+            True,
+            "of two deviations of 10, 1e-12",
+        ),
     ],
 )
 def test_a_quantity_is_checked_as_its_line_says(known, values, passed, target):
@@ -510,10 +508,10 @@ def test_a_quantity_is_checked_as_its_line_says(known, values, passed, target):
 
 def test_every_published_line_has_its_place_in_the_thesis_and_a_check_that_can_be_made():
     names = set(registry.experiments())
-    with Path(tables.__file__).with_name("published.csv").open(encoding="utf-8") as stream:
-        lines = list(csv.DictReader(stream))
+    lines = tables.read_lines("published.csv")
     assert len(lines) == len(PUBLISHED)
-    assert all(line["source"].startswith(("section ", "table", "figure", "eq. ")) for line in lines)
+    for line in lines + tables.read_lines("columns.csv"):
+        assert line["source"].startswith(("section ", "table", "figure", "eq. ")), line
     for (experiment, quantity), known in PUBLISHED.items():
         assert experiment in names
         if known.check:
@@ -532,6 +530,17 @@ def test_parts_are_the_combinations_of_lists_values_and_parameters():
     assert parts_of({"trials": [{"key": "x", "word": "one"}]}) == [Part("x", {"word": "one"})]
 
 
+def test_a_line_of_a_large_table_is_checked_as_its_columns_say(tmp_path):
+    evaluation = Evaluation(Context(tmp_path, tmp_path, "toy", 1, {}, quick=False), [], {})
+    known = {"trigger_percent": 15.1, "exceeded_percent": 35.1}
+    measured = {"trigger_percent": 15.0, "exceeded_percent": {"printed": 90.0, "remark": "Far off."}}
+    evaluation.compare_line("6.7", "0.995", "table 6.7, first", known, measured)
+    near, far = evaluation.outcome().rows
+    assert (near.quantity, near.author, near.passed) == ("table 6.7, first: triggers", "15.0 %", True)
+    assert (far.printed, far.passed, far.remark) == ("90.0 %", False, "Far off.")
+    assert "two shares of 1001" in far.target
+
+
 def test_rows_of_a_column_are_reported_together_and_its_constant_is_weak(tmp_path):
     evaluation = Evaluation(Context(tmp_path, tmp_path, "toy", 1, {}, quick=False), [], {})
     for number in (1.0, 2.0):
@@ -545,7 +554,7 @@ def test_rows_of_a_column_are_reported_together_and_its_constant_is_weak(tmp_pat
 
 
 def _rate(quantity: str, published: float) -> Row:
-    return agreement(quantity, published=published, author=99.9, tolerance=(0.1, "a tenth"))
+    return compared(quantity, Published(str(published), check="0.1 a tenth"), author=99.9)
 
 
 def test_a_number_to_which_a_constant_was_fitted_is_no_agreement():
@@ -561,9 +570,7 @@ def test_a_number_to_which_a_constant_was_fitted_is_no_agreement():
 
 
 def test_a_number_without_the_authors_version_depends_on_no_choice():
-    printed = agreement(
-        "position and brightness noise", published=1.0, printed=1.0, tolerance=(0.1, "a tenth")
-    )
+    printed = compared("position and brightness noise", Published("1", check="0.1 a tenth"), printed=1.0)
     assert class_of("lsi-noise", printed) == "agrees"
 
 
