@@ -36,6 +36,7 @@ def export(
     from starhil.emulator.errors import EmulatorError
     from starhil.emulator.fmu.export import export_fmu
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starhil.hil_tests.emulator_process import installed_command
     from starid.cli.options import one_of
 
     one_of("--fmi", fmi, ("2", "3"))
@@ -46,6 +47,7 @@ def export(
         export_fmu(
             output,
             str(Path(name).absolute()) if name.endswith(".toml") else name,
+            installed_command(),
             cast("Literal['2', '3']", fmi),
         )
     except OSError as error:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import shutil
 import subprocess
-import sys
 import tempfile
 import uuid
 import zipfile
@@ -53,7 +52,7 @@ class Variable:
     key: str = ""
 
 
-def variables(profile: str) -> list[Variable]:
+def variables(profile: str, command: str) -> list[Variable]:
     """Return all variables, in the order of their value references."""
     return [
         Variable("time", 0.0, "Time of the simulation", "independent", "s"),
@@ -83,21 +82,26 @@ def variables(profile: str) -> list[Variable]:
         Variable("convention", "rotation", "Of q: rotation (rotates vectors from ICRS to the body) or attitude", "parameter"),
         Variable("order", "xyzw", "Of q: xyzw or wxyz", "parameter"),
         Variable("check_rates", start=True, about="Whether the rates are connected; they then check the convention", causality="parameter"),
-        Variable("command", _command(), "Program that starts the emulator", "parameter"),
+        Variable("command", command, "Program that starts the emulator", "parameter"),
         Variable("feed", "", "Live feed HOST:PORT of an emulator that runs already; empty: one is started", "parameter"),
         Variable("control", "", "Its control channel, unix:/PATH or HOST:PORT", "parameter"),
     ]  # fmt: skip
 
 
-def export_fmu(path: Path, profile: str, fmi: Literal["2", "3"]) -> None:
+def export_fmu(path: Path, profile: str, command: str, fmi: Literal["2", "3"]) -> None:
     """Write the FMU with its binary and its source.
+
+    Parameters
+    ----------
+    profile, command
+        Start values of the parameters: the device profile, and the program that starts the emulator.
 
     Raises
     ------
     EmulatorError
         There is no C compiler, or it fails.
     """
-    found = variables(profile)
+    found = variables(profile, command)
     token = "{" + str(uuid.uuid5(uuid.NAMESPACE_URL, repr((version("starhil"), fmi, found)))) + "}"
     source = (Path(__file__).parent / SHELL).read_text(encoding="ascii")
     header = "\n".join(_header(found, token)) + "\n"
@@ -130,12 +134,6 @@ def _compiled(source: str, header: str) -> bytes:
         if done.returncode:
             raise EmulatorError(f"fmu export: {compiler} failed: {done.stderr.strip().partition(chr(10))[0]}")
         return (Path(folder) / f"{MODEL}.so").read_bytes()
-
-
-def _command() -> str:
-    """Return the installed command `starhil` beside this Python, else the name."""
-    beside = Path(sys.executable).parent / "starhil"
-    return str(beside) if beside.exists() else "starhil"
 
 
 def _vector(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -219,14 +220,15 @@ def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, 
     control = tmp_path / "control"
     command = emulator_command(
         profile=str(fmu3.parent / "acquiring.toml"), serial="off", can="off",  settings=LOCK_STEP,
+        extra=["--control", f"unix:{control}"],
     )  # fmt: skip
-    with EmulatorProcess([*command, "--control", f"unix:{control}"]) as emulator:
+    with EmulatorProcess(command) as emulator:
         feed = emulator.ready["truth"]
         with unit_of(fmu3, tmp_path, feed=feed, control=f"unix:{control}") as unit:
             unit.begin()
             for row in tumble(2.5):
                 unit.step(row)
-            assert (unit.get("valid"), unit.get("mode")) == (True, "lost_in_space")
+            assert (unit.get("valid"), unit.get("mode")) == (True, "tracking")
             unit.slave.terminate()
         with socket.socket(socket.AF_UNIX) as channel:
             channel.connect(str(control))
@@ -298,7 +300,6 @@ def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> 
 def test_what_does_not_start_says_why(
     fmu3: Path, tmp_path: Path, parameters: dict[str, object], said: str
 ) -> None:
-    import re
 
     with unit_of(fmu3, tmp_path, **parameters) as unit:
         with pytest.raises(Exception, match="fmi3ExitInitializationMode"):
@@ -346,3 +347,18 @@ def test_the_version_2_binary_reports_to_its_callback(fmu2: Path, tmp_path: Path
         slave.exitInitializationMode()
     assert messages
     slave.freeInstance()
+
+
+def test_the_program_of_the_docs_prints_what_they_show(fmu3: Path, tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "fmu.md").read_text(encoding="utf-8")
+    program, shown = re.search(r"```python\n(.*?)```\n\n```text\n(.*?)```", page, re.DOTALL).groups()
+    shutil.copy(fmu3, tmp_path / "startracker.fmu")
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.stdout.splitlines()[-1:] == shown.splitlines(), done.stderr
