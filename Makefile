@@ -9,6 +9,7 @@
 # make coverage    all tests under measurement; fails below 95 % of lines and branches (docs/figures.md)
 # make mutation    a random SAMPLE (40) of the mutants of each module (MODULES: protocol/canopen, …); table in out/mutation
 # make years       random lives of all units on JOBS (2) processors for HOURS (8), judged by an oracle (docs/endurance.md)
+# make obc         a flight computer in QEMU reads the star tracker over its UART; report and truth log in out/obc
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow
 PYTHON ?= python3
 MINUTES ?= 15
@@ -18,10 +19,11 @@ SAMPLE ?= 40
 JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
+OBC_PACKAGES := qemu-system-arm:qemu-system-arm arm-none-eabi-gcc:"gcc-arm-none-eabi libnewlib-arm-none-eabi"
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help demo test lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos clean
+.PHONY: help demo test lint docs reproduce fuzz fuzz-guided coverage mutation soak years cosmos obc clean
 help:
 	@sed -n 's/^# make /make /p' Makefile
 
@@ -43,7 +45,7 @@ demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
 
 test: $(VENV)/.developer
-	-@tools/install_test_packages tshark:tshark chromium:chromium java:default-jre-headless
+	-@tools/install_test_packages tshark:tshark chromium:chromium java:default-jre-headless $(OBC_PACKAGES)
 	@tools/test_in_lanes $(BIN)/python
 
 lint: $(VENV)/.developer
@@ -93,6 +95,10 @@ soak: $(VENV)/.product
 
 years: $(VENV)/.product
 	$(BIN)/starhil endurance --hours $(HOURS) --jobs $(JOBS) --seed $$(date +%s)
+
+obc: $(VENV)/.product
+	@tools/install_test_packages $(OBC_PACKAGES)
+	$(BIN)/python tools/obc_in_qemu.py $(OBC)
 
 SITE := import site; print(site.getsitepackages()[0])
 cosmos: $(VENV)/.developer

@@ -19,6 +19,7 @@ COMMANDS: Final[dict[str, str]] = {
     for name in (
         "icd",
         "truth",
+        "fmu",
         "unit",
         "run",
         "replay",

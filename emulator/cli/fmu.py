@@ -1,0 +1,56 @@
+"""`starhil fmu`: the star tracker as a Functional Mock-up Unit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starid.cli.output import output_help, prepare_output
+
+group = typer.Typer(help="Export the star tracker as a Functional Mock-up Unit (FMU).", no_args_is_help=True)
+
+
+@group.callback()
+def _about() -> None:
+    """Keep `export` a sub-command, although it is the only one."""
+
+
+@group.command()
+def export(
+    profile: Annotated[
+        str | None, typer.Argument(help="Device profile: a name or a TOML file.", show_default="cubestar")
+    ] = None,
+    output: Annotated[Path, typer.Option("--output", "-o", help=output_help("The FMU."))] = Path(
+        "startracker.fmu"
+    ),
+    fmi: Annotated[str, typer.Option(help="Version of FMI: 3 or 2, which older tools read.")] = "3",
+) -> None:
+    """Export an FMU for co-simulation, with its binary (Linux x86-64) and its source; this needs a C compiler.
+
+    Where it is simulated, `starhil` must be installed: the FMU starts it.
+    """
+    from typing import Literal, cast
+
+    from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.fmu.export import export_fmu
+    from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starhil.hil_tests.emulator_process import installed_command
+    from starid.cli.options import one_of
+
+    one_of("--fmi", fmi, ("2", "3"))
+    name = profile or DEFAULT_PROFILE
+    load_profile(name)
+    prepare_output(output, "-o")
+    try:
+        export_fmu(
+            output,
+            str(Path(name).absolute()) if name.endswith(".toml") else name,
+            installed_command(),
+            cast("Literal['2', '3']", fmi),
+        )
+    except OSError as error:
+        raise EmulatorError(
+            f"{output}: cannot be written ({error.strerror}); choose another file with -o"
+        ) from None

@@ -1,0 +1,364 @@
+"""The exported FMU in FMPy: its description, a tumble, repetition, and what ends first."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from tests.emulator.cli.command_line import run_command_line
+
+pytestmark = pytest.mark.process
+
+if shutil.which("cc") is None:
+    pytest.skip("no C compiler (cc) here", allow_module_level=True)
+fmpy = pytest.importorskip("fmpy", reason="the package fmpy is not installed")
+from fmpy.fmi2 import FMU2Slave  # noqa: E402
+from fmpy.fmi3 import FMU3Slave  # noqa: E402
+from fmpy.validation import validate_fmu  # noqa: E402
+
+STEP_S = 0.1
+LOCK_STEP = [
+    *("truth.kind=live", "truth.protocol=tcp", "truth.port=0", "truth.lockstep=true", "run.clock=stepped"),
+]
+CHI2_3_SIGMA = 14.16
+"""99.73 % of χ² with three degrees of freedom."""
+ARCSEC_PER_RAD = 206_264.8
+
+
+@pytest.fixture(scope="module")
+def fmu2(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export("2", tmp_path_factory.mktemp("fmu2"))
+
+
+def export(fmi: str, folder: Path) -> Path:
+    profile = folder / "acquiring.toml"
+    profile.write_text('extends = "ideal"\n[parameters]\nstart_mode = "lost_in_space"\n')
+    target = folder / f"fmi{fmi}.fmu"
+    done = run_command_line("fmu", "export", str(profile), "--fmi", fmi, "-o", str(target))
+    assert done == (0, "", "")
+    return target
+
+
+@pytest.fixture(scope="module")
+def fmu3(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return export("3", tmp_path_factory.mktemp("fmu3"))
+
+
+def tumble(seconds: float) -> np.ndarray:
+    """A torque-free asymmetric body: time, quaternion ICRS→body that rotates vectors, rate in degrees per second."""
+    inertia, rate = np.array([0.05, 0.14, 0.10]), np.radians([0.2, -0.1, 0.2])
+    to_icrs, fine, rows = Rotation.identity(), STEP_S / 20, []
+    for t in np.arange(0.0, seconds + STEP_S / 2, STEP_S):
+        rows.append((t, *to_icrs.inv().as_quat(), *np.degrees(rate)))
+        for _ in range(20):
+            middle = rate - 0.5 * fine * np.cross(rate, inertia * rate) / inertia
+            to_icrs *= Rotation.from_rotvec(middle * fine)
+            rate = rate - fine * np.cross(middle, inertia * middle) / inertia
+    names = ["time", *(f"q_{i}" for i in range(1, 5)), *(f"rate_{axis}" for axis in "xyz")]
+    return np.array(rows, dtype=[(name, float) for name in names])
+
+
+OUTPUTS = [
+    *(f"measured_q{axis}" for axis in "xyzw"),
+    *(f"measured_w{axis}_deg_s" for axis in "xyz"),
+    *("valid", "frame", "exposure_s", "sigma_cross", "sigma_roll", "stars_matched"),
+]
+
+
+def simulate(path: Path, inputs: np.ndarray) -> np.ndarray:
+    return fmpy.simulate_fmu(
+        str(path), stop_time=float(inputs["time"][-1]), step_size=STEP_S, output_interval=STEP_S, input=inputs, output=OUTPUTS,
+        start_values={"serial": "off", "can": "off"},
+    )  # fmt: skip
+
+
+def test_the_descriptions_pass_the_schema_of_the_standard_and_the_rules_of_fmpy(
+    fmu2: Path, fmu3: Path
+) -> None:
+    assert validate_fmu(str(fmu2)) == validate_fmu(str(fmu3)) == []
+
+
+def test_the_errors_in_a_tumble_are_within_3_sigma_and_repeat_to_the_byte(fmu2: Path, fmu3: Path) -> None:
+    inputs = tumble(15.0)
+    first, again, of_version_2 = (simulate(path, inputs) for path in (fmu3, fmu3, fmu2))
+    assert first.tobytes() == again.tobytes() == of_version_2.tobytes()
+    _, newest = np.unique(first["frame"], return_index=True)
+    rows = first[newest]
+    rows = rows[rows["valid"].astype(bool)]
+    assert len(rows) >= 13
+    true = Slerp(inputs["time"], Rotation.from_quat(np.array([inputs[f"q_{i}"] for i in range(1, 5)]).T))(
+        rows["exposure_s"]
+    )
+    measured = Rotation.from_quat(np.array([rows[f"measured_q{axis}"] for axis in "xyzw"]).T)
+    errors = (measured * true.inv()).as_rotvec() * ARCSEC_PER_RAD
+    sigma = np.array([rows["sigma_cross"], rows["sigma_cross"], rows["sigma_roll"]]).T
+    assert (np.sum((errors / sigma) ** 2, axis=1) < CHI2_3_SIGMA).all()
+    assert np.median(np.linalg.norm(errors, axis=1)) > 0.05  # a copy of the truth would have no errors
+    assert rows["stars_matched"].min() > 5
+
+
+# --- one step at a time ---
+
+
+class Unit:
+    """An instance of the FMU of version 3, with what it logs."""
+
+    def __init__(self, path: Path, folder: Path, **parameters: object) -> None:
+        description = fmpy.read_model_description(str(path))
+        self.references = {each.name: each.valueReference for each in description.modelVariables}
+        self.types = {each.name: each.type for each in description.modelVariables}
+        self.messages: list[str] = []
+        unpacked = fmpy.extract(str(path), unzipdir=str(folder / "fmu"))
+        self.slave = FMU3Slave(
+            guid=description.guid,
+            unzipDirectory=unpacked,
+            modelIdentifier=description.coSimulation.modelIdentifier,
+            instanceName="unit",
+        )
+        self.slave.instantiate(loggingOn=True, logMessage=self._log)
+        self.time = 0.0
+        for name, value in {"serial": "off", "can": "off", **parameters}.items():
+            self.set(name, value)
+
+    def _log(self, _environment: object, _status: int, _category: bytes, message: bytes) -> None:
+        self.messages.append(message.decode())
+
+    def begin(self) -> None:
+        self.slave.enterInitializationMode()
+        self.slave.exitInitializationMode()
+
+    def set(self, name: str, value: object) -> None:
+        getattr(self.slave, f"set{self.types[name]}")([self.references[name]], [value])
+
+    def get(self, name: str) -> object:
+        (value,) = getattr(self.slave, f"get{self.types[name]}")([self.references[name]])
+        return value.decode() if isinstance(value, bytes) else value
+
+    def step(self, row: np.void) -> None:
+        for name in row.dtype.names[1:]:
+            self.set(name, row[name])
+        self.slave.doStep(self.time, STEP_S)
+        self.time += STEP_S
+
+
+@contextmanager
+def unit_of(path: Path, folder: Path, **parameters: object) -> Iterator[Unit]:
+    unit = Unit(path, folder, **parameters)
+    try:
+        yield unit
+    finally:
+        unit.slave.freeInstance()
+
+
+def gone(path: Path, within_s: float = 20.0) -> bool:
+    """Whether a file vanishes in time, here the symbolic link of an emulator that ends."""
+    end = time.monotonic() + within_s
+    while path.is_symlink() and time.monotonic() < end:
+        time.sleep(0.05)
+    return not path.is_symlink()
+
+
+def replies(step: Callable[[np.void], object], port: str) -> list[dict[str, object]]:
+    """What an OBC reads on the serial line while a simulator steps."""
+    with ObcClient.open(serial=port, timeout_s=5.0) as obc:
+        found = []
+        for number, row in enumerate(tumble(6.0)):
+            step(row)
+            if number % 5 == 4:
+                found.append(obc.telemetry("precise_attitude") | obc.telemetry("device_status"))
+    return found
+
+
+def test_an_obc_reads_the_same_as_beside_a_simulator_that_speaks_to_the_feed(
+    fmu3: Path, tmp_path: Path
+) -> None:
+    link = tmp_path / "port"
+    with unit_of(fmu3, tmp_path, serial="auto", symlink=str(link)) as unit:
+        unit.begin()
+        assert unit.get("ready").startswith("ready truth=tcp:")
+        by_fmu = replies(unit.step, str(link))
+        unit.slave.terminate()
+        assert gone(link)
+    command = emulator_command(
+        profile=str(fmu3.parent / "acquiring.toml"),
+        serial="auto",
+        can="off",
+        seed=1,
+        settings=LOCK_STEP,
+    )
+    with EmulatorProcess(command) as emulator:
+        host, port = emulator.ready["truth"].removeprefix("tcp:").split(":")
+        with socket.create_connection((host, int(port))) as feed, feed.makefile("rw") as lines:
+
+            def step(row: np.void) -> None:
+                values = [float(row[name]) for name in row.dtype.names]
+                lines.write(json.dumps({"t": values[0], "q": values[1:5], "rate": values[5:]}) + "\n")
+                lines.flush()
+                assert json.loads(lines.readline())["ok"]
+
+            assert replies(step, emulator.ready["serial"]) == by_fmu
+    assert by_fmu[-1]["valid"]
+
+
+def test_it_connects_to_an_emulator_that_runs_and_leaves_it_running(fmu3: Path, tmp_path: Path) -> None:
+    control = tmp_path / "control"
+    command = emulator_command(
+        profile=str(fmu3.parent / "acquiring.toml"), serial="off", can="off",  settings=LOCK_STEP,
+        extra=["--control", f"unix:{control}"],
+    )  # fmt: skip
+    with EmulatorProcess(command) as emulator:
+        feed = emulator.ready["truth"]
+        with unit_of(fmu3, tmp_path, feed=feed, control=f"unix:{control}") as unit:
+            unit.begin()
+            for row in tumble(2.5):
+                unit.step(row)
+            assert (unit.get("valid"), unit.get("mode")) == (True, "tracking")
+            unit.slave.terminate()
+        with socket.socket(socket.AF_UNIX) as channel:
+            channel.connect(str(control))
+            channel.sendall(b'{"do": "status"}\n')
+            assert json.loads(channel.recv(4096))["ok"]
+
+
+def test_reset_begins_again_with_the_same_outputs(fmu3: Path, tmp_path: Path) -> None:
+    seen = []
+    with unit_of(fmu3, tmp_path) as unit:
+        for _ in range(2):
+            unit.begin()
+            unit.time = 0.0
+            for row in tumble(2.5):
+                unit.step(row)
+            seen.append([unit.get(name) for name in OUTPUTS])
+            unit.slave.reset()
+            assert unit.get("frame") == 0
+            unit.set("serial", "off")
+    assert seen[0] == seen[1]
+    assert seen[0][OUTPUTS.index("valid")]
+
+
+def test_an_emulator_that_dies_ends_the_step_with_a_message(fmu3: Path, tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    with unit_of(fmu3, tmp_path, serial="auto", symlink=str(link)) as unit:
+        unit.begin()
+        rows = tumble(1.0)
+        unit.step(rows[0])
+        children = Path(f"/proc/{os.getpid()}/task/{os.getpid()}/children").read_text().split()
+        shells = [pid for pid in children if "truth.lockstep" in Path(f"/proc/{pid}/cmdline").read_text()]
+        (emulator,) = Path(f"/proc/{shells[0]}/task/{shells[0]}/children").read_text().split()
+        os.kill(int(emulator), signal.SIGKILL)
+        with pytest.raises(Exception, match="fmi3DoStep"):
+            unit.step(rows[1])
+        assert any(message.startswith("the emulator has ended") for message in unit.messages)
+        with pytest.raises(Exception, match="fmi3DoStep"):  # and so does the next
+            unit.step(rows[2])
+
+
+def test_the_emulator_ends_with_a_host_that_dies(fmu3: Path, tmp_path: Path) -> None:
+    link = tmp_path / "port"
+    program = (
+        "import os, signal, sys\nfrom pathlib import Path\n"
+        f"from tests.process.test_fmu import Unit, tumble\n"
+        f"unit = Unit(Path({str(fmu3)!r}), Path({str(tmp_path)!r}), serial='auto', symlink={str(link)!r})\n"
+        f"unit.begin()\nunit.step(tumble(0.1)[0])\nassert Path({str(link)!r}).is_symlink()\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=root, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    assert gone(link)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"command": "/does/not/exist"}, "/does/not/exist does not start: .*not found"),
+        ({"profile": "no_such_profile"}, "does not start: .*no_such_profile"),
+        (
+            {"feed": "127.0.0.1:1", "control": "unix:/none"},
+            "no emulator at 127.0.0.1:1 and unix:/none: Connection refused",
+        ),
+    ],
+)
+def test_what_does_not_start_says_why(
+    fmu3: Path, tmp_path: Path, parameters: dict[str, object], said: str
+) -> None:
+
+    with unit_of(fmu3, tmp_path, **parameters) as unit:
+        with pytest.raises(Exception, match="fmi3ExitInitializationMode"):
+            unit.begin()
+        assert re.search(said, unit.messages[-1])
+
+
+def test_a_quaternion_in_the_wrong_sense_ends_the_step_with_the_reason(fmu3: Path, tmp_path: Path) -> None:
+    with unit_of(fmu3, tmp_path, convention="attitude") as unit:
+        unit.begin()
+        rows = tumble(1.0)
+        with pytest.raises(Exception, match="fmi3DoStep"):
+            list(map(unit.step, rows))
+        assert "rate contradicts q" in unit.messages[-1]
+        assert "truth.convention" in unit.messages[-1]
+
+
+def test_without_a_compiler_the_export_says_what_is_missing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("starhil.emulator.fmu.export.shutil.which", lambda _name: None)
+    status, _, said = run_command_line("fmu", "export", "-o", str(tmp_path / "x.fmu"))
+    assert status == 2
+    assert said.splitlines() == [
+        "starhil: fmu export: needs a C compiler (cc, gcc or clang); as root on Debian: apt-get install gcc libc6-dev"
+    ]
+
+
+def test_the_version_2_binary_reports_to_its_callback(fmu2: Path, tmp_path: Path) -> None:
+    description = fmpy.read_model_description(str(fmu2))
+    references = {each.name: each.valueReference for each in description.modelVariables}
+    slave = FMU2Slave(
+        guid=description.guid, unzipDirectory=fmpy.extract(str(fmu2), unzipdir=str(tmp_path / "fmu")),
+        modelIdentifier=description.coSimulation.modelIdentifier, instanceName="unit",
+    )  # fmt: skip
+    messages = []
+    callbacks = fmpy.fmi2.fmi2CallbackFunctions()
+    callbacks.logger = fmpy.fmi2.fmi2CallbackLoggerTYPE(lambda *arguments: messages.append(arguments))
+    callbacks.allocateMemory = fmpy.fmi2.fmi2CallbackAllocateMemoryTYPE(fmpy.calloc)
+    callbacks.freeMemory = fmpy.fmi2.fmi2CallbackFreeMemoryTYPE(fmpy.free)
+    slave.instantiate(callbacks=callbacks, loggingOn=True)
+    slave.setString([references["command"]], ["/does/not/exist"])
+    slave.enterInitializationMode()
+    with pytest.raises(Exception, match="fmi2ExitInitializationMode"):
+        slave.exitInitializationMode()
+    assert messages
+    slave.freeInstance()
+
+
+def test_the_program_of_the_docs_prints_what_they_show(fmu3: Path, tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "fmu.md").read_text(encoding="utf-8")
+    program, shown = re.search(r"```python\n(.*?)```\n\n```text\n(.*?)```", page, re.DOTALL).groups()
+    shutil.copy(fmu3, tmp_path / "startracker.fmu")
+    done = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.stdout.splitlines()[-1:] == shown.splitlines(), done.stderr

@@ -1,0 +1,55 @@
+"""A flight computer in QEMU reads the star tracker over its UART: tools/obc, run by tools/obc_in_qemu.py."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.process
+
+TOOLS = Path(__file__).parents[2] / "tools"
+sys.path.insert(0, str(TOOLS))
+import obc_in_qemu  # noqa: E402
+
+MISSING = [package for program, package in obc_in_qemu.PACKAGES.items() if shutil.which(program) is None]
+if MISSING:
+    pytest.skip(f"Debian packages missing: {' '.join(MISSING)}", allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    try:
+        return obc_in_qemu.build(tmp_path_factory.mktemp("obc"))
+    except subprocess.CalledProcessError:
+        if shutil.which(obc_in_qemu.COMPILER) and not Path(libc()).is_absolute():
+            pytest.skip("Debian package missing: libnewlib-arm-none-eabi")
+        raise
+
+
+def libc() -> str:
+    """Return the path of newlib, or only its name if it is not installed."""
+    command = [obc_in_qemu.COMPILER, "-print-file-name=libc.a"]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.mark.parametrize("link", ["pty", "theirs"])
+def test_the_flight_computer_reads_valid_attitudes_that_agree_with_the_truth(
+    program: Path, tmp_path: Path, link: str
+) -> None:
+    status, report, _ = obc_in_qemu.run(program, link, "real", tmp_path)
+    assert status == 0, report
+    assert len(re.findall(r"^frame ", report, re.MULTILINE)) == 25
+    assert "valid 25 wrong 0 " in report
+    assert obc_in_qemu.largest_error_arcsec(report, tmp_path / "truth.csv") < obc_in_qemu.AGREES_ARCSEC
+
+
+def test_a_flight_computer_without_a_star_tracker_ends_with_status_1(program: Path, tmp_path: Path) -> None:
+    machine = obc_in_qemu.start_machine(program, "null", ("-icount", "shift=10,sleep=off"))
+    status, report, _ = obc_in_qemu.end(machine)
+    assert status == 1
+    assert "valid 0 wrong 0 " in report

@@ -1,0 +1,204 @@
+/* A flight computer of 200 lines for the board MPS2 with a Cortex-M3 (QEMU: -machine mps2-an385), without an operating system.
+ *
+ * UART 0 is connected to the star tracker, UART 1 to the ground. The program sets the star tracker's clock, lets it find the
+ * attitude, reads it five times per second, and checks length and progress. It reports each reading, and ends the machine: with
+ * status 0 after 25 readings that are valid, with 1 if something was wrong. The codec is `starhil icd export c`.
+ */
+#include "cubestar_like.h"
+
+#define CYCLE_MS 200u   /* five readings per second */
+#define DEADLINE_MS 50u /* a later reply is late */
+#define SILENCE_MS 1000u /* after which a reply is missing */
+#define LIMIT_MS 120000u
+#define WANTED 25u
+#define UNIX_S 1774008000u /* 2026-03-20T12:00:00Z */
+#define CLOCK_HZ 25000000u
+
+/* --- the board --- */
+
+typedef struct {
+    volatile uint32_t data, state, control, interrupts, divider;
+} uart_t;
+#define TRACKER ((uart_t *)0x40004000u)
+#define GROUND ((uart_t *)0x40005000u)
+#define TX_FULL 1u
+#define RX_FULL 2u
+static volatile uint32_t *const systick = (volatile uint32_t *)0xE000E010u; /* control, reload, value */
+
+static volatile uint32_t now_ms;
+int main(void);
+
+static void tick(void) { ++now_ms; }
+
+static void leave(int failed) /* semihosting: SYS_EXIT, with ADP_Stopped_ApplicationExit or an error */
+{
+    register uint32_t operation __asm__("r0") = 0x18u;
+    register uint32_t reason __asm__("r1") = failed ? 0x20023u : 0x20026u;
+    __asm__ volatile("bkpt 0xab" : : "r"(operation), "r"(reason) : "memory");
+    for (;;) {
+    }
+}
+
+static void fault(void) { leave(1); }
+
+void reset(void)
+{
+    extern uint32_t bss_begin, bss_end;
+    for (uint32_t *word = &bss_begin; word < &bss_end; ++word) {
+        *word = 0u;
+    }
+    TRACKER->divider = GROUND->divider = CLOCK_HZ / 115200u;
+    TRACKER->control = GROUND->control = 3u; /* send and receive */
+    systick[1] = CLOCK_HZ / 1000u - 1u;
+    systick[2] = 0u;
+    systick[0] = 7u; /* core clock, interrupt, on */
+    leave(main());
+}
+
+extern uint32_t stack_top;
+__attribute__((section(".vectors"), used)) static void (*const vectors[16])(void) = {
+    (void (*)(void))(&stack_top), reset, fault, fault, fault, fault, fault, 0, 0, 0, 0, fault, fault, 0, fault, tick};
+
+static void send(uart_t *uart, const uint8_t *bytes, size_t size)
+{
+    for (size_t i = 0u; i < size; ++i) {
+        while ((uart->state & TX_FULL) != 0u) {
+        }
+        uart->data = bytes[i];
+    }
+}
+
+/* --- reports to the ground --- */
+
+static void say(const char *text)
+{
+    for (; *text != '\0'; ++text) {
+        send(GROUND, (const uint8_t *)text, 1u);
+    }
+}
+
+static void say_number(const char *name, int32_t number)
+{
+    char digits[12], *begin = &digits[11];
+    uint32_t rest = number < 0 ? 0u - (uint32_t)number : (uint32_t)number;
+    *begin = '\0';
+    do {
+        *--begin = (char)('0' + rest % 10u);
+        rest /= 10u;
+    } while (rest > 0u);
+    say(name);
+    say(number < 0 ? "-" : "");
+    say(begin);
+}
+
+/* --- the star tracker --- */
+
+static cubestar_like_receiver_t link;
+static uint32_t late, missing, slowest_ms;
+
+/* Send a request and wait for its reply; returns the kind of the message, or CUBESTAR_LIKE_NONE after a silence. */
+static int ask(uint8_t id, const uint8_t *data, size_t size, cubestar_like_message_t *message)
+{
+    uint8_t frame[CUBESTAR_LIKE_REQUEST_CAPACITY(CUBESTAR_LIKE_TC_SET_UNIX_TIME_SIZE)];
+    const size_t length = cubestar_like_frame_request(id, data, size, frame, sizeof frame);
+    const uint32_t begin_ms = now_ms;
+    (void)cubestar_like_give_up(&link);
+    cubestar_like_expect(&link, id);
+    send(TRACKER, frame, length);
+    while (now_ms - begin_ms < SILENCE_MS) {
+        if ((TRACKER->state & RX_FULL) != 0u) {
+            const int kind = (int)cubestar_like_receive(&link, (uint8_t)TRACKER->data, message);
+            if (kind != CUBESTAR_LIKE_NONE) {
+                const uint32_t took_ms = now_ms - begin_ms;
+                late += took_ms > DEADLINE_MS ? 1u : 0u;
+                slowest_ms = took_ms > slowest_ms ? took_ms : slowest_ms;
+                return kind;
+            }
+        }
+    }
+    ++missing;
+    return CUBESTAR_LIKE_NONE;
+}
+
+/* Discard what arrives until the line is quiet: replies to requests from before the star tracker had booted. */
+static void drain(void)
+{
+    for (uint32_t begin_ms = now_ms; now_ms - begin_ms < CYCLE_MS;) {
+        if ((TRACKER->state & RX_FULL) != 0u) {
+            (void)TRACKER->data;
+            begin_ms = now_ms;
+        }
+    }
+}
+
+static bool command(uint8_t id, const uint8_t *data, size_t size)
+{
+    cubestar_like_message_t message;
+    return ask(id, data, size, &message) == CUBESTAR_LIKE_ACK;
+}
+
+static bool set_time(uint32_t unix_s)
+{
+    cubestar_like_tc_set_unix_time_t values = CUBESTAR_LIKE_TC_SET_UNIX_TIME_INIT;
+    uint8_t data[CUBESTAR_LIKE_TC_SET_UNIX_TIME_SIZE];
+    values.seconds = unix_s;
+    return cubestar_like_tc_set_unix_time_encode(&values, data) == CUBESTAR_LIKE_OK
+        && command(CUBESTAR_LIKE_TC_SET_UNIX_TIME_ID, data, sizeof data);
+}
+
+static bool find_attitude(void)
+{
+    cubestar_like_tc_set_mode_t values = CUBESTAR_LIKE_TC_SET_MODE_INIT;
+    uint8_t data[CUBESTAR_LIKE_TC_SET_MODE_SIZE];
+    values.mode = CUBESTAR_LIKE_COMMANDED_MODE_LOST_IN_SPACE;
+    return cubestar_like_tc_set_mode_encode(&values, data) == CUBESTAR_LIKE_OK
+        && command(CUBESTAR_LIKE_TC_SET_MODE_ID, data, sizeof data);
+}
+
+static bool read_attitude(cubestar_like_tlm_precise_attitude_t *attitude)
+{
+    cubestar_like_message_t message;
+    return ask(CUBESTAR_LIKE_TLM_PRECISE_ATTITUDE_ID, NULL, 0u, &message) == CUBESTAR_LIKE_TELEMETRY
+        && cubestar_like_tlm_precise_attitude_decode(message.data, message.size, attitude) == CUBESTAR_LIKE_OK;
+}
+
+int main(void)
+{
+    cubestar_like_tlm_precise_attitude_t attitude;
+    uint32_t valid = 0u, wrong = 0u, due_ms = 0u, frame = 0u;
+    cubestar_like_receiver_init(&link, CUBESTAR_LIKE_DIALECT_B);
+    say("boot\n");
+    while (!(set_time(UNIX_S) && find_attitude()) && now_ms < LIMIT_MS) { /* the star tracker may boot later */
+        drain();
+    }
+    say("finding the attitude\n");
+    late = missing = slowest_ms = 0u;
+    while (valid < WANTED && now_ms < LIMIT_MS) {
+        while ((int32_t)(now_ms - due_ms) < 0) {
+            __asm__ volatile("wfi"); /* until the next tick */
+        }
+        due_ms = now_ms + CYCLE_MS;
+        if (!read_attitude(&attitude) || !attitude.valid) {
+            continue;
+        }
+        const float length2 = attitude.q_x * attitude.q_x + attitude.q_y * attitude.q_y + attitude.q_z * attitude.q_z
+                            + attitude.q_w * attitude.q_w;
+        wrong += length2 < 0.9999f || length2 > 1.0001f || attitude.frame_counter < frame ? 1u : 0u;
+        frame = (uint32_t)attitude.frame_counter;
+        ++valid;
+        say_number("frame ", (int32_t)frame);
+        say_number(" q ", (int32_t)(1e6f * attitude.q_x));
+        say_number(" ", (int32_t)(1e6f * attitude.q_y));
+        say_number(" ", (int32_t)(1e6f * attitude.q_z));
+        say_number(" ", (int32_t)(1e6f * attitude.q_w));
+        say("\n");
+    }
+    say_number("valid ", (int32_t)valid);
+    say_number(" wrong ", (int32_t)wrong);
+    say_number(" late ", (int32_t)late);
+    say_number(" missing ", (int32_t)missing);
+    say_number(" slowest_ms ", (int32_t)slowest_ms);
+    say_number(" elapsed_ms ", (int32_t)now_ms);
+    say("\n");
+    return valid == WANTED && wrong == 0u ? 0 : 1;
+}
