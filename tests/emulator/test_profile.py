@@ -239,7 +239,9 @@ def test_an_impossible_parameter_is_named_with_its_option(override, why):
     with pytest.raises(EmulatorError) as caught:
         Parameters(load_unit(), profile_defaults(profile, load_unit()), lambda _changes: None)
     assert f"{profile.source_of(caught.value)}: {caught.value}".startswith(f"--set {override}: {why}")
-    with pytest.raises(EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"):
+    with pytest.raises(
+        EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"
+    ):
         load_profile("cubestar", ["parameters.serial_baud=5"])
 
 
