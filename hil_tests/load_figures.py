@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+
+
+def percentile(values: Sequence[float], part: float) -> float:
+    """Return a percentile of values by the nearest rank, NaN without values; `part` is 0 to 1."""
+    if not values:
+        return math.nan
+    ordered = sorted(values)
+    return ordered[min(len(ordered) - 1, max(0, math.ceil(part * len(ordered)) - 1))]
 
 
 @dataclass(frozen=True)
@@ -17,12 +26,7 @@ class Spread:
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Spread:
         """Summarise durations in seconds; NaN if there are none."""
-        if not seconds:
-            return cls(float("nan"), float("nan"), float("nan"))
-        ordered = sorted(1e3 * value for value in seconds)
-        ranks = (min(int(share * len(ordered)), len(ordered) - 1) for share in (0.5, 0.99))
-        p50, p99 = (ordered[rank] for rank in ranks)
-        return cls(round(p50, 3), round(p99, 3), round(ordered[-1], 3))
+        return cls(*(round(1e3 * percentile(seconds, part), 3) for part in (0.5, 0.99, 1.0)))
 
 
 @dataclass(frozen=True)

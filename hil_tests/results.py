@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -211,11 +210,3 @@ def junit_cases(result: SessionResult, suite: str) -> list[TestCase]:
         )
         for item in result.results
     ]
-
-
-def percentile(values: Sequence[float], part: float) -> float:
-    """Return a percentile of values by the nearest rank, NaN without values; `part` is 0 to 1."""
-    if not values:
-        return math.nan
-    ordered = sorted(values)
-    return ordered[min(len(ordered) - 1, max(0, math.ceil(part * len(ordered)) - 1))]

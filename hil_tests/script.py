@@ -523,11 +523,20 @@ TABLES: Final[Mapping[str, type[Keys]]] = {
 def _checked(
     model: type[Table], table: dict[str, Any], location: str, context: dict[str, Any] | None = None
 ) -> tuple[Table | None, list[str]]:
-    """Validate a table; return the result, or the problems."""
+    """Validate a table; return the result, or the problems: unknown keys, and those of the others without them."""
     try:
         return model.model_validate(table, context=context), []
     except ValidationError as error:
-        return None, [text for item in error.errors() for text in _texts_of(item, location, model)]
+        found = error.errors()
+    unknown = {
+        item["loc"][0] for item in found if item["type"] == "extra_forbidden" and len(item["loc"]) == 1
+    }
+    if unknown and len(unknown) == len(found):
+        try:
+            model.model_validate({key: table[key] for key in table if key not in unknown}, context=context)
+        except ValidationError as error:
+            found += error.errors()
+    return None, [text for item in found for text in _texts_of(item, location, model)]
 
 
 def _texts_of(error: ErrorDetails, location: str, model: type[Keys]) -> Iterator[str]:

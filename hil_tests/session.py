@@ -15,6 +15,7 @@ from starhil.hil_tests.errors import BenchError, NackError
 from starhil.hil_tests.expect import resolve, show, show_angle
 from starhil.hil_tests.images import write_png
 from starhil.hil_tests.interruption import Interrupted
+from starhil.hil_tests.load_figures import percentile
 from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
 from starhil.hil_tests.results import (
     FAILED,
@@ -22,7 +23,6 @@ from starhil.hil_tests.results import (
     SKIPPED,
     SessionResult,
     StepResult,
-    percentile,
     summarize,
 )
 from starhil.hil_tests.script import (

@@ -63,6 +63,7 @@ def command(
     the exit status is 128 plus the signal's number.
     """
     from starhil.hil_tests.bench import LinkOptions
+    from starhil.hil_tests.errors import ScriptError
     from starhil.hil_tests.interruption import interruptible
     from starhil.hil_tests.session_run import SessionRequest, run_session
 
@@ -87,8 +88,14 @@ def command(
         quiet=as_json,
         view=view,
     )
-    with interruptible():
-        result = run_session(request)
+    try:
+        with interruptible():
+            result = run_session(request)
+    except ScriptError as error:  # one line for each error of the script
+        *others, last = str(error).splitlines()
+        for line in others:
+            print(f"starhil: {line}", file=sys.stderr)
+        raise ScriptError(last) from None
     if as_json:
         json.dump(result.to_json(), sys.stdout)
         print()

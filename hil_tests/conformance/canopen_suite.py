@@ -12,7 +12,6 @@ from starhil.hil_tests.conformance import (
     canopen_pdo,
     canopen_sdo,
     canopen_store_lss,
-    canopen_sync_time,
 )
 from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
 from starhil.hil_tests.conformance.canopen_unit import canopen_unit_cases
@@ -21,7 +20,7 @@ from starhil.hil_tests.judge.definition import Unit
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = tuple(
     cases_of(
-        canopen_eds, canopen_nmt, canopen_sdo, canopen_od, canopen_sync_time, canopen_emcy, canopen_pdo, canopen_store_lss
+        canopen_eds, canopen_nmt, canopen_sdo, canopen_od, canopen_emcy, canopen_pdo, canopen_store_lss
     )
 )  # fmt: skip
 """Cases of CiA 301, for any unit."""

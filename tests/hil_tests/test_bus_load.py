@@ -173,7 +173,7 @@ def test_a_device_without_unsolicited_telemetry_is_reported() -> None:
     asyncio.run(main())
 
 
-def test_spreads_are_quantiles_of_the_values() -> None:
+def test_spreads_are_nearest_ranks_of_the_values() -> None:
     spread = Spread.of([value / 1000 for value in range(100, 0, -1)])
-    assert (spread.p50_ms, spread.p99_ms, spread.max_ms) == (51.0, 100.0, 100.0)
+    assert (spread.p50_ms, spread.p99_ms, spread.max_ms) == (50.0, 99.0, 100.0)
     assert Spread.of([]).max_ms != Spread.of([]).max_ms

@@ -12,8 +12,9 @@ import pytest
 from starhil.hil_tests.attitude import attitude_error, from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.images import decode_bmp, write_png
+from starhil.hil_tests.load_figures import percentile
 from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
-from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, percentile, write_junit
+from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog
 from starhil.protocol.can_framing import CanFrame

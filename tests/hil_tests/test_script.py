@@ -211,8 +211,8 @@ def test_every_error_of_a_script_is_reported_with_its_place(load):
             "[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }"
         )
     lines = str(caught.value).splitlines()
-    assert [line.split(": ")[1] for line in lines] == ["defaults", "step 1", "step 2", "step 3"]
-    for line, word in zip(lines, ("timeout_s", "quaternion", "within_s", "tracking"), strict=True):
+    assert [line.split(": ")[1] for line in lines] == ["defaults", "step 1", "step 2", "step 2", "step 3"]
+    for line, word in zip(lines, ("timeout_s", "quaternion", "within_s", "rate_x", "tracking"), strict=True):
         assert word in line
 
 

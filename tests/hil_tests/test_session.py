@@ -436,6 +436,17 @@ def test_the_command_prints_json_alone_and_exits_1_when_a_step_fails(device, tmp
     assert (data["passed"], data["failed"], data["results"][0]["values"]["rate_x"]) == (False, 1, 0.0)
 
 
+def test_the_command_prints_a_line_for_each_error_of_a_script(tmp_path):
+    script = tmp_path / "s.toml"
+    script.write_text(
+        "[[step]]\nread = 'ratse'\n[[step]]\nraed = 'rates'\n[[step]]\nread = 'rates'\nxpect = 1\n"
+    )
+    outcome = run_command(script, "--start")
+    assert isinstance(outcome.exception, BenchError)
+    lines = [*outcome.stderr.splitlines(), f"starhil: {outcome.exception}"]
+    assert [line.split(": ")[:3] for line in lines] == [["starhil", "s.toml", f"step {n}"] for n in (1, 2, 3)]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -27,6 +27,13 @@ def test_our_slave_passes(simulated_probe, case):
     assert (outcome.status, outcome.expected, outcome.seen) == ("passed", "", ""), "\n".join(outcome.log)
 
 
+def test_a_value_of_a_wrong_size_fails_its_case_and_does_not_end_the_run(simulated_probe):
+    probe = simulated_probe()
+    probe.try_read = lambda *_entry: b"\x01\x02\x03"
+    defaults = next(case for case in CANOPEN_CASES if case.id == "canopen.od.defaults")
+    assert run_case(probe, defaults).status == "failed"
+
+
 def test_consecutive_cases_are_independent(simulated_probe):
     probe = simulated_probe()
     failed = [
