@@ -93,7 +93,7 @@ class LsiOptions:
         Keep the database and the index in the cache folder.
     divided
         If the whole field has no answer, search nine circles of half its width (section 7.2 of the thesis): for a field
-        that a body covers in part. Needs a second database, which is kept in the cache folder.
+        that a body covers in part. Needs a second database; every search then tries at most 3000 neighbours.
     solver
         Solver of nearest neighbour and LASSO: "exact", "matlab" or "sklearn" (see `LostInSpace`).
     """

@@ -144,6 +144,12 @@ def value_text(value: Any, unit: str, digits: int) -> str:
     return f"{value:.{digits}f}{space_before(unit)}{unit}"
 
 
+def markdown_table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """Format a table in Markdown, all columns but the first aligned to the right."""
+    text = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
+    return "\n".join(text + ["| " + " | ".join(line) + " |" for line in lines])
+
+
 _ROUNDING_ERROR: Final = 1e-12
 """A published deviation below this is a rounding error."""
 

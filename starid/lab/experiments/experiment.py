@@ -162,9 +162,11 @@ class Evaluation:
         self.note: dict[str, Any] = {}
         """Values for the fields in the notes."""
         self._columns: dict[int, str] = {}
+        self._used: set[str] = set()
 
     def published(self, quantity: str) -> list[float]:
         """Return the published numbers of a quantity of this experiment; none if the thesis has none."""
+        self._used.add(quantity)
         return published(self.context.name, quantity)
 
     def compare(
@@ -188,6 +190,7 @@ class Evaluation:
         Rows of one `column` of a table are reported together, and those that a constant meets are marked. The others
         are the arguments of `compared`.
         """
+        self._used.add(quantity)
         line = PUBLISHED.get((self.context.name, quantity))
         if line is None:
             line = Published("" if text is None else str(text), unit, digits, check)
@@ -232,7 +235,20 @@ class Evaluation:
         self.files.append(draw(self.context.folder / name, panels, **options))
 
     def outcome(self) -> Outcome:
-        """Return what was added; rows of a column of a table together, where the first of them stands."""
+        """Return what was added; rows of a column of a table together, where the first of them stands.
+
+        Raises
+        ------
+        ReproduceError
+            The full run did not compare a published number that has a check.
+        """
+        lines = {
+            quantity
+            for (name, quantity), line in PUBLISHED.items()
+            if name == self.context.name and line.check
+        }
+        if (lost := lines - self._used) and not self.context.quick:
+            raise ReproduceError(f"reproduce: {self.context.name} does not compare {min(lost)}")
         groups: dict[str | int, list[Row]] = {}
         for i, each in enumerate(self.rows):
             groups.setdefault(self._columns.get(i, i), []).append(each)

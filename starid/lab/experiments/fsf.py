@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
-from starid.arrays import Array, Mask
+from starid.arrays import Mask
 from starid.lab.experiments.author_noise import filter_noise
-from starid.lab.experiments.comparison import best_constant
+from starid.lab.experiments.comparison import best_constant, markdown_table
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.tables import CONFUSION
@@ -199,70 +198,57 @@ def _write(e: Evaluation) -> None:
     e.write("confusion_matrices.csv", lines)
 
 
+Curves = Mapping[tuple[str, int], Sequence[float]]
+"""Kind of noise and number of false stars → a value for each factor of the noise."""
+
+
 def _figures(e: Evaluation) -> None:
-    """Draw a panel for each kind of noise: the indicators, and the means of μ_d and σ_d."""
-    kinds, false_stars = e.parameters["kinds"], e.parameters["false_stars"]
-    shades = dict(zip(false_stars, colours(6), strict=False))
-
-    def draw(
-        number: int,
-        label: str,
-        title: str,
-        values: Callable[[str, int], Any],
-        published: Callable[[str, int], Any] | None = None,
-    ) -> None:
-        panels = []
-        for kind in kinds:
-            curves = [
-                Curve(FACTORS, values(kind, f), "-o", f"f = {f}", {"color": shades[f], "markersize": 3})
-                for f in false_stars
-            ]
-            if published:
-                curves += [
-                    Curve(FACTORS, published(kind, f), ":", "", {"color": shades[f]}) for f in false_stars
-                ]
-            settings = {"xlabel": "noise factor μ", "ylabel": label}
-            panels.append(Panel(f"{_KINDS[kind]} noise", curves, settings))
-        size = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
-        e.draw(f"figure_6_{number}.png", panels, title=title, **size)
-
-    def indicators(kind: str, f: int, value: Callable[..., float], indicator: str) -> list[float]:
-        return [value(kind, f, k, indicator) for k in range(len(FACTORS))]
-
+    """Draw the indicators beside the published ones, and the means of μ_d and σ_d."""
+    sets = list(itertools.product(e.parameters["kinds"], e.parameters["false_stars"]))
     for number, name in enumerate(_INDICATORS, start=14):
-        author, published = (
-            partial(indicators, value=value, indicator=name) for value in (partial(_of_author, e), _published)
-        )
+        author = {case: [_of_author(e, *case, k, name) for k in FACTORS] for case in sets}
+        published = {case: [_published(*case, k, name) for k in FACTORS] for case in sets}
         title = f"{name.capitalize()}, as the author ran it (dotted: published)"
-        draw(number, f"{name} / %", title, author, published)
+        _draw(e, number, f"{name} / %", title, author, published)
     (worst,) = e.published("figure 6.18: greatest mean μ_d of all sets")
-
-    def distances(kind: str, f: int, place: int) -> Array:
-        return np.asarray(
-            np.nanmean(e.results[f"{kind}-f{f}-author-x1"]["distances"][..., place], axis=(1, 2))
-        )
-
     for number, name, place in ((18, "μ_d", 0), (19, "σ_d", 1)):
+        distances = {
+            case: e.results[f"{case[0]}-f{case[1]}-author-x1"]["distances"][..., place] for case in sets
+        }
+        means = {case: np.nanmean(values, axis=(1, 2)) for case, values in distances.items()}
         title = f"Mean {name}, as the author ran it; published: at most {worst:g}° of μ_d"
-        draw(number, f"mean {name} / °", title, partial(distances, place=place))
+        _draw(e, number, f"mean {name} / °", title, means, {})
+
+
+def _draw(e: Evaluation, number: int, label: str, title: str, author: Curves, published: Curves) -> None:
+    """Draw a panel for each kind of noise, a curve for each number of false stars."""
+    kinds, false_stars = e.parameters["kinds"], e.parameters["false_stars"]
+    panels = []
+    for kind in kinds:
+        curves = []
+        for f, shade in zip(false_stars, colours(6), strict=False):
+            style = {"color": shade, "markersize": 3}
+            curves.append(Curve(FACTORS, author[kind, f], "-o", f"f = {f}", style))
+            if published:
+                curves.append(Curve(FACTORS, published[kind, f], ":", "", {"color": shade}))
+        settings = {"xlabel": "noise factor μ", "ylabel": label}
+        panels.append(Panel(f"{_KINDS[kind]} noise", curves, settings))
+    size = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
+    e.draw(f"figure_6_{number}.png", panels, title=title, **size)
 
 
 def _matrix(e: Evaluation, indicator: str) -> str:
     """Tabulate our and the published indicator: a line for each table A.1–A.18, a column for each μ."""
-    head = f"{indicator} / %: published / as the author ran it / as printed"
-    lines = [
-        "| " + " | ".join((head, *(f"μ = {factor}" for factor in FACTORS))) + " |",
-        "|---" + "|---:" * 6 + "|",
-    ]
+    lines = []
     for kind, f in itertools.product(e.parameters["kinds"], e.parameters["false_stars"]):
         cells = []
         for k in range(len(FACTORS)):
             case = (kind, f, k, indicator)
             values = (_published(*case), _of_author(e, *case), _printed_value(e, *case))
             cells.append(" / ".join(f"{value:.1f}" for value in values))
-        label = f"A.{3 * f + 1 + list(_KINDS).index(kind)}: f = {f}, {_KINDS[kind]}"
-        lines.append("| " + " | ".join((label, *cells)) + " |")
-    return "\n".join(lines)
+        lines.append([f"A.{3 * f + 1 + list(_KINDS).index(kind)}: f = {f}, {_KINDS[kind]}", *cells])
+    head = f"{indicator} / %: published / as the author ran it / as printed"
+    return markdown_table([head, *(f"μ = {factor}" for factor in FACTORS)], lines)
 
 
 def _compare_tables(e: Evaluation) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from starid.files import write_atomically
-from starid.lab.experiments.comparison import Row
+from starid.lab.experiments.comparison import Row, markdown_table
 from starid.lab.experiments.runner import FinishedExperiment
 from starid.lab.experiments.tables import class_of, known_miss, numbers_by_choice
 
@@ -50,16 +50,8 @@ def _table(rows: Iterable[tuple[str, Row]]) -> list[str]:
         "|---|---:|---:|---:|---:|---|---|---|",
     ]
     for experiment, row in rows:
-        cells = (
-            row.quantity,
-            row.published,
-            row.author,
-            row.printed,
-            row.ours,
-            row.target,
-            _mark(experiment, row),
-            _remark(experiment, row),
-        )
+        values = (row.published, row.author, row.printed, row.ours, row.target)
+        cells = (row.quantity, *values, _mark(experiment, row), _remark(experiment, row))
         lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
     return lines
 
@@ -88,11 +80,12 @@ def _choices(results: Iterable[FinishedExperiment]) -> list[str]:
         f"The column *as the author ran it* rests on {len(found)} choices that the text of the thesis does not make. A number",
         "may depend on several.",
         "",
-        "| choice | numbers that depend on it | of these agree | it was fitted to |",
-        "|---|---:|---:|---:|",
-        *(
-            f"| {name} | {each['numbers']} | {each['agree']} | {each['fitted']} |"
-            for name, each in found.items()
+        markdown_table(
+            ("choice", "numbers that depend on it", "of these agree", "it was fitted to"),
+            (
+                (name, *(str(each[key]) for key in ("numbers", "agree", "fitted")))
+                for name, each in found.items()
+            ),
         ),
         "",
     ]
@@ -139,12 +132,10 @@ def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int
     lines += [
         f"Seed {seed}. The run took {minutes:.1f} minutes of processor time, about half as long on two cores.",
         "",
-        "| class | met | of |",
-        "|---|---:|---:|",
     ]
     found = counts(results)
-    lines += [f"| {words} | {found[kind]['met']} | {found[kind]['of']} |" for kind, words in CLASSES.items()]
-    lines.append("")
+    table = ((words, str(found[kind]["met"]), str(found[kind]["of"])) for kind, words in CLASSES.items())
+    lines += [markdown_table(("class", "met", "of"), table), ""]
     lines += _choices(results)
     if lost:
         lines += ["## Regressions", "", *_table(lost), ""]

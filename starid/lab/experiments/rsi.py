@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from starid.lab.experiments.author_noise import identification_noise
+from starid.lab.experiments.comparison import markdown_table
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
 from starid.lab.experiments.fsf import track_filter
 from starid.lab.experiments.rsi_figures import draw_sequences
@@ -168,12 +169,7 @@ def _sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, f
         return ""
     e.write("equation_6_5.csv", lines)
     head = ["Γ / °: noise", "μ_d / °", "σ_d / °", "eq. 6.5 as printed", "Γ_min + √(μ_d·σ_d)", "table 6.8"]
-    return _markdown([*head, "√(μ_d·σ_d) it needs"], cells)
-
-
-def _markdown(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    text = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    return "\n".join(text + ["| " + " | ".join(line) + " |" for line in lines])
+    return markdown_table([*head, "√(μ_d·σ_d) it needs"], cells)
 
 
 def _pair(theirs: float | None, ours: float, digits: int) -> str:
@@ -193,7 +189,7 @@ def _table(
         s, theirs = found[part.key], _published(part.values)
         cells = [_pair(theirs.get(name), s[ours], digits) for name, ours, digits, _ in columns]
         lines.append([_label(part.values), *cells])
-    return _markdown([f"{title}: published / ours", *(head for *_, head in columns)], lines)
+    return markdown_table([f"{title}: published / ours", *(head for *_, head in columns)], lines)
 
 
 def _matrix(e: Evaluation, found: Mapping[str, dict[str, float]], overlap: float) -> str | None:
@@ -210,7 +206,7 @@ def _matrix(e: Evaluation, found: Mapping[str, dict[str, float]], overlap: float
         return None
     lines = [(f"f = {f}", *(f"{means[f, m]:.3f}" for m in factors)) for f in false_stars]
     words = f"mean ε_f / °, p = {100 * overlap:g} %, with memory (sets of table 6.6)"
-    return _markdown((words, *(f"μ = {m}" for m in factors)), lines)
+    return markdown_table((words, *(f"μ = {m}" for m in factors)), lines)
 
 
 def _compare(e: Evaluation, diagonal: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:

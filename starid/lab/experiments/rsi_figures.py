@@ -71,7 +71,7 @@ def _draw_precision(
     """Draw a panel for each value of one function of a part, a curve for each value of another."""
     methods = dict.fromkeys(map(_method, parts))
     shades = dict(zip(methods, colours(len(methods)), strict=True))
-    panels = []
+    panels: list[Panel] = []
     for words in dict.fromkeys(map(panel_of, parts)):
         curves = []
         for part in parts:
@@ -81,7 +81,8 @@ def _draw_precision(
                 colour = {"color": shades[_method(part)]} if panel_of is not _method else {}
                 errors = e.results[part.key]["numbers"][0, settling:]
                 curves.append(precision(errors, 1.0, label_of(part), style, **colour))
-        panels.append(Panel(words, curves, precision_axes("ε_f", 1.0), "lower right"))
+        legend = "lower right" if panel_of is _method or not panels else ""
+        panels.append(Panel(words, curves, precision_axes("ε_f", 1.0), legend))
     e.draw(name, panels, columns=2, width=9.0, height=7.0, title=title, sharey=True)
 
 
