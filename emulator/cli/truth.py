@@ -28,8 +28,7 @@ def convert(
             "--output",
             "-o",
             help=output_help(
-                "File to write: a SPICE meta-kernel (.tm, with .bc, .tsc and .tls beside it), or an AEM as XML (.xml) or KVN "
-                "(any other suffix)."
+                "File to write: a SPICE meta-kernel (.tm, with .bc, .tsc and .tls beside it), or an AEM (any other suffix)."
             ),
         ),
     ],
@@ -75,7 +74,7 @@ def convert(
         if output.suffix == ".tm":
             write_kernels(truth, output, structure)
         else:
-            text = write_aem(truth, sensor, xml=output.suffix == ".xml")
+            text = write_aem(truth, sensor)
             write_atomically(output, lambda temporary: temporary.write_text(text, encoding="ascii"))
     except OSError as error:
         raise EmulatorError(

@@ -37,7 +37,6 @@ from starhil.emulator.truth.table import FileTruth, OrbitTable
 from starid.attitude import Attitude
 from starid.files import read_number
 
-RATE_TYPES: Final = ("QUATERNION/ANGVEL", "EULER_ANGLE/ANGVEL")
 TYPES: Final = {"QUATERNION": 4, "EULER_ANGLE": 3, "QUATERNION/ANGVEL": 7, "EULER_ANGLE/ANGVEL": 6}
 """Attitude types that are read, and the numbers in a row of each."""
 
@@ -89,58 +88,24 @@ def read_oem(path: Path, text: str) -> OrbitTable:
     return orbit_of_rows(path, icrs_to(where, frames.pop()), dates, rows)
 
 
-def write_aem(truth: FileTruth, sensor: str, *, xml: bool) -> str:
-    """Return the rows of a truth with dates as an AEM 2.0, GCRF to the frame named `sensor`."""
+def write_aem(truth: FileTruth, sensor: str) -> str:
+    """Return the rows of a truth with dates as an AEM 2.0 (KVN), GCRF to the frame named `sensor`."""
     begin_ns = 1000 * round(1e6 * (truth.start_unix_s or 0.0))  # the resolution of such a float is 0.2 µs
     dates = [_date(begin_ns + round(t * NANOSECONDS)) for t in truth.times_s.tolist()]
-    with_rates = truth.rates_rad_s is not None
-    meta = {
-        "OBJECT_NAME": "STARHIL",
-        "OBJECT_ID": "UNKNOWN",
-        "REF_FRAME_A": "GCRF",
-        "REF_FRAME_B": sensor,
-        "TIME_SYSTEM": "UTC",
-        "START_TIME": dates[0],
-        "STOP_TIME": dates[-1],
-        "ATTITUDE_TYPE": "QUATERNION/ANGVEL" if with_rates else "QUATERNION",
-        **({"ANGVEL_FRAME": sensor} if with_rates else {}),
-    }
-    header = {"CREATION_DATE": dates[0], "ORIGINATOR": "starhil"}
-    rows = []
-    for index, (date, attitude) in enumerate(zip(dates, truth.attitudes, strict=True)):
-        numbers = inverse(attitude).quaternion_xyzw.tolist()
-        if truth.rates_rad_s is not None:
-            numbers += np.degrees(truth.rates_rad_s[index]).tolist()
-        rows.append((date, [repr(number) for number in numbers]))
-    if not xml:
-        lines = [
-            "CCSDS_AEM_VERS = 2.0",
-            *_lines(header),
-            "META_START",
-            *_lines(meta),
-            "META_STOP",
-            "DATA_START",
-        ]
-        lines += [" ".join((date, *values)) for date, values in rows]
-        return "\n".join((*lines, "DATA_STOP", ""))
-    root = ET.Element("aem", {"id": "CCSDS_AEM_VERS", "version": "2.0"})
-    _add(ET.SubElement(root, "header"), header)
-    segment = ET.SubElement(ET.SubElement(root, "body"), "segment")
-    _add(ET.SubElement(segment, "metadata"), meta)
-    data = ET.SubElement(segment, "data")
-    for date, values in rows:
-        kind = "quaternionAngVel" if with_rates else "quaternionEphemeris"
-        state = ET.SubElement(ET.SubElement(data, "attitudeState"), kind)
-        _add(state, {"EPOCH": date})
-        _add(
-            ET.SubElement(state, "quaternion"),
-            dict(zip(("Q1", "Q2", "Q3", "QC"), values[:4], strict=True)),
-        )
-        if with_rates:
-            names = ("ANGVEL_X", "ANGVEL_Y", "ANGVEL_Z")
-            _add(ET.SubElement(state, "angVel"), dict(zip(names, values[4:], strict=True)))
-    ET.indent(root)
-    return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
+    numbers = np.array([inverse(attitude).quaternion_xyzw for attitude in truth.attitudes])
+    kind, frame_of_rates = "QUATERNION", []
+    if truth.rates_rad_s is not None:
+        kind, frame_of_rates = "QUATERNION/ANGVEL", [f"ANGVEL_FRAME = {sensor}"]
+        numbers = np.hstack((numbers, np.degrees(truth.rates_rad_s)))
+    lines = [
+        *("CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {dates[0]}", "ORIGINATOR = starhil", "META_START"),
+        *("OBJECT_NAME = STARHIL", "OBJECT_ID = UNKNOWN", "REF_FRAME_A = GCRF", f"REF_FRAME_B = {sensor}"),
+        *("TIME_SYSTEM = UTC", f"START_TIME = {dates[0]}", f"STOP_TIME = {dates[-1]}"),
+        *(f"ATTITUDE_TYPE = {kind}", *frame_of_rates, "META_STOP", "DATA_START"),
+        *(" ".join((date, *map(repr, row))) for date, row in zip(dates, numbers.tolist(), strict=True)),
+        "DATA_STOP",
+    ]
+    return "\n".join(lines) + "\n"
 
 
 def _attitudes(where: str, version: str, segment: Segment) -> Iterator[Row]:
@@ -172,7 +137,7 @@ def _attitudes(where: str, version: str, segment: Segment) -> Iterator[Row]:
                 )
             else:
                 turn = euler_turn(where, _keyword(where, segment, "EULER_ROT_SEQ"), values)
-            if kind in RATE_TYPES:
+            if kind.endswith("/ANGVEL"):
                 rate = checked_rate("rate", np.radians(numbers[size:]))
         except FeedError as error:
             raise EmulatorError(f"{where}: {error}") from None
@@ -263,15 +228,6 @@ def _keyword(where: str, segment: Segment, key: str) -> str:
     if key not in segment.keywords:
         raise EmulatorError(f"{where}: {key} is missing")
     return segment.keywords[key]
-
-
-def _lines(keywords: dict[str, str]) -> list[str]:
-    return [f"{key} = {value}" for key, value in keywords.items()]
-
-
-def _add(parent: Any, keywords: dict[str, str]) -> None:
-    for key, value in keywords.items():
-        ET.SubElement(parent, key).text = value
 
 
 def _date(at_ns: int) -> str:

@@ -587,7 +587,13 @@ def standard_truths() -> list[bytes]:
         "stk.v.11.0\nBEGIN Attitude\nScenarioEpoch 1 Jan 2026 00:00:00.0\nCoordinateAxes ICRF\n"
         "AttitudeTimeQuatAngVels\n0 0 0 0 1 0 0 0.1\n1e1 0 0 0.00872654 0.99996192 0 0 0.1\nEND Attitude\n"
     )
-    return [*(write_aem(file, "INSTRUMENT_A", xml=xml).encode() for xml in (False, True)), stk.encode()]
+    xml = (
+        '<aem id="CCSDS_AEM_VERS" version="2.0"><body><segment><metadata><REF_FRAME_A>ICRF</REF_FRAME_A>'
+        "<REF_FRAME_B>SC</REF_FRAME_B><TIME_SYSTEM>UTC</TIME_SYSTEM><ATTITUDE_TYPE>QUATERNION</ATTITUDE_TYPE></metadata><data>"
+        "<attitudeState><quaternionEphemeris><EPOCH>2026-01-01T00:00:00</EPOCH><quaternion><Q1>0</Q1><Q2>0</Q2><Q3>0</Q3>"
+        "<QC>1</QC></quaternion></quaternionEphemeris></attitudeState></data></segment></body></aem>"
+    )
+    return [write_aem(file, "INSTRUMENT_A").encode(), xml.encode(), stk.encode()]
 
 
 def _truth(path: Path) -> None:
