@@ -5,7 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, Any, TypeAlias
 
 import typer
 
@@ -18,7 +18,7 @@ def names_of(kind: Kind) -> Callable[[str], list[str]]:
     return lambda incomplete: [name for name in bundled(kind) if name.startswith(incomplete)]
 
 
-def list_option(*kinds: Kind) -> object:
+def list_option(*kinds: Kind) -> Any:
     """Return an option that lists what ships with the package, by name with a description, and exits."""
 
     def show(asked: bool) -> None:

@@ -1,9 +1,12 @@
 """The worker is started before anything else is imported, and a kernel needs no whole `scipy.linalg`."""
 
+import os
 import subprocess
 import sys
 
 import pytest
+
+from starhil.emulator.pipeline.worker_process import WorkerProcess
 
 AHEAD = """
 import sys
@@ -44,6 +47,15 @@ def test_only_a_run_starts_its_worker_before_anything_else_is_imported(arguments
     ended = python(AHEAD.format(arguments=arguments))
     assert said in ended.stdout + ended.stderr
     assert ("worker" in ended.stdout.split()) == (said.startswith("worker"))
+
+
+@pytest.mark.process
+def test_ctrl_c_in_a_terminal_does_not_reach_the_worker():
+    worker = WorkerProcess()
+    try:
+        assert os.getpgid(worker.process.pid) == worker.process.pid
+    finally:
+        worker.end()
 
 
 def test_a_worker_that_was_started_ahead_is_taken_once(monkeypatch):
