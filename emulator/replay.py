@@ -389,7 +389,7 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             recording = await play.entries(folder, report, ends=ends)
             to_the_end = not report.differences
             new_decoder = partial(Decoder, head.icd, head.serial_dialect)
-            _compare_sent(recording, player.passed, report, new_decoder, to_the_end=to_the_end)
+            _compare_sent(recording, player, report, new_decoder, to_the_end=to_the_end)
         finally:
             await again.close()
             log.close()
@@ -488,15 +488,15 @@ def _deviation(entry: Entry, why: str) -> str:
 
 def _compare_sent(
     recording: list[WireItem],
-    played: list[WireItem],
+    player: Player,
     report: ReplayReport,
     new_decoder: Callable[[], Decoder],
     *,
     to_the_end: bool,
 ) -> None:
     """Compare what was sent on each link, if not to the end then as far as it was recorded."""
-    for link in sorted({each.bus for each in recording + played if each.outgoing}):
-        passed = [[each for each in items if each.bus == link] for items in (recording, played)]
+    for link in sorted({each.bus for each in recording} | set(player.receivers)):
+        passed = [[each for each in items if each.bus == link] for items in (recording, player.passed)]
         before, now = (list(_units(items)) for items in passed)
         report.sent[link] = len(before)
         if not to_the_end:

@@ -198,6 +198,13 @@ def test_a_changed_can_frame_is_named_by_its_row_or_its_meaning_in_canopen(recor
         assert ": recorded a9, now " in difference
 
 
+def test_a_link_on_which_nothing_is_sent_is_counted(record):
+    async def nothing(_emulation, _line):
+        return
+
+    assert report_of(record(nothing)).sent == {"serial": 0}
+
+
 def test_traffic_is_reported_while_it_is_recorded(record):
     passed = []
 

@@ -123,7 +123,7 @@ export class Faults {
     }
     this.count = chips.length;
     this.now.replaceChildren(...(chips.length ? chips : [make("li", { class: "dim none", text: "no fault" })]));
-    this.store.emit("faults", this.count);
+    this.store.emit("faults", chips.map((chip) => chip.textContent));
   }
 }
 

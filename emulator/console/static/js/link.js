@@ -34,12 +34,23 @@ export class Link {
     socket.onmessage = (event) => this.receive(event.data);
     socket.onclose = () => {
       this.handlers.state("disconnected");
+      this.explain();
       for (const answer of this.waiting.values()) answer({ ok: false, error: "the connection was lost" });
       this.waiting.clear();
       setTimeout(() => this.connect(), this.retry);
       this.retry = Math.min(2 * this.retry, LAST_RETRY_MS);
     };
     this.socket = socket;
+  }
+
+  // A socket does not say why it was closed; the page of another run does: it rejects the token of this one.
+  async explain() {
+    try {
+      const answer = await fetch(address("/"), { cache: "no-store" });
+      if (answer.status === 403) this.handlers.state("restarted");
+    } catch {
+      // nobody listens at the address
+    }
   }
 
   receive(data) {

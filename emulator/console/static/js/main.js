@@ -20,15 +20,42 @@ const $ = (id) => document.getElementById(id);
 initTheme($("theme"));
 
 const store = new Store();
+
+// --- what is shown is of the past while the emulator is not connected, or the device is unresponsive ---
+
+let lost = null;
+let unresponsive = false;
+
+function showLink(state) {
+  if (state === "connected") lost = null;
+  else if (lost === null && state === "disconnected") lost = Date.now();
+  if (state === "connecting" && lost !== null) return;
+  setText($("link"), state);
+  $("link").dataset.state = state;
+  showAge();
+}
+
+function showAge() {
+  document.body.classList.toggle("past", lost !== null || unresponsive);
+  const restarted = $("link").dataset.state === "restarted";
+  $("past").hidden = lost === null && !unresponsive;
+  if (lost !== null) {
+    const age = Math.round((Date.now() - lost) / 1000);
+    setText($("past"), restarted ? "The emulator was restarted: open its new address, on its ready line." : `No connection to the emulator for ${age} s; everything shown is from before.`);
+  } else if (unresponsive) {
+    setText($("past"), "The device is unresponsive (fault: device stuck); it answers no request.");
+  }
+}
+
+setInterval(showAge, 1000);
+
 const link = new Link({
   message: (message) => store.message(message),
   frame: (head, blob) => store.frame(head, blob),
   history: (numbers) => store.history(numbers),
-  state: (state) => {
-    setText($("link"), state);
-    $("link").dataset.state = state;
-  },
+  state: showLink,
 });
+
 const sky = new Sky(store);
 new SkyMap(store);
 const charts = new Charts(store);
@@ -64,7 +91,7 @@ openPage();
 // --- tabs ---
 
 const tabs = Object.fromEntries(TABS.map((name, number) => {
-  const button = make("button", { type: "button", role: "tab", "data-tab": name, title: `F${number + 1}`, text: name, onclick: () => openTab(name) });
+  const button = make("button", { type: "button", role: "tab", "data-tab": name, title: number < 4 ? `F${number + 1}` : "", text: name, onclick: () => openTab(name) });
   $("tabs").append(button);
   return [name, button];
 }));
@@ -94,12 +121,16 @@ store.on("hello", (hello) => {
   $("unit").title = Object.entries(hello.links).map(([name, where]) => `${name} ${where}`).join("\n");
 });
 
-store.on("faults", (count) => {
+store.on("faults", (names) => {
+  const count = names.length;
   setText($("active"), count ? `${count} fault${count === 1 ? "" : "s"}` : "no fault");
+  $("active").title = count ? `injected: ${names.join(", ")}` : "injected faults";
   $("active").dataset.state = count ? "bad" : "idle";
 });
 
 store.on("status", ({ status }) => {
+  unresponsive = Boolean(status.faults && status.faults.device && status.faults.device.stuck);
+  showAge();
   if (store.cursor !== null) return;
   setText($("mode"), status.mode.replaceAll("_", " ") + (status.error_cause ? `: ${status.error_cause}` : ""));
   $("mode").dataset.mode = status.mode;
@@ -125,7 +156,7 @@ store.on("shown", () => {
   showValidity(item("valid") === 1, store.reasons[item("reason")] || "invalid");
   setText($("ra"), `${fixed(turn(item("ra")), 4, 9)}°`);
   setText($("dec"), `${fixed(item("dec"), 4, 9)}°`);
-  setText($("roll"), `${fixed(turn(item("roll")), 4, 9)}°`);
+  setText($("roll"), `${fixed(signed(item("roll")), 4, 9)}°`);
   for (const name of ["qx", "qy", "qz", "qw"]) $("ra").dataset[name] = String(item(name));
   setText($("error"), `${fixed(item("error_cross"), 2, 6)} / ${fixed(item("error_roll"), 1, 6)}`);
   setText($("stars"), `${fixed(item("matched"), 0, 3)} of ${fixed(item("detected"), 0, 3)}`);
@@ -139,6 +170,11 @@ store.on("shown", () => {
 // An angle that is rounded to a full turn with four digits is shown as zero.
 function turn(degrees) {
   return degrees >= 359.99995 ? 0 : degrees;
+}
+
+// A roll near zero does not jump between 0° and 360°.
+function signed(degrees) {
+  return degrees > 180 ? degrees - 360 : degrees;
 }
 
 function showMoment(item) {
@@ -189,7 +225,7 @@ const KEYS = [
   ["?", "?", "these keys", () => $("keys").showModal()],
 ];
 for (const [, label, what] of KEYS) if (label) $("keys").querySelector("dl").append(make("dt", { text: label }), make("dd", { text: what }));
-$("keys").querySelector("dl").append(make("dt", { text: "F1 … F5" }), make("dd", { text: "telemetry, telecommands, wire, faults, truth" }));
+$("keys").querySelector("dl").append(make("dt", { text: "F1 … F4" }), make("dd", { text: "telemetry, telecommands, wire, faults" }));
 $("keys").querySelector("dl").append(make("dt", { text: "Ctrl+Enter" }), make("dd", { text: "send the telecommand" }));
 $("help").addEventListener("click", () => $("keys").showModal());
 
@@ -198,7 +234,7 @@ document.addEventListener("keydown", (event) => {
     panels.telecommands.submit();
     return;
   }
-  const function_ = /^F([1-5])$/.exec(event.key);
+  const function_ = /^F([1-4])$/.exec(event.key);
   if (function_) {
     event.preventDefault();
     openTab(TABS[Number(function_[1]) - 1]);

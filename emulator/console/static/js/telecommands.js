@@ -27,7 +27,8 @@ export class Telecommands {
     const save = make("a", { class: "button", id: "save-session", href: address("/session.toml"), download: "session.toml", title: "what this console has sent, for `starhil session`", text: "save as session" });
     const clear = make("button", { type: "button", id: "clear-session", text: "clear", onclick: () => this.clear() });
     this.host.replaceChildren(this.select, this.form, make("div", { class: "bar" }, make("h2", { text: "Sent" }), this.steps, make("span", { class: "spacer" }), save, clear), this.log);
-    this.choose(this.chosen && this.rows.has(this.chosen) ? this.chosen : hello.telecommands[0].name);
+    if (this.rows.has(this.chosen)) this.choose(this.chosen);
+    else this.form.replaceChildren(make("p", { class: "dim doc", text: "Choose a telecommand." }));
   }
 
   choose(name) {
@@ -91,7 +92,7 @@ export class Telecommands {
   }
 
   submit() {
-    this.form.requestSubmit();
+    if (this.chosen) this.form.requestSubmit();
   }
 
   note(item) {

@@ -15,6 +15,7 @@ export class Wire {
     this.lines = [];
     this.hidden = new Set(["part"]);
     this.buses = new Set(["serial", "can"]);
+    this.own = false;
     this.text = "";
     this.held = false;
     this.build();
@@ -32,6 +33,7 @@ export class Wire {
     this.hold = make("button", { type: "button", text: "hold", onclick: () => this.setHeld(!this.held) });
     const buses = ["serial", "can"].map((bus) => check(bus === "can" ? "CAN" : bus, true, (on) => (on ? this.buses.add(bus) : this.buses.delete(bus))));
     const kinds = KINDS.map(([label, names]) => check(label, !this.hidden.has(names[0]), (on) => { for (const name of names) on ? this.hidden.delete(name) : this.hidden.add(name); }));
+    kinds.push(check("console", this.own, (on) => (this.own = on)));
     this.left = make("output", { class: "num dim" });
     const save = make("a", { class: "button", href: address("/wire.log"), download: "wire.log", text: "candump log" });
     this.list = make("ol", { class: "trace scroll" });
@@ -59,7 +61,7 @@ export class Wire {
   }
 
   wanted(line) {
-    if (this.hidden.has(line.kind) || !this.buses.has(line.bus)) return false;
+    if ((line.own && !this.own) || this.hidden.has(line.kind) || !this.buses.has(line.bus)) return false;
     return !this.text || `${line.raw} ${line.text}`.toLowerCase().includes(this.text);
   }
 
