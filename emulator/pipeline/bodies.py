@@ -1,18 +1,29 @@
-"""Sun, Moon and Earth in the field of view."""
+"""Sun, Moon and Earth in the field of view, and whether they blind the sensor.
+
+A frame without a valid attitude is `blinded` only if a body is in the field and hardly any of the frame's stars were
+detected. Where they were, the attitude was lost for another reason, which stands.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
 from starhil.emulator.pipeline.messages import FrameResult
 from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.light import through_baffle
 from starhil.emulator.sky.objects import SkyObjects
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 
-_WITHOUT_STARS: Final = frozenset({"too_few_stars", "no_match", "prediction_lost", "detection_failed"})
+_BRIGHTEST: Final = 200
+"""Number of a frame's stars that are looked for; detections of other light rarely coincide with so few."""
+
+_SEEN_PX: Final = 3.0
+"""Largest distance between a star and its detection, pixels."""
 
 
 def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tuple[str, ...]:
@@ -31,9 +42,13 @@ def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tupl
     )
 
 
-def with_bodies(result: FrameResult, in_field: tuple[str, ...]) -> FrameResult:
-    """Return a result with the bodies in the field; without stars, they are the reason."""
-    if not in_field:
-        return result
-    blinded = not result.valid and result.reason in _WITHOUT_STARS
+def stars_seen(stars_xy: Array, detections_xy: Array) -> int:
+    """Return how many of a frame's stars (n, 2), brightest first, were detected (m, 2)."""
+    offsets = stars_xy[:_BRIGHTEST, None] - detections_xy
+    return int(np.count_nonzero((np.hypot(offsets[..., 0], offsets[..., 1]) <= _SEEN_PX).any(axis=1)))
+
+
+def with_bodies(result: FrameResult, in_field: tuple[str, ...], *, enough_stars: bool) -> FrameResult:
+    """Return a result with the bodies in the field; unless enough stars were seen, they are the reason for no attitude."""
+    blinded = bool(in_field) and not result.valid and not enough_stars
     return replace(result, in_field=in_field, reason="blinded" if blinded else result.reason)

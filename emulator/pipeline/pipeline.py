@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
 from starhil.emulator.pipeline.binning import mean_over_squares
-from starhil.emulator.pipeline.bodies import bodies_in_field, with_bodies
+from starhil.emulator.pipeline.bodies import bodies_in_field, stars_seen, with_bodies
 from starhil.emulator.pipeline.image_source import ImageSource, open_images, used_bits
 from starhil.emulator.pipeline.messages import (
     Failure,
@@ -206,7 +206,11 @@ class Pipeline:
         modelled = identifier.catalog.vectors[solution.catalog_index]
         times = (begin, rendered, detected, solved)
         result = self._frame_result(request, sensor, found, solution, modelled, times)
-        result = with_bodies(result, exposure.in_field)
+        if exposure.frame is not None:
+            stars = exposure.frame.stars
+            seen = stars_seen(stars.xy_px[stars.visible], found.xy_px) if exposure.in_field else 0
+            enough = seen >= request.settings.min_stars_matched
+            result = with_bodies(result, exposure.in_field, enough_stars=enough)
         if request.preview:
             result = replace(result, preview=self._preview(exposure, sensor, found, solution))
         return result if current else replace(result, index_pending=True)

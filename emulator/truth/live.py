@@ -7,7 +7,7 @@ Messages are JSON lines (`starhil.emulator.truth.feed_message`) or the blocks of
 The first message (or the last one before time starts) sets the offset between the sender's clock and simulation time; drift is tracked
 (`starhil.emulator.truth.sender_clock`) and rates are scaled accordingly. With ``timeline = "run"`` in the profile,
 ``t`` is simulation time. A sender that runs at another speed than the clock is reported, and flagged ``wrong_speed``;
-each of its messages then holds from its receipt.
+each of its messages then holds from its receipt, with ``timeline = "run"`` still at its ``t``.
 
 Between two messages the attitude is interpolated. After the last one it is propagated at the last rate for at most
 ``stale_s``; then it is held and flagged ``stale``. With ``timeline = "run"`` it is also stale if the last ``t`` is
@@ -131,12 +131,15 @@ class LiveTruth:
         at_s = received_s if message.t is None else message.t
         rate = self._rates.body_rate(at_s, message.attitude, message.rate_rad_s)
         t = at_s
-        if timed and self.timeline == "anchor":
+        if timed:
             differed = self.speed.differs
-            t = self._clock.simulation_time(at_s, received_s, self.stale_s)
+            if self.timeline == "anchor":
+                t = self._clock.simulation_time(at_s, received_s, self.stale_s)
+                rate = rate * (1.0 - self._clock.slope)
+            else:
+                self.speed.add(at_s, received_s)
             if self.speed.differs != differed:
                 self._speed_changed()
-            rate = rate * (1.0 - self._clock.slope)
         self._drop_superseded(t, timed=timed)
         self._received_s = received_s
         self._times.append(t)
@@ -148,9 +151,10 @@ class LiveTruth:
         return self._clock.speed
 
     def _speed_changed(self) -> None:
-        """Report a speed that differs from the clock's, and discard the states, whose times no longer hold."""
-        self._times.clear()
-        self._states.clear()
+        """Report a speed that differs from the clock's, and discard the states whose times no longer hold."""
+        if self.timeline == "anchor":
+            self._times.clear()
+            self._states.clear()
         if self.speed.differs:
             wall = rounded_speed(self.speed.ratio * self._clock_speed)
             scaled = f"--clock scaled:{wall:g}, or " if wall <= MAX_SCALE else ""

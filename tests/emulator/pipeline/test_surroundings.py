@@ -51,13 +51,23 @@ def test_a_body_is_in_the_field_if_any_part_of_it_is(sky, expected):
     assert bodies_in_field(sky, ORION, DEFAULT_CAMERA) == expected
 
 
-def test_a_body_in_the_field_is_the_reason_where_stars_are_missing():
-    lost = FrameResult(1, reason="too_few_stars")
-    assert with_bodies(lost, ("moon",)).reason == "blinded"
-    assert with_bodies(lost, ()).reason == "too_few_stars"
-    found = FrameResult(1, valid=True, reason="ok")
-    assert (with_bodies(found, ("moon",)).reason, with_bodies(found, ("moon",)).in_field) == ("ok", ("moon",))
-    assert with_bodies(replace(lost, reason="residual"), ("earth",)).reason == "residual"
+@pytest.mark.parametrize("reason", ["too_few_stars", "no_match", "residual", "prediction_lost"])
+def test_a_body_in_the_field_is_the_reason_where_stars_are_missing(reason):
+    lost = FrameResult(1, reason=reason)
+    assert with_bodies(lost, ("moon",), enough_stars=False).reason == "blinded"
+    assert with_bodies(lost, ("moon",), enough_stars=True).reason == reason
+    assert with_bodies(lost, (), enough_stars=False).reason == reason
+    found = with_bodies(FrameResult(1, valid=True, reason="ok"), ("moon",), enough_stars=False)
+    assert (found.reason, found.in_field) == ("ok", ("moon",))
+
+
+def test_a_jump_with_a_moon_in_the_corner_loses_the_prediction_and_is_not_blinded(pipeline):
+    moon = {"ra_deg": 93.5, "dec_deg": -10.0}
+    elsewhere = as_quaternion(Attitude.from_radec_roll(110.0, 30.0, 0.0))
+    seen = pipeline.handle(replace(REQUEST, index=20, faults={"moon": moon}))
+    assert (seen.valid, seen.in_field) == (True, ("moon",))
+    jumped = pipeline.handle(replace(REQUEST, index=21, predicted_xyzw=elsewhere, faults={"moon": moon}))
+    assert (jumped.valid, jumped.reason, jumped.in_field) == (False, "prediction_lost", ("moon",))
 
 
 def test_the_earth_across_the_field_blinds_the_sensor(pipeline):

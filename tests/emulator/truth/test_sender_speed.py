@@ -53,6 +53,21 @@ def test_a_sender_at_another_speed_is_named_within_a_few_messages_and_followed(s
     )
 
 
+@pytest.mark.parametrize("speed", [0.5, 3.0])
+def test_a_sender_of_simulation_time_at_another_speed_is_named_and_its_times_still_hold(speed, caplog):
+    live = LiveTruth(START, stale_s=10.0, timeline="run")
+    for n in range(100):
+        send(live, speed * 0.1 * n, 0.1 * n)
+        state = live.state(0.1 * n)
+        assert state.attitude.error_to(propagate(START, RATE_RAD_S, 0.1 * n)).total_arcsec < 1e-3
+        if n >= FEW:
+            assert state.status is TruthStatus.WRONG_SPEED, n
+    (said,) = warnings(caplog)
+    assert said.startswith(
+        f"truth feed: the sender runs at {speed:g} × the clock; use --clock scaled:{speed:g}"
+    )
+
+
 def arrivals(kind, count, rng):
     """Times of receipt of a sender at 0.1 s per message on time, with the delays of a real link."""
     sent = 0.1 * np.arange(count)
