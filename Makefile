@@ -7,7 +7,7 @@
 # make fuzz        every decoder of the wire against a million mutated inputs (minutes; for the night)
 # make fuzz-guided every decoder and reader of files against inputs guided by coverage, SECONDS (60) each
 # make coverage    all tests under measurement; fails below 95 % of lines and branches (docs/figures.md)
-# make mutation    a random SAMPLE (40) of the mutants of each module (MODULES: protocol/canopen, …); table in out/mutation
+# make mutation    a random SAMPLE (40) of the mutants of each group of modules (MODULES: protocol/canopen, …); table in out/mutation
 # make years       random lives of all units on JOBS (2) processors for HOURS (8), judged by an oracle (docs/endurance.md)
 # make obc         a flight computer in QEMU reads the star tracker over its UART; report and truth log in out/obc
 # make soak        the emulator under load and faults for MINUTES (15); fails if memory, descriptors or latency grow

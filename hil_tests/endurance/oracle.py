@@ -138,9 +138,9 @@ class Oracle:
         self.values = {**self._defaults, **self._stored}
         self.modes = {"boot"}
         self.counts = {"telecommands": 0, "telemetry": 0}
-        self._boot_count = (
-            None if self._boot_count is None or self.disk_full else (self._boot_count + 1) & 0xFFFF
-        )
+        self._is_counted = not self.disk_full
+        if self._boot_count is not None:
+            self._boot_count = (self._boot_count + 1) & 0xFFFF if self._is_counted else None
         self._clock: tuple[float, int] | None = (at_s, self._start_unix_ns)
         self._has_imaged = False
         self._frames = None
@@ -452,7 +452,7 @@ class Oracle:
     def _check_boot_count(self, where: str, field: Field, value: Value) -> None:
         if self._boot_count is not None:
             self._expect(where, field, value, self._boot_count)
-        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF and not self.disk_full:
+        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF and self._is_counted:
             self._boot_count = value
 
     def _check_frames(self, where: str, _field: Field, value: Value) -> None:

@@ -252,6 +252,13 @@ def test_a_value_that_the_object_dictionary_rejects_is_no_telecommand():
     )
 
 
+def test_a_start_on_a_full_disk_is_not_counted_at_the_next():
+    status = request_on("serial", load_unit("cubestar").telemetry["device_status"])
+    power = {"do": "power", "factory": False}
+    full, free = ({"do": "disk", "full": full} for full in (True, False))
+    assert violation_of(status, full, power, status, free, status, power, status) == ""
+
+
 def test_one_byte_of_data_is_not_taken_for_a_refusal():
     row = load_unit("cubestar").telemetry["card_progress"]
     assert row.size == 1

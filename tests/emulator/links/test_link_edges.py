@@ -1,0 +1,121 @@
+"""Requests in pieces, damage that changes a byte, and addresses that change while a link is open."""
+
+import asyncio
+import random
+
+import pytest
+
+from starhil.emulator.clock import SteppedClock
+from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.links.can import CanLink
+from starhil.emulator.links.canopen import CanopenLink
+from starhil.emulator.links.serial import SerialDamage, SerialLink
+from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.canopen import MemoryStorage
+from starhil.protocol.cubespace_serial import encode_request
+from starhil.protocol.messages import Request
+from tests.emulator.wire import Wire
+
+NODE = 44
+
+
+def test_damage_changes_every_byte_string():
+    rng = random.Random(1)
+    assert all(
+        SerialDamage().corrupt(item, rng) != item for item in (b"\xff" * 8, b"\x00" * 8) for _ in range(50)
+    )
+
+
+def test_each_corrupted_item_is_counted_once_and_shown_as_it_is_sent():
+    sent, seen = [], []
+    clock = SteppedClock()
+    faults = WireFaults(sent.append, SerialDamage(), clock, Scheduler(), seed=1)
+    faults.listener = seen.append
+    faults.settings = WireFaultSettings(corrupt=1.0)
+    for _ in range(3):
+        faults.send(bytes(4))
+    assert faults.corrupted == 3
+    assert seen == sent
+    assert len(sent) == 3
+
+
+def test_a_request_in_two_pieces_is_answered(bench):
+    async def scenario():
+        uart = Wire()
+        link = SerialLink(bench.requests, uart)
+        await link.start()
+        data = encode_request(Request.of(128))
+        uart.arrive(data[:2])
+        bench.step(0.01)
+        uart.arrive(data[2:])
+        assert uart.take()
+        await link.close()
+
+    asyncio.run(scenario())
+
+
+def test_a_new_can_address_is_that_under_which_the_unit_is_seen(bench, caplog):
+    async def scenario():
+        bus = Wire()
+        link = CanLink(bench.requests, bus)
+        await link.start()
+        bench.device.parameters.set({"can_address": 9})
+        caplog.clear()
+        bus.arrive(CanFrame(5 << 24 | 128 << 16 | 9 << 8 | 1, bytes(8)))  # telemetry from 9 to 1
+        assert "address 9: also used by another node" in caplog.text
+        await link.close()
+
+    asyncio.run(scenario())
+
+
+def canopen_link(bench, test, storage=None):
+    async def scenario():
+        bus = Wire()
+        link = CanopenLink(bench.requests, bus, storage)
+        await link.start()
+        test(bus)
+        await link.close()
+
+    asyncio.run(scenario())
+
+
+@pytest.fixture
+def node_bench(make_bench):
+    bench = make_bench().start()
+    bench.device.parameters.set({"canopen_node": NODE})
+    return bench
+
+
+def test_a_reset_of_the_node_takes_over_the_stored_node_id(node_bench):
+    def test(bus):
+        node_bench.device.parameters.set({"canopen_node": 50})
+        node_bench.command("save_parameters")
+        bus.take()
+        bus.arrive(CanFrame(0, bytes((0x81, NODE)), extended=False))
+        assert [frame.id for frame in bus.take() if frame.data == b"\0"] == [0x700 + 50]
+
+    canopen_link(node_bench, test)
+
+
+def test_a_restart_of_the_device_after_a_reset_of_the_node_boots_the_node(node_bench):
+    node_bench.command("save_parameters")
+
+    def test(bus):
+        bus.arrive(CanFrame(0, bytes((0x81, NODE)), extended=False))
+        bus.take()
+        node_bench.device.reset("watchdog")
+        assert [frame.id for frame in bus.take() if frame.data == b"\0"] == [0x700 + NODE]
+
+    canopen_link(node_bench, test)
+
+
+def test_another_parameter_leaves_the_node_id_that_lss_stored(node_bench):
+    storage = MemoryStorage()
+    storage.save("lss", {"node_id": b"\x30", "bit_rate": (1_000_000).to_bytes(4, "little")})
+
+    def test(_bus):
+        node_bench.device.parameters.set({"exposure": 150})
+        assert storage.load("lss")["node_id"] == b"\x30"
+
+    canopen_link(node_bench, test, storage)
