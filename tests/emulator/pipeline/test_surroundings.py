@@ -63,10 +63,10 @@ def test_a_body_in_the_field_is_the_reason_where_stars_are_missing(reason):
 
 def test_a_jump_with_a_moon_in_the_corner_loses_the_prediction_and_is_not_blinded(pipeline):
     moon = {"ra_deg": 93.5, "dec_deg": -10.0}
-    elsewhere = as_quaternion(Attitude.from_radec_roll(110.0, 30.0, 0.0))
+    elsewhere = Attitude.from_radec_roll(110.0, 30.0, 0.0)
     seen = pipeline.handle(replace(REQUEST, index=20, faults={"moon": moon}))
     assert (seen.valid, seen.in_field) == (True, ("moon",))
-    jumped = pipeline.handle(replace(REQUEST, index=21, predicted_xyzw=elsewhere, faults={"moon": moon}))
+    jumped = pipeline.handle(replace(REQUEST, index=21, predicted=elsewhere, faults={"moon": moon}))
     assert (jumped.valid, jumped.reason, jumped.in_field) == (False, "prediction_lost", ("moon",))
 
 
