@@ -8,7 +8,7 @@ enough rings with it. From the candidates of several pole stars, pairs, triangle
 the observed lengths are built until one set is left.
 
 own choice: every observed star is a pole, and its candidates are the eight best guide stars with at least
-four rings in common. The polygon is the largest set that agrees in all its sides, which the shared last step
+eight votes of the rings. The polygon is the largest set that agrees in all its sides, which the shared last step
 finds. It must have five corners: among so many candidates, quadrilaterals occur by chance.
 """
 
@@ -25,7 +25,7 @@ from starid.lab.classic.neighbours import neighbours_of
 from starid.lab.classic.rings import MAX_NEIGHBOURS, RADIUS_SHARE, radial_votes, ring_table
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 
-MIN_RINGS: Final = 8
+MIN_VOTES: Final = 8
 CANDIDATES: Final = 8
 
 
@@ -42,7 +42,7 @@ def _candidates(
         radial_votes(table, polar, neighbours_of(seen, pole, radius, polar, rows), radius, votes)
         for _ in range(CANDIDATES):
             best = np.argmax(votes)
-            if votes[best] < MIN_RINGS:
+            if votes[best] < MIN_VOTES:
                 break
             votes[best] = 0
             found[filled, 0], found[filled, 1] = pole, best

@@ -7,7 +7,7 @@ The radial feature (`starid.lab.classic.rings`) gives the first match: the guide
 with an observed star. The cyclic feature decides among them: the directions to the neighbours, quantised into
 sectors, form a bit string that is compared at its best circular shift.
 
-own choice: 60 sectors of 6°. The forty guide stars with the most rings in common, at least four, are compared.
+own choice: 60 sectors of 6°. The ten guide stars with the most votes of the rings, at least six, are compared.
 The one whose string has the most bits in common at one shift, to within one sector, is taken if unique.
 """
 
@@ -26,7 +26,7 @@ from starid.lab.classic.rings import MAX_NEIGHBOURS, RADIUS_SHARE, radial_votes,
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 
 SECTORS: Final = 60
-MIN_RINGS: Final = 6
+MIN_VOTES: Final = 6
 CANDIDATES: Final = 10
 
 
@@ -94,7 +94,7 @@ def _identify(
         for _ in range(CANDIDATES):
             star = int(np.argmax(votes))
             rings = votes[star]
-            if rings < MIN_RINGS:
+            if rings < MIN_VOTES:
                 break
             votes[star] = 0
             likeness = rings + common_sectors(word, words[star])

@@ -5,8 +5,8 @@ under rotation. A lookup table leads from each ring to the guide stars with a ne
 vote.
 
 own choice: 200 rings from the buffer to the pattern radius, half the width of the field (2.2 px of 937 each).
-own choice: an observed neighbour also votes for the ring that is next nearest to it, as noise carries it there; each
-guide star gets one vote of it at most.
+own choice: an observed neighbour has two votes for its own ring and one for each ring beside it, where noise may have
+carried it; each guide star gets its votes once.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def ring_table(vectors: Array, radius: float) -> tuple[Indices32, NDArray[np.uin
 def radial_votes(
     table: tuple[Indices32, NDArray[np.uint16]], polar: Array, count: int, radius: float, votes: Indices32
 ) -> None:
-    """Count the rings that an observed star, given its neighbours, shares with each guide star."""
+    """Count the votes of an observed star's neighbours for each guide star: two for their own ring, one beside it."""
     start, owner = table
     votes[:] = 0
     voter = np.full(votes.shape[0], -1, dtype=np.int64)
