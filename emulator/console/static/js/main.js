@@ -107,6 +107,7 @@ function openTab(name) {
   history.replaceState(null, "", `${location.pathname}${location.search}#${name}`);
 }
 
+window.addEventListener("load", () => scrollTo(0, 0)); // the browser scrolls to the tab that the address names
 openTab(TABS.includes(location.hash.slice(1)) ? location.hash.slice(1) : "telemetry");
 
 // --- top line ---
