@@ -111,15 +111,21 @@ def reported(device: Device) -> Reported:
     if not last.valid:
         return Reported(last.reason)
     measured = Attitude(np.array(last.result.quaternion_xyzw))
-    mounted = reduce(Attitude.rotated, mounting_turns(device.parameters), measured)
-    attitude = reduce(Attitude.rotated, axes_turns(device.icd.conventions), mounted)
-    rate = to_reported_frame(device, np.array(last.rate_rad_s))
-    return Reported("ok", _in_convention(attitude, device), as_triple(rate), attitude, mounted)
+    mounting, axes = mounting_turns(device.parameters), axes_turns(device.icd.conventions)
+    mounted = reduce(Attitude.rotated, mounting, measured)
+    attitude = reduce(Attitude.rotated, axes, mounted)
+    rate = as_triple(_turned(np.array(last.rate_rad_s), mounting + axes))
+    return Reported("ok", _in_convention(attitude, device), rate, attitude, mounted)
 
 
 def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
     """Turn a vector (3,) from the sensor frame to the reported frame."""
-    for turn in mounting_turns(device.parameters) + axes_turns(device.icd.conventions):
+    return _turned(vector, mounting_turns(device.parameters) + axes_turns(device.icd.conventions))
+
+
+def _turned(vector: np.ndarray, turns: list[np.ndarray]) -> np.ndarray:
+    """Return a vector (3,) in a frame that has been turned by rotation vectors, one after another."""
+    for turn in turns:
         vector = Attitude.identity().rotated(turn).to_sensor(vector)
     return vector
 

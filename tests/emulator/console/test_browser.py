@@ -4,6 +4,7 @@ import json
 import math
 import re
 import shutil
+import socket
 import subprocess
 import urllib.error
 import urllib.request
@@ -279,3 +280,27 @@ def test_a_wrong_token_and_another_origin_get_403(emulator):
         with pytest.raises(urllib.error.HTTPError) as error:
             urllib.request.urlopen(request, timeout=10)
         assert error.value.code == 403
+
+
+def test_a_page_whose_emulator_ended_is_grey_and_asks_for_the_address_of_the_next(browser):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        where = f"127.0.0.1:{free.getsockname()[1]}"
+    command = emulator_command(
+        profile="ideal", serial="off", can="off", seed=1, extra=["--clock", "stepped", "--view", where]
+    )
+    page = browser.new_page(viewport={"width": 420, "height": 900})
+    page.set_default_timeout(WITHIN_MS)
+    with EmulatorProcess(command) as process:
+        page.goto(process.ready["view"])
+        page.wait_for_selector("#link[data-state=connected]")
+        page.wait_for_function("() => starhil.store.hello")
+        assert page.evaluate("document.documentElement.scrollWidth") == 420
+        assert page.evaluate("scrollY") == 0
+        assert page.locator("#telecommand-form button").count() == 0
+        assert page.locator("#past").is_hidden()
+    page.wait_for_selector("body.past #past:not([hidden])")
+    assert "No connection to the emulator for " in page.locator("#past").text_content()
+    with EmulatorProcess(command):
+        page.wait_for_selector("#link[data-state=restarted]")
+        assert "open its new address" in page.locator("#past").text_content()
+    page.close()

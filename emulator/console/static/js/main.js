@@ -104,10 +104,12 @@ function openTab(name) {
     $(each).classList.toggle("open", on);
     if (panels[each].show) panels[each].show(on);
   }
-  history.replaceState(null, "", `${location.pathname}${location.search}#${name}`);
+  history.replaceState(null, "", `${location.pathname}${location.search}#tab=${name}`);
 }
 
-openTab(TABS.includes(location.hash.slice(1)) ? location.hash.slice(1) : "telemetry");
+// not the ID of the tab itself, to which the browser would scroll
+const named = location.hash.replace("#tab=", "");
+openTab(TABS.includes(named) ? named : "telemetry");
 
 // --- top line ---
 
