@@ -109,7 +109,15 @@ static bool read_line(struct stream *stream, char *line, int patience_ms)
             return true;
         }
         struct pollfd readable = {stream->descriptor, POLLIN, 0};
-        if (stream->descriptor < 0 || stream->filled == LINE || poll(&readable, 1u, patience_ms) <= 0) {
+        int ready = 0;
+        if (stream->filled == LINE) {
+            stream->filled = 0u; /* longer than any line of the emulator */
+            return false;
+        }
+        do {
+            ready = stream->descriptor < 0 ? 0 : poll(&readable, 1u, patience_ms);
+        } while (ready < 0 && errno == EINTR); /* a signal of the host */
+        if (ready <= 0) {
             return false;
         }
         const ssize_t count = read(stream->descriptor, stream->bytes + stream->filled, LINE - stream->filled);
