@@ -99,7 +99,7 @@ class InnerFunction:
 
     @cached_property
     def dispatcher(self) -> Any:
-        """Dispatcher of the function."""
+        """Numba's dispatcher of the function as a part of the kernels that call it."""
         from starid.kernel_library import inner_dispatcher
 
         return inner_dispatcher(self.py_func, self.options)
@@ -117,6 +117,8 @@ class InnerFunction:
 class KernelFunction(InnerFunction):
     """A kernel: calls the machine code for the types of its arguments.
 
+    Other kernels that call it contain it, as they do an inner function.
+
     Attributes
     ----------
     loaded : dict of str to callable
@@ -132,8 +134,8 @@ class KernelFunction(InnerFunction):
         self._by_kind: dict[tuple[object, ...], Function] = {}
 
     @cached_property
-    def dispatcher(self) -> Any:
-        """Numba's dispatcher of the kernel."""
+    def entry(self) -> Any:
+        """Numba's dispatcher of the kernel as Python calls it."""
         from starid.kernel_library import kernel_dispatcher
 
         return kernel_dispatcher(self)
@@ -186,6 +188,11 @@ class KernelFunction(InnerFunction):
         code = self.py_func.__code__
         key = hashlib.sha256(f"{types} {code.co_firstlineno} {processor()}".encode()).hexdigest()[:16]
         return self._folder / f"{self.py_func.__name__}-{key}{KERNEL_SUFFIX}"
+
+    @property
+    def in_cache(self) -> bool:
+        """Whether there is cached machine code, for any types."""
+        return any(self._folder.glob(f"{self.py_func.__name__}-*{KERNEL_SUFFIX}"))
 
     def read(self, types: str) -> StoredKernel | None:
         """Return the cached machine code for types of arguments; None if there is none."""
@@ -249,14 +256,14 @@ class StoredKernel(NamedTuple):
         Name of its function that Python can call.
     environments : list of (str, list)
         Python objects that the code uses, by the name of the variable that refers to them.
-    linkable : bytes
-        What numba needs to link it into other kernels, pickled.
+    description : bytes
+        What numba needs to load it, pickled.
     """
 
     code: bytes
     entry: str
     environments: list[tuple[str, list[Any]]]
-    linkable: bytes
+    description: bytes
 
 
 def _kind(value: Any) -> object:

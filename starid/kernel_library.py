@@ -1,8 +1,8 @@
-"""How numba compiles and links kernels; imported only where one is compiled.
+"""How numba compiles kernels; imported only where one is compiled.
 
 numba optimises every function, with all that it calls, and turns it into machine code, before it links it into
-its callers, where both happen again. A function of `starid.jit.inner` is called by kernels only: its code is left
-as it is until a kernel is optimised as a whole.
+its callers, where both happen again. Here, a function that a kernel calls is left as it is until the kernel is
+optimised as a whole: only a kernel that Python calls becomes machine code.
 """
 
 from __future__ import annotations
@@ -157,43 +157,45 @@ def without_literals(dispatcher: Any) -> Any:
     return dispatcher
 
 
-class LinkableCache:
-    """The disk cache of one kernel, as numba uses it to link the kernel into others."""
+class KernelCache:
+    """The disk cache of one kernel, as numba uses it: to write it, and to load what `starid.machine_code` cannot."""
 
     def __init__(self, kernel: KernelFunction) -> None:
         self._kernel = kernel
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
-        """Return a cached kernel, or None. Its intermediate code is parsed only when it is linked."""
+        """Return a cached kernel, or None."""
         target_context.refresh()
         arguments, _ = _normalize_signature(signature)
         stored = self._kernel.read(names_of_types(arguments))
         if stored is None:
             return None
-        (name, bitcode), description, *rest = pickle.loads(stored.linkable)  # noqa: S301 (this package's own cache)
-        names = ("llvm_func_name", "llvm_cpython_wrapper_name", "llvm_cfunc_wrapper_name")
+        name, description, *rest = pickle.loads(stored.description)  # noqa: S301 (this package's own cache)
+        names = ("llvm_func_name", "llvm_cpython_wrapper_name")
         engine = target_context.codegen()._engine  # noqa: SLF001
         engine._defined_symbols.update(getattr(description, each) for each in names)  # noqa: SLF001
         library = name, "object", (stored.code, _NO_CODE)
-        kernel = _CompileResult._rebuild(target_context, library, description, *rest)  # noqa: SLF001
-        kernel.library._get_module_for_linking = lambda: _llvm.parse_bitcode(bitcode)  # noqa: SLF001
-        return kernel
+        return _CompileResult._rebuild(target_context, library, description, *rest)  # noqa: SLF001
 
     def save_overload(self, _signature: Any, kernel: Any) -> None:
         """Cache a kernel that was compiled."""
         self._kernel.compilations += 1
         if kernel.library.has_dynamic_globals or kernel.reload_init:
             return  # refers to objects of this process
-        (name, _, (code, bitcode)), description, *rest = kernel._reduce()  # noqa: SLF001
+        (name, _, (code, _)), description, *rest = kernel._reduce()  # noqa: SLF001
         used = {each.env_name: each.consts for each in rest[-1] if each.consts}
         used = {kernel.environment.env_name: kernel.environment.consts, **used}
-        linkable = _dumps(((name, bitcode), description, *rest))
-        stored = StoredKernel(code, description.llvm_cpython_wrapper_name, list(used.items()), linkable)
+        stored = StoredKernel(
+            code,
+            description.llvm_cpython_wrapper_name,
+            list(used.items()),
+            _dumps((name, description, *rest)),
+        )
         self._kernel.write(names_of_types(description.argtypes), stored)
 
 
 def inner_dispatcher(function: Any, options: dict[str, Any]) -> Any:
-    """Return the dispatcher of a function of `starid.jit.inner`."""
+    """Return the dispatcher of a function that kernels call."""
     without_wrappers = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return without_literals(
         _njit(nogil=True, pipeline_class=InnerCompiler, **without_wrappers, **options)(function)
@@ -201,9 +203,9 @@ def inner_dispatcher(function: Any, options: dict[str, Any]) -> Any:
 
 
 def kernel_dispatcher(kernel: KernelFunction) -> Any:
-    """Return the dispatcher of a kernel, which caches the kernel on disk."""
-    dispatcher = _njit(nogil=True, **kernel.options)(kernel.py_func)
-    dispatcher._cache = LinkableCache(kernel)  # noqa: SLF001
+    """Return the dispatcher of a kernel that Python calls, which caches the kernel on disk."""
+    dispatcher = _njit(nogil=True, no_cfunc_wrapper=True, **kernel.options)(kernel.py_func)
+    dispatcher._cache = KernelCache(kernel)  # noqa: SLF001
     return dispatcher
 
 
@@ -215,10 +217,10 @@ def compile_kernel(kernel: KernelFunction, types: str, arguments: tuple[Any, ...
     TypeError
         `starid.jit` and numba name the types differently, so the kernel would never be found in the cache.
     """
-    signature = tuple(kernel.dispatcher.typeof_pyval(each) for each in arguments)
+    signature = tuple(kernel.entry.typeof_pyval(each) for each in arguments)
     if names_of_types(signature) != types:
         raise TypeError(f"{kernel.py_func.__name__}: arguments of types {types}, in numba {signature}")
-    return cast("Callable[..., Any]", kernel.dispatcher.compile(signature))
+    return cast("Callable[..., Any]", kernel.entry.compile(signature))
 
 
 def names_of_types(signature: Iterable[Any]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import itertools
 import math
+import subprocess
 import time
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
@@ -30,7 +31,7 @@ from starhil.emulator.pipeline.messages import (
     SolverSettings,
     as_triple,
 )
-from starhil.emulator.pipeline.precompile import kernel_cache_was_cold, start_helper
+from starhil.emulator.pipeline.precompile import start_helper
 from starhil.emulator.pipeline.preview import make_preview
 from starhil.emulator.pipeline.star_identifiers import StarIdentifiers, StarIdentifierSetup
 from starhil.emulator.sensor.dark_map import DarkMap, measure_dark_map
@@ -83,11 +84,12 @@ def make_pipeline(setup: PipelineSetup) -> tuple[Pipeline, PipelineReady] | Fail
     """Make a pipeline and warm it up; on failure, return the reason in one line."""
     begin = time.perf_counter()
     try:
+        helper = start_helper()
         pipeline = Pipeline(setup)
         images = open_images(setup.images, pipeline.camera)
         if images is not None:
             images.image(0)  # an image of the wrong size fails before the long start
-        pipeline.warm_up()
+        pipeline.warm_up(helper)
         pipeline.images = images
     except (EmulatorError, StaridError) as error:
         return Failure(str(error))
@@ -130,11 +132,11 @@ class Pipeline:
         """Source of images; None: they are rendered."""
         self._dark: DarkMap | None = None
 
-    def warm_up(self) -> None:
+    def warm_up(self, helper: subprocess.Popen[bytes] | None = None) -> None:
         """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
 
         Compiling a kernel during a run would interrupt frames for seconds, so some frames here have star
-        trails.
+        trails. A `helper` that compiles the star identifier is waited for.
         """
         camera = self.camera
         k1, k2, p1, p2, _ = camera.distortion
@@ -147,10 +149,7 @@ class Pipeline:
             p1=p1,
             p2=p2,
         )
-        attitude = Attitude.identity()
-        helper = start_helper() if kernel_cache_was_cold() else None
-        if helper is not None:
-            gc.disable()  # as in the helper
+        attitude = IDENTITY
         request = FrameRequest(
             index=0,
             truth=TruthState(attitude, ZERO_RATE),
@@ -160,6 +159,7 @@ class Pipeline:
             preview=self._setup.previews,
         )
         if helper is not None:
+            gc.disable()  # as in the helper
             for rate in _WARM_UP_RATES_RAD_S:
                 frame = self._renderer.render(Attitude.identity(), rate, exposure_s=_WARM_UP_EXPOSURE_S)
                 detect(frame.image, detection_settings(self._sensor.detection_settings(), settings))

@@ -1,7 +1,8 @@
 """Compilation of half of the kernels in a second process, in parallel with the pipeline.
 
 Kernels are compiled once after an installation or a change, and cached on disk. The second process compiles those
-of the star identifier, and first the kernel that the pipeline needs last.
+of the star identifier, and first the one that splits pairs: meanwhile the pipeline compiles the projection, which both
+need.
 """
 
 from __future__ import annotations
@@ -15,14 +16,11 @@ from starhil.emulator.parent_death_signal import end_with_parent
 from starid.projection import back_project_kernel
 
 
-def kernel_cache_was_cold() -> bool:
-    """Return whether this process had to compile the projection; the other kernels are then missing too."""
+def start_helper() -> subprocess.Popen[bytes] | None:
+    """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it."""
     kernel: Any = back_project_kernel
-    return bool(kernel.compilations)
-
-
-def start_helper() -> subprocess.Popen[bytes]:
-    """Start the process that compiles the star identifier; the caller must wait for it."""
+    if kernel.in_cache:
+        return None
     return subprocess.Popen(
         [sys.executable, "-m", "starhil.emulator.pipeline.precompile"], stdin=subprocess.DEVNULL
     )

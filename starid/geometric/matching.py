@@ -66,31 +66,6 @@ def residual(
 
 
 @inner
-def lower_median(values: Array, count: int) -> float:
-    """Lower median of the first `count` values, which are reordered in place (quickselect)."""
-    low, high, middle = 0, count - 1, (count - 1) // 2
-    while low < high:
-        pivot = values[(low + high) // 2]
-        i, j = low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while values[j] > pivot:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if middle <= j:
-            high = j
-        elif middle >= i:
-            low = i
-        else:
-            break
-    return float(values[middle])
-
-
-@inner
 def _best_star(
     index: IndexArrays,
     seen: Table,

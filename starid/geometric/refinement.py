@@ -17,7 +17,6 @@ import numpy as np
 from starid.arrays import Array, Indices
 from starid.geometric.matching import (
     BY_NOISE,
-    lower_median,
     match_detections,
     residual,
 )
@@ -51,6 +50,7 @@ from starid.geometric.settings import (
     WINDOW,
 )
 from starid.jit import inner
+from starid.small_arrays import lower_median
 
 MAX_ROUNDS: Final = 12
 """Largest number of rounds of matching and solving."""

@@ -43,6 +43,7 @@ from starid.imaging.windows import (
     TRAIL_Y,
 )
 from starid.jit import compiled_ieee
+from starid.small_arrays import copy_values
 
 SATURATED, AT_EDGE = 1, 2
 """Bits of a star's flags."""
@@ -324,8 +325,7 @@ def measure(
             target = own
             if not alone:
                 target = cleaned[:count]
-                for pixel in range(count):  # as in `starid.imaging.pairs.split_pairs`
-                    target[pixel] = own[pixel]
+                copy_values(own, target)
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
             noise = (window[NOISE] * window[NOISE], per_dn, model_error)

@@ -26,6 +26,7 @@ from starid.imaging.centroid import (
 from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y, WINDOW_COLUMNS
 from starid.jit import compiled_ieee
 from starid.photometry import EVEN_PAIR
+from starid.small_arrays import copy_values
 
 _UNKNOWNS: Final = 6
 _ITERATIONS: Final = 25
@@ -186,8 +187,8 @@ def _first_guesses(
     if best <= 0.0:
         return False
     distance = math.hypot(best_x, best_y)
-    pair[0] = star
-    pair[1] = star
+    copy_values(star, pair[0])
+    copy_values(star, pair[1])
     if distance > _FAR_SIGMA * sigma:
         pair[1, X] += best_x
         pair[1, Y] += best_y
@@ -355,8 +356,7 @@ def split_pairs(
         begin = int(windows[k, OFFSET])
         shape = (sigma, windows[k, TRAIL_X], windows[k, TRAIL_Y])
         target = cleaned[:count]
-        for pixel in range(count):  # assigning the slice would compile the text of its error message too
-            target[pixel] = pixels[begin + pixel]
+        copy_values(pixels[begin:], target)
         for entry in range(first[k], first[k + 1]):
             other = stars[neighbours[entry]]
             if other[STATE] == GOOD:
@@ -378,8 +378,8 @@ def split_pairs(
         if math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y]) < blend_px:
             _merge(pair, blend_px, stars[k])
             continue
-        stars[k] = pair[1 - faint]
-        partners[found] = pair[faint]
+        copy_values(pair[1 - faint], stars[k])
+        copy_values(pair[faint], partners[found])
         owners[found] = k
         found += 1
     return found

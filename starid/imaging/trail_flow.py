@@ -17,6 +17,7 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.jit import compiled_ieee
+from starid.small_arrays import copy_values, median
 
 FLOW_TERMS: Final = 5
 _TRANSLATION: Final = 2
@@ -164,13 +165,14 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
                 left = _mean_mismatch(start, positions, trails)
                 if left < least:
                     least = left
-                    flow[:] = start
+                    copy_values(start, flow)
     used = _TRANSLATION if count < _MIN_FOR_ROLL else _WITH_ROLL if count < _MIN_FOR_FLOW else FLOW_TERMS
-    off = np.empty(count)
+    off, ordered = np.empty(count), np.empty(count)
     for _ in range(_ROUNDS):
         for k in range(count):
             off[k], senses[k] = _mismatch(flow, positions, trails, k)
-        limit = max(_CLIP * np.median(off), _MIN_CLIP_PX)
+            ordered[k] = off[k]
+        limit = max(_CLIP * median(ordered, count), _MIN_CLIP_PX)
         kept = 0
         for k in range(count):
             if off[k] > limit:
@@ -179,7 +181,7 @@ def fit_flow(positions: Array, trails: Array, flow: Array) -> None:
                 kept += 1
         if kept < used or not _least_squares(positions, trails, senses, used, matrix, right, rows, start):
             return
-        flow[:] = start
+        copy_values(start, flow)
 
 
 @compiled_ieee
