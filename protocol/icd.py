@@ -109,7 +109,9 @@ def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDe
         reader.read(file)
     definition = reader.definition()
     errors = reader.errors if files else [f"{path}: no .toml file in this folder"]
-    return definition, [escape_controls(error) for error in errors]  # an error may quote any text of the definition
+    return definition, [
+        escape_controls(error) for error in errors
+    ]  # an error may quote any text of the definition
 
 
 def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
