@@ -29,7 +29,6 @@ from starhil.emulator.pipeline.messages import (
     PipelineSetup,
     Preview,
     SolverSettings,
-    as_triple,
 )
 from starhil.emulator.pipeline.precompile import start_helper
 from starhil.emulator.pipeline.preview import make_preview
@@ -149,7 +148,7 @@ class Pipeline:
             p1=p1,
             p2=p2,
         )
-        attitude = IDENTITY
+        attitude = Attitude.identity()
         request = FrameRequest(
             index=0,
             truth=TruthState(attitude, ZERO_RATE),

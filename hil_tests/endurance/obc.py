@@ -17,7 +17,6 @@ from starhil.hil_tests.endurance.outcome import Outcome
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort, objects_of
 from starhil.hil_tests.endurance.unit import Unit
 from starhil.hil_tests.endurance.violation import Violation, flag
-from starhil.hil_tests.judge.definition import unit_of
 from starhil.hil_tests.judge.messages import Answer, Request
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
@@ -55,7 +54,7 @@ class Obc:
         self._fixed_framing = icd.link.serial is not None and isinstance(
             icd.link.serial.framing, FixedFraming
         )
-        self._judged = unit_of(icd)
+        self._judged = oracle.judged
         self._line = SerialLine(self._judged) if icd.link.serial is not None else None
         self._objects = {} if icd.canopen is None else objects_of(self._judged)
         self._node = None if icd.canopen is None else Node(icd, self._judged)

@@ -55,7 +55,7 @@ class Oracle:
         sigma_arcsec: tuple[float, float],
     ) -> None:
         self._icd = icd
-        self._judged = unit_of(icd)
+        self.judged: Final = unit_of(icd)
         self._start_unix_ns = round(start_unix_s * SECOND_NS)
         calibrated = {"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"}
         self._defaults: dict[str, Known | None] = {
@@ -222,7 +222,7 @@ class Oracle:
 
     def is_outside(self, row: Row | None, data: bytes) -> bool:
         """Return whether a value of a telecommand is outside its limits."""
-        fields = () if row is None else self._judged.telecommands[row.name].named.values()
+        fields = () if row is None else self.judged.telecommands[row.name].named.values()
         return any(field.fault(field.read(data)) for field in fields)
 
     def _mode_verdict(self, wanted: str) -> ErrorCode | None:
@@ -262,7 +262,7 @@ class Oracle:
 
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
         """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
-        values = self._judged.telecommands[row.name].decode(data)
+        values = self.judged.telecommands[row.name].decode(data)
         found: dict[str, Any] = dict(row.arguments)
         for name, field in row.named_fields.items():
             value = values[name]
@@ -341,7 +341,7 @@ class Oracle:
         """Judge the telemetry of a row, received now."""
         if len(data) != row.size:
             raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
-        values = self._judged.telemetry[row.name].decode(data)
+        values = self.judged.telemetry[row.name].decode(data)
         by_quantity: dict[str, tuple[Field, Value]] = {}
         for name, value in values.items():
             field = row.named_fields[name]

@@ -153,6 +153,7 @@ class LifeRun:
 
     async def _fault(self, step: Step) -> None:
         fault = step["fault"]
+        self._obc.hear()  # what was sent before
         self._unit.fault(fault)
         oracle = self._oracle
         if "optical" in fault:

@@ -12,7 +12,7 @@ from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import MemoryStorage
+from starhil.protocol.canopen import MemoryStorage, StorageError
 from starhil.protocol.cubespace_serial import encode_request
 from starhil.protocol.messages import Request
 from tests.emulator.wire import Wire
@@ -119,3 +119,16 @@ def test_another_parameter_leaves_the_node_id_that_lss_stored(node_bench):
         assert storage.load("lss")["node_id"] == b"\x30"
 
     canopen_link(node_bench, test, storage)
+
+
+def test_a_stored_node_id_that_cannot_be_deleted_is_a_fault_of_the_store(node_bench, caplog):
+    class Kept(MemoryStorage):
+        def clear(self, group):
+            raise StorageError(f"{group}: read-only")
+
+    def test(_bus):
+        caplog.clear()
+        node_bench.device.parameters.set({"canopen_node": 50})
+        assert "lss: read-only" in caplog.text
+
+    canopen_link(node_bench, test, Kept())

@@ -259,6 +259,11 @@ def test_a_start_on_a_full_disk_is_not_counted_at_the_next():
     assert violation_of(status, full, power, status, free, status, power, status) == ""
 
 
+def test_what_was_sent_before_a_fault_is_no_output_of_an_unresponsive_unit():
+    life = Life("oresat", 1, ("canopen",), {}, ({"do": "fault", "fault": {"device": {"stuck": True}}},))
+    assert run_once(life).violation == ""
+
+
 def test_one_byte_of_data_is_not_taken_for_a_refusal():
     row = load_unit("cubestar").telemetry["card_progress"]
     assert row.size == 1
