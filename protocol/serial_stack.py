@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Final, TypeVar
 
 from starhil.protocol import cubespace
@@ -58,9 +59,6 @@ from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
-
-_UNASKED: Final = (ReplyKind.UNSOLICITED, ReplyKind.EVENT, ReplyKind.BURST)
-"""Kinds of messages that are not the reply to the pending request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,23 +125,32 @@ class ReplyFormat:
 
     framing: Framing
     headers: Mapping[ReplyKind, Header]
-    starts: dict[int | None, list[ReplyKind]] = field(init=False)
-    """First byte of a header, None if any → kinds of replies to a request."""
-    ids: dict[ReplyKind, int] = field(init=False)
-    """Kind → place of the ID in the header, if it has one."""
-    sizes: dict[ReplyKind, int] = field(init=False)
-    """Kind → size of the header in messages without a class."""
 
-    def __post_init__(self) -> None:
-        self.starts, self.ids, self.sizes = {}, {}, {}
+    @cached_property
+    def starts(self) -> Mapping[int | None, list[ReplyKind]]:
+        """First byte of a header, None if any → kinds of replies to a request."""
+        found: dict[int | None, list[ReplyKind]] = {}
         for kind, header in self.headers.items():
-            roles = [item.role for item in header.fields]
-            self.sizes[kind] = header.size("")
-            if "id" in roles:
-                self.ids[kind] = roles.index("id")
             if kind is not ReplyKind.BURST:
                 start = header.fields[0].const if header.fields else None
-                self.starts.setdefault(start, []).append(kind)
+                found.setdefault(start, []).append(kind)
+        return found
+
+    @cached_property
+    def ids(self) -> Mapping[ReplyKind, int]:
+        """Kind → place of the ID in the header, if it has one."""
+        roles = {kind: [item.role for item in header.fields] for kind, header in self.headers.items()}
+        return {kind: found.index("id") for kind, found in roles.items() if "id" in found}
+
+    @cached_property
+    def sizes(self) -> Mapping[ReplyKind, int]:
+        """Kind → size of the header."""
+        return {kind: header.size("") for kind, header in self.headers.items()}
+
+    @cached_property
+    def coded(self) -> frozenset[ReplyKind]:
+        """Kinds whose header has an error code."""
+        return frozenset(kind for kind, header in self.headers.items() if "status" in header.roles)
 
 
 class SerialStack:
@@ -500,10 +507,9 @@ class HostReceiver:
         if self._echo is not None:
             return self._check_echo(body)
         stack = self._stack
-        told = self._kind_in_dialect(body) if stack.dialects else ReplyKind.TELEMETRY
-        if isinstance(told, LinkFault):
-            return told
-        opened = stack.open(self._format.headers[told], body)
+        if stack.dialects:
+            return self._reply_in_dialect(body)
+        opened = stack.open(stack.reply_header, body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened
@@ -515,8 +521,8 @@ class HostReceiver:
         klass = envelope.klass
         if not klass and pending is not None and pending.id == row_id:
             klass = pending.klass
-        kind = self._kind(told, envelope, klass, row_id)
-        if values.get("final", 1) and kind not in _UNASKED:
+        kind = self._kind(envelope, klass, row_id)
+        if values.get("final", 1) and kind is not ReplyKind.UNSOLICITED:
             self._pending = None
         return Reply(
             kind,
@@ -543,29 +549,28 @@ class HostReceiver:
         self._pending = None
         return Reply(ReplyKind.ACK, pending.id, klass=pending.klass)
 
-    def _kind(self, told: ReplyKind, envelope: Envelope, klass: str, row_id: int) -> ReplyKind:
-        """Return the kind of a reply; `told` is the one that the dialect told, if the link has any."""
+    def _kind(self, envelope: Envelope, klass: str, row_id: int) -> ReplyKind:
         values, stack = envelope.values, self._stack
         if values.get("status", 0) or not values.get("ack", 1):
             return ReplyKind.NACK
-        if stack.dialects:
-            return told
         if stack.classes.unsolicited(values.get("class")):
             return ReplyKind.UNSOLICITED
         telecommand = stack.kind_of(row_id, klass) is RequestKind.TELECOMMAND
         return ReplyKind.ACK if telecommand else ReplyKind.TELEMETRY
 
-    def _kind_in_dialect(self, body: bytes) -> ReplyKind | LinkFault:
-        """Return the kind of a reply by its start byte, row and size; an ACK may be a NACK by its code."""
+    def _reply_in_dialect(self, body: bytes) -> Reply | LinkFault:
+        """Return the reply in a body, whose kind follows from its start byte, row and size."""
         form, pending = self._format, self._pending
         if len(body) == form.sizes[ReplyKind.BURST] + cubespace.BURST_SIZE and self._is_burst(body):
-            return ReplyKind.BURST
+            return Reply(ReplyKind.BURST, BURST_ID, body[form.sizes[ReplyKind.BURST] :])
         kinds = form.starts.get(body[0]) or form.starts.get(None)
         if kinds is None:
             text = f"message {body[1]} with the start byte of a request"
             return LinkFault(FaultKind.UART_PROTOCOL, text)
+        known = pending is not None
         if kinds[0] in form.ids:
             row_id = body[form.ids[kinds[0]]]
+            known = pending is not None and pending.id == row_id
         elif pending is not None:
             row_id = pending.id
         else:
@@ -575,15 +580,20 @@ class HostReceiver:
         elif row_id < FIRST_TELEMETRY_ID:
             kind = ReplyKind.ACK
         else:
-            known = pending is not None and pending.id == row_id
             coded = ReplyKind.NACK in kinds and len(body) == form.sizes[ReplyKind.NACK]
-            refused = coded and known and self._reply_size != 1
-            kind = ReplyKind.NACK if refused else ReplyKind.TELEMETRY
-        codes = len(body) - form.sizes[kind] + 1
-        if codes != 1 and "status" in form.headers[kind].roles:
-            name = "ACK of telecommand" if kind is ReplyKind.ACK else "NACK of"
-            return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
-        return kind
+            kind = ReplyKind.NACK if coded and known and self._reply_size != 1 else ReplyKind.TELEMETRY
+        data = body[form.sizes[kind] :]
+        code: ErrorCode | int = ErrorCode.OK
+        if kind in form.coded:
+            codes = len(body) - form.sizes[kind] + 1
+            if codes != 1:
+                name = "ACK of telecommand" if kind is ReplyKind.ACK else "NACK of"
+                return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
+            code = error_code(body[-1])
+            kind = ReplyKind.NACK if code else kind
+        if kind not in (ReplyKind.UNSOLICITED, ReplyKind.EVENT):
+            self._pending = None
+        return Reply(kind, row_id, data, code, klass=pending.klass if known and pending is not None else "")
 
     def _is_burst(self, body: bytes) -> bool:
         """Return whether a body with the size of a burst packet is one."""
