@@ -27,15 +27,28 @@ DIALOGUES: Final = (
     Dialogue("expedited-download", "expedited download is confirmed", "2b {number} 39 30 > 60 {number} 00000000; value 39 30", "CiA 301 7.2.4.3.3", intrusive=True),
     Dialogue("no-size", "expedited download without a size", "22 {number} 39 30 > 60 {number} 00000000; value 39 30", "CiA 301 7.2.4.3.3", intrusive=True),
     Dialogue("upload-toggle", "toggle bit not alternated in an upload", "40 {text} > *; 70 > abort TOGGLE {text}; 60 > abort COMMAND; 40 {text} > *; 60 > *; 60 > abort TOGGLE {text}; 60 > abort COMMAND"),
-    Dialogue("segmented-download", "segmented download of a number", "21 {number} 02 > 60 {number} 00000000; 0b 39 30 > 20 00000000000000; value 39 30; 20 {number} > 60 {number} 00000000; 0b 38 30 > 20 00000000000000; value 38 30", "CiA 301 7.2.4.3.4", intrusive=True),
+    Dialogue(
+        "segmented-download", "segmented download of a number",
+        "21 {number} 02 > 60 {number} 00000000; 0b 39 30 > 20 00000000000000; value 39 30; 20 {number} > 60 {number} 00000000; 0b 38 30 > 20 00000000000000; "
+        "value 38 30",
+        "CiA 301 7.2.4.3.4", intrusive=True,
+    ),
     Dialogue("download-in-parts", "segmented download in two segments", "21 {number} 02 > *; 0c {low} > 20 00000000000000; 1d {high} > 30 00000000000000; value {new}", "CiA 301 7.2.4.3.4", intrusive=True),
-    Dialogue("download-toggle", "toggle bit not alternated in a download", "21 {number} 02 > *; 1b 11 11 > abort TOGGLE {number}; 01 > abort COMMAND; 21 {number} 02 > *; 0c 11 > *; 0d 11 > abort TOGGLE {number}; kept", intrusive=True),
+    Dialogue(
+        "download-toggle", "toggle bit not alternated in a download",
+        "21 {number} 02 > *; 1b 11 11 > abort TOGGLE {number}; 01 > abort COMMAND; 21 {number} 02 > *; 0c 11 > *; 0d 11 > abort TOGGLE {number}; kept",
+        intrusive=True,
+    ),
     Dialogue("announced-high", "announced size larger than the object", "21 {number} 03 > unless abort LENGTH|LENGTH_HIGH {number}; 09 01 01 01 > abort LENGTH|LENGTH_HIGH {number}", intrusive=True),
     Dialogue("sent-high", "more bytes sent than the object has", "20 {number} > *; 09 01 01 01 > abort LENGTH|LENGTH_HIGH {number}", intrusive=True),
     Dialogue("sent-low", "fewer bytes sent than the object has", "20 {number} > *; 0d {low} > abort LENGTH|LENGTH_LOW {number}; kept", intrusive=True),
     Dialogue("announced-differs", "fewer bytes sent than announced", "21 {number} 02 > *; 0d 01 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}", intrusive=True),
     Dialogue("unknown-command", "unknown command specifier", "e0 00 10 00 > abort COMMAND"),
-    Dialogue("no-transfer", "segments without a transfer", "60 > abort COMMAND; 70 > abort COMMAND; 00 > abort COMMAND; 01 > abort COMMAND; a1 > abort COMMAND; a2 01 7f > abort COMMAND; a3 > abort COMMAND; c1 > abort COMMAND"),
+    Dialogue(
+        "no-transfer", "segments without a transfer",
+        "60 > abort COMMAND; 70 > abort COMMAND; 00 > abort COMMAND; 01 > abort COMMAND; a1 > abort COMMAND; a2 01 7f > abort COMMAND; a3 > abort COMMAND; "
+        "c1 > abort COMMAND",
+    ),
     Dialogue("wrong-segment", "download segment within an upload", "40 {text} > *; 00 > abort COMMAND; 60 > abort COMMAND"),
     Dialogue("client-abort", "an abort by the client ends the transfer and is not answered", "40 {text} > *; 80 {text} 00000405 > silence; 60 > abort COMMAND"),
     Dialogue("new-request", "a new request replaces the active transfer", "40 {text} > *; 60 > *; 40 00 10 00 > 43 00 10 00 .. .. .. ..; 60 > abort COMMAND", "CiA 301 7.2.4.3.6"),
@@ -43,16 +56,40 @@ DIALOGUES: Final = (
     Dialogue("stopped", "no SDO in STOPPED", "40 {text} > *; nmt 2; 60 > silence; 40 00 10 00 > silence", "CiA 301 7.3.2.2.5", intrusive=True),
 )  # fmt: skip
 BLOCK_DIALOGUES: Final = (
-    Dialogue("upload-block-size", "block size 0 and above 127", "a4 {text} 00 > abort BLOCK_SIZE {text}; a4 {text} 80 > abort BLOCK_SIZE {text}; a4 {text} 01 > *; a3 > segment 1; a2 01 00 > abort BLOCK_SIZE {text}; a4 {text} 01 > *; a3 > segment 1; a2 01 80 > abort BLOCK_SIZE {text}"),
+    Dialogue(
+        "upload-block-size", "block size 0 and above 127",
+        "a4 {text} 00 > abort BLOCK_SIZE {text}; a4 {text} 80 > abort BLOCK_SIZE {text}; a4 {text} 01 > *; a3 > segment 1; a2 01 00 > abort BLOCK_SIZE {text}; "
+        "a4 {text} 01 > *; a3 > segment 1; a2 01 80 > abort BLOCK_SIZE {text}",
+    ),
     Dialogue("upload-sequence", "more segments confirmed than were sent", "a4 {text} 02 > *; a3 > segment 1; > segment 2; a2 03 02 > abort SEQUENCE {text}"),
-    Dialogue("upload-order", "requests of a block upload out of order", "a4 {text} 01 > *; a2 01 01 > abort COMMAND; a4 {text} 01 > *; a1 > abort COMMAND; a4 {text} 01 > *; 60 > abort COMMAND; a4 {text} 01 > *; a3 > segment 1; a1 > abort COMMAND"),
+    Dialogue(
+        "upload-order", "requests of a block upload out of order",
+        "a4 {text} 01 > *; a2 01 01 > abort COMMAND; a4 {text} 01 > *; a1 > abort COMMAND; a4 {text} 01 > *; 60 > abort COMMAND; a4 {text} 01 > *; "
+        "a3 > segment 1; a1 > abort COMMAND",
+    ),
     Dialogue("upload-refused", "block upload of objects that cannot be read", "a4 05 00 00 7f > abort NO_OBJECT 050000; a4 {write_only} 7f > abort WRITE_ONLY {write_only}"),
     Dialogue("upload-time-out", "a block upload whose client stops sending times out", "a4 {text} 02 > *; a3 > segment 1; > segment 2; wait > abort TIMEOUT {text}"),
-    Dialogue("download", "block download with CRC", "c6 {number} 02 > block {number}; 81 39 30 > a2 01 *; d5 5e 89 > a1 00000000000000; value 39 30; c4 {number} > block {number}; 81 38 30 > a2 01 *; d5 6f ba > a1 00000000000000; value 38 30; c2 {number} 02 > block {number}; 81 37 30 > a2 01 *; d5 > a1 00000000000000; value 37 30; 60 > abort COMMAND", "CiA 301 7.2.4.3.9", intrusive=True),
+    Dialogue(
+        "download", "block download with CRC",
+        "c6 {number} 02 > block {number}; 81 39 30 > a2 01 *; d5 5e 89 > a1 00000000000000; value 39 30; c4 {number} > block {number}; 81 38 30 > a2 01 *; "
+        "d5 6f ba > a1 00000000000000; value 38 30; c2 {number} 02 > block {number}; 81 37 30 > a2 01 *; d5 > a1 00000000000000; value 37 30; "
+        "60 > abort COMMAND",
+        "CiA 301 7.2.4.3.9", intrusive=True,
+    ),
     Dialogue("download-crc", "wrong CRC of a block download", "c6 {number} 02 > block {number}; 81 {new} > *; d5 {bad_crc} > abort CRC {number}; kept", intrusive=True),
     Dialogue("download-gap", "a lost segment is requested again", "c6 {number} 02 > block {number}; 82 {new} > a2 00 *; 81 {new} > a2 01 *; d5 {crc} > a1 00000000000000", "CiA 301 7.2.4.3.11", intrusive=True),
-    Dialogue("download-length", "block downloads of wrong length", "c0 {number} > block {number}; 81 39 30 01 > *; d1 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}; c0 {number} > block {number}; 81 39 30 01 > *; d9 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}; c2 {number} 02 > block {number}; 81 39 30 01 > *; d9 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}; kept", intrusive=True),
-    Dialogue("download-announced", "announced size that differs from the size of the object", "c2 {number} 03 > unless abort LENGTH|LENGTH_HIGH {number}; 81 39 30 01 > *; d1 > abort LENGTH|LENGTH_HIGH {number}", intrusive=True),
+    Dialogue(
+        "download-length", "block downloads of wrong length",
+        "c0 {number} > block {number}; 81 39 30 01 > *; d1 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}; c0 {number} > block {number}; 81 39 30 01 > *; "
+        "d9 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}; c2 {number} 02 > block {number}; 81 39 30 01 > *; "
+        "d9 > abort LENGTH|LENGTH_HIGH|LENGTH_LOW {number}; kept",
+        intrusive=True,
+    ),
+    Dialogue(
+        "download-announced", "announced size that differs from the size of the object",
+        "c2 {number} 03 > unless abort LENGTH|LENGTH_HIGH {number}; 81 39 30 01 > *; d1 > abort LENGTH|LENGTH_HIGH {number}",
+        intrusive=True,
+    ),
     Dialogue("download-abort", "an abort by the client ends a block download", "c6 {number} 02 > block {number}; 80 {number} 00000405 > silence; 60 > abort COMMAND", intrusive=True),
     Dialogue("download-refused", "block download to objects that cannot be written", "c2 00 10 00 04 > abort READ_ONLY 001000; c2 05 00 00 04 > abort NO_OBJECT 050000", intrusive=True),
 )  # fmt: skip

@@ -96,7 +96,11 @@ def groups(probe: CanopenProbe) -> None:
 
 DIALOGUES: Final = (
     Dialogue("global", "switch state global", "04 > silence; 5e > silence; 04 01 > silence; 5e > 5e *; 04 > -", "CiA 305 switch state global"),
-    Dialogue("inquire", "inquire identity and node ID", "5a > 5a {vendor} 000000; 5b > 5b {product} 000000; 5c > 5c {revision} 000000; 5d > 5d {serial} 000000; 5e > 5e {node} 000000000000; 04 > -", "CiA 305 inquire"),
+    Dialogue(
+        "inquire", "inquire identity and node ID",
+        "5a > 5a {vendor} 000000; 5b > 5b {product} 000000; 5c > 5c {revision} 000000; 5d > 5d {serial} 000000; 5e > 5e {node} 000000000000; 04 > -",
+        "CiA 305 inquire",
+    ),
     Dialogue("waiting", "a waiting node ignores configuration commands", "04 > -; 11 05 > silence; 13 00 02 > silence; 17 > silence; 5a > silence; 5e > silence"),
     Dialogue("configured", "a configured node does not take part in Fastscan", "04 > -; 51 00 00 00 00 80 > silence; 4c > silence", "CiA 305 fastscan"),
     Dialogue("states", "LSS works in every NMT state", "04 > -; nmt 1; 04 01 > -; 5e > 5e {node} 000000000000; 04 > -; nmt 2; 04 01 > -; 5e > 5e {node} 000000000000; 04 > -"),
