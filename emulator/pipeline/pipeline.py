@@ -29,6 +29,7 @@ from starhil.emulator.pipeline.messages import (
     PipelineSetup,
     Preview,
     SolverSettings,
+    as_triple,
 )
 from starhil.emulator.pipeline.precompile import start_helper
 from starhil.emulator.pipeline.preview import make_preview

@@ -13,8 +13,8 @@ from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import MemoryStorage, StorageError
-from starhil.protocol.cubespace_serial import encode_request
 from starhil.protocol.messages import Request
+from starhil.protocol.serial_stack import build_serial_stack
 from tests.emulator.wire import Wire
 
 NODE = 44
@@ -45,7 +45,7 @@ def test_a_request_in_two_pieces_is_answered(bench):
         uart = Wire()
         link = SerialLink(bench.requests, uart)
         await link.start()
-        data = encode_request(Request.of(128))
+        data = build_serial_stack(bench.icd).encode_request(Request.of(128))
         uart.arrive(data[:2])
         bench.step(0.01)
         uart.arrive(data[2:])
