@@ -38,7 +38,7 @@ from starhil.hil_tests.bench import LinkOptions
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError, DeviceError
-from starhil.hil_tests.results import percentile
+from starhil.hil_tests.load_figures import percentile
 from starhil.hil_tests.session_run import SessionRequest, run_session
 
 WARM_UP_SHARE = 0.25
