@@ -14,7 +14,6 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.pipeline.messages import ZERO, Quaternion, Triple, as_quaternion, as_triple
-from starhil.protocol.conventions import Conventions
 from starid.attitude import Attitude
 
 _IDENTITY: Final = Attitude.identity()
@@ -111,7 +110,7 @@ def reported(device: Device) -> Reported:
     if not last.valid:
         return Reported(last.reason)
     measured = Attitude(np.array(last.result.quaternion_xyzw))
-    mounting, axes = mounting_turns(device.parameters), axes_turns(device.icd.conventions)
+    mounting, axes = mounting_turns(device.parameters), axes_turns(device.icd.conventions.rows)
     mounted = reduce(Attitude.rotated, mounting, measured)
     attitude = reduce(Attitude.rotated, axes, mounted)
     rate = as_triple(_turned(np.array(last.rate_rad_s), mounting + axes))
@@ -120,7 +119,7 @@ def reported(device: Device) -> Reported:
 
 def to_reported_frame(device: Device, vector: np.ndarray) -> np.ndarray:
     """Turn a vector (3,) from the sensor frame to the reported frame."""
-    return _turned(vector, mounting_turns(device.parameters) + axes_turns(device.icd.conventions))
+    return _turned(vector, mounting_turns(device.parameters) + axes_turns(device.icd.conventions.rows))
 
 
 def _turned(vector: np.ndarray, turns: list[np.ndarray]) -> np.ndarray:
@@ -145,9 +144,9 @@ def _in_convention(attitude: Attitude, device: Device) -> Quaternion:
 
 
 @cache
-def axes_turns(conventions: Conventions) -> list[np.ndarray]:
-    """Return the rotation vector from sensor axes to reported axes, radians."""
-    matrix = np.array(conventions.rows, dtype=np.float64)
+def axes_turns(rows: tuple[tuple[int, int, int], ...]) -> list[np.ndarray]:
+    """Return the rotation vector from sensor axes to reported axes, radians, for the rows of `Conventions.rows`."""
+    matrix = np.array(rows, dtype=np.float64)
     *axis, w = Attitude.from_matrix(matrix.T).quaternion_xyzw.tolist()
     sine = float(np.linalg.norm(axis))
     return [np.array(axis) / sine * 2.0 * math.atan2(sine, w)] if sine > 0.0 else []
