@@ -63,7 +63,7 @@ def test_a_scenario_from_the_page_starts_now(run, tmp_path):
             await emulation.stepper.step(0.2)
             assert run.first_head().faults.describe() == {"optical": {"blank": True}}
             missing = await page.ask(do="control", request={"do": "scenario", "name": "no_such"})
-            assert "no such file" in missing["error"]
+            assert "not found" in missing["error"]
 
     run(scenario, options=OPTIONS)
 
