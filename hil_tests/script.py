@@ -200,7 +200,7 @@ class Step(Keys):
     def _fits_its_row(self, info: ValidationInfo) -> Self:
         problems = [*self._problems(info)]
         if problems:
-            raise ValueError("\n".join(problems))
+            raise ValueError(*problems)
         self._number = (info.context or {})["number"]
         self.name = self.name or self.default_name.format(self=self)
         return self
@@ -544,7 +544,9 @@ def _texts_of(error: ErrorDetails, location: str, model: type[Keys]) -> Iterator
     path = [str(step) for step in error["loc"]]
     key = path[-1] if path else ""
     table = TABLES.get(path[0], model) if len(path) > 1 else model
-    for text in _explanation(error, key, _keys_of(table)).split("\n"):
+    problem = error.get("ctx", {}).get("error")
+    found = problem.args if problem is not None else [_explanation(error, key, _keys_of(table))]
+    for text in found:
         if text.startswith("must "):
             yield ": ".join([location, *path[:-1], f"'{key}' {text}"])
         else:
@@ -565,8 +567,6 @@ def _explanation(error: ErrorDetails, key: str, known: list[str]) -> str:
         case "literal_error":
             allowed = [word for word in re.findall(r"\w+", context["expected"]) if word != "or"]
             return f"must be one of {', '.join(allowed)}, not {given!r}{did_you_mean(str(given), allowed)}"
-        case "value_error":
-            return str(context["error"])
         case kind:
             return f"must be {NEEDED.get(kind, error['msg'])}, not {given!r}"
 

@@ -270,8 +270,14 @@ def test_one_byte_of_data_is_not_taken_for_a_refusal():
     assert violation_of(request_on("serial", row, "be75")) == ""
 
 
+def report(monkeypatch, quantity, value):
+    """Let the device report a value of a quantity, whatever its state."""
+    wrong = replace(QUANTITIES[quantity], function=lambda _shot: value)
+    monkeypatch.setitem(QUANTITIES, quantity, wrong)
+
+
 def test_a_parameter_is_followed_by_its_selection(monkeypatch):
-    monkeypatch.setitem(QUANTITIES, "selected.value", lambda _shot: 1.0)
+    report(monkeypatch, "selected.value", 1.0)
     icd = load_unit("cubestar")
     select = icd.telecommands["select_parameter"]
     data = select.encode({"parameter": icd.parameters["exposure"].id}).hex()
@@ -280,7 +286,7 @@ def test_a_parameter_is_followed_by_its_selection(monkeypatch):
 
 
 def test_a_result_that_is_not_that_of_the_last_telecommand_is_found(monkeypatch):
-    monkeypatch.setitem(QUANTITIES, "request.error", lambda _shot: "ok")
+    report(monkeypatch, "request.error", "ok")
     icd = load_unit("cubestar")
     unknown = {"do": "request", "link": "serial", "row": ["", 60, "telecommand"]}
     found = violation_of(unknown, request_on("serial", icd.telemetry["acknowledge"]))
