@@ -378,7 +378,7 @@ def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
     path = find("profile", name_or_path)
     if relative_to is not None and not path.is_absolute():
         path = relative_to / path
-    if not path.is_file():
+    if not path.exists():
         raise EmulatorError(not_found("profile", name_or_path))
     return path
 

@@ -242,14 +242,14 @@ def _outcome_of_early_end(error: EmulatorProcessError) -> Outcome:
 
 def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
     """Start an emulator with the requested links."""
-    folder = stack.enter_context(temporary_folder("starhil-conformance-"))
+    folder = stack.enter_context(temporary_folder("starhil-"))
     needs_bus = request.can is not None or request.canopen_node is not None
     channel = "off"
     if needs_bus:
         channel = (
             stack.enter_context(private_can_bus()) if request.can in (None, "auto") else str(request.can)
         )
-    extra = ["--control", "auto"]
+    extra = ["--control", f"unix:{folder}/control"]
     if request.canopen_node is not None:
         extra += ["--canopen", str(request.canopen_node)]
     if request.speed != 1.0:

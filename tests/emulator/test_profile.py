@@ -294,7 +294,7 @@ def test_a_byte_order_mark_is_accepted(tmp_path):
 def test_a_device_in_place_of_a_profile_is_rejected(tmp_path):
     path = tmp_path / "zero.toml"
     path.symlink_to("/dev/zero")
-    with pytest.raises(EmulatorError, match="not found"):
+    with pytest.raises(EmulatorError, match="not a regular file"):
         load_profile(str(path))
 
 

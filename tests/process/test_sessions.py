@@ -62,7 +62,7 @@ def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(emulator, 
         (
             "[[step]]\nread = 'quaternoin'\n",
             ["--start"],
-            "wrong.toml: step 1: unknown telemetry row 'quaternoin'",
+            "wrong.toml: step 1: read: unknown telemetry row 'quaternoin'",
         ),
         ("[[step]]\nwait_s = 0\n", ["--serial", "/dev/no-such-port"], "/dev/no-such-port"),
         ("[[step]]\nwait_s = 0\n", ["--can", "socketcand:127.0.0.1:1/vcan0"], "cannot connect"),

@@ -58,7 +58,7 @@ def test_every_reader_rejects_a_pipe_in_one_line_without_waiting(tmp_path, name)
     with pytest.raises((EmulatorError, BenchError, ProtocolError)) as refusal:
         READERS[name](path)
     assert str(path) in str(refusal.value)
-    assert "not a regular file" in str(refusal.value) or "no such file" in str(refusal.value)
+    assert "not a regular file" in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 
