@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from typing import Any, Final, Protocol
 
-from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge import can, canopen
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
@@ -123,11 +122,11 @@ class CanPort:
 
 
 class _TransferEndedError(Exception):
-    """A transfer that the node aborts, or does not answer: code 0."""
+    """A transfer that ended early, with what is then heard: an abort or a malformed response; None for no response."""
 
-    def __init__(self, code: int) -> None:
-        super().__init__(code)
-        self.code = code
+    def __init__(self, answer: Answer | None) -> None:
+        super().__init__(answer)
+        self.answer = answer
 
 
 Objects = dict[tuple[str, str], list[canopen.Entry]]
@@ -163,9 +162,9 @@ class CanopenPort:
                     (entry,) = self._objects[row.kind, row.name]
                     self._download(entry, canopen.written(entry, row, request.data))
             except _TransferEndedError as ended:
-                if not ended.code:
+                if ended.answer is None:
                     continue
-                answer = Answer("nack", ended.code)
+                answer = ended.answer
             self._answers.append((self._at_s, answer))
 
     def cut(self, request: Request, share: float) -> None:
@@ -209,11 +208,11 @@ class CanopenPort:
         self._deliver(CanFrame(SDO_RECEIVE + self.node, data.ljust(SDO_SIZE, b"\0"), extended=False))
         responses = self._sort()
         if not responses:
-            raise _TransferEndedError(0)
+            raise _TransferEndedError(None)
         if len(responses) > 1 or len(responses[0]) != SDO_SIZE:
-            raise Violation(f"canopen: {b' '.join(responses).hex(' ')} in answer to the SDO {data.hex(' ')}")
+            raise _TransferEndedError(Answer("malformed", data=b"".join(responses)))
         if responses[0][0] == canopen.ABORT:
-            raise _TransferEndedError(canopen.abort_code(responses[0]))
+            raise _TransferEndedError(Answer("nack", canopen.abort_code(responses[0])))
         return responses[0]
 
     def _sort(self) -> list[bytes]:

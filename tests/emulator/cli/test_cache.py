@@ -20,7 +20,7 @@ from tests.emulator.workers import WORKER
 MEGABYTE = np.zeros(125_000)
 RECORDS_SETUP = (
     WORKER.replace("{", "{{").replace("}", "}}")
-    + "open('{path}', 'w').write(f'{{setup.previews}} {{setup.sky}}')\nsend({outcome})\nreceive()\n"
+    + "text = f'{{setup.previews}} {{setup.sky}}'\nopen('{path}', 'w').write(text)\nsend({outcome})\nreceive()\n"
 )
 
 

@@ -264,6 +264,15 @@ def test_what_was_sent_before_a_fault_is_no_output_of_an_unresponsive_unit():
     assert run_once(life).violation == ""
 
 
+def test_an_answer_that_a_faulty_bus_has_garbled_is_no_violation():
+    fault = {"do": "fault", "fault": {"can": {"corrupt": 0.3, "junk": 0.3}}}
+    reads = [
+        {"do": "request", "link": "canopen", "row": ["telemetry", number, "telemetry"]} for number in (2, 3)
+    ]
+    life = Life("oresat", 1, ("canopen",), {}, (fault, *60 * reads))
+    assert run_once(life).violation == ""
+
+
 def test_one_byte_of_data_is_not_taken_for_a_refusal():
     row = load_unit("cubestar").telemetry["card_progress"]
     assert row.size == 1
