@@ -54,7 +54,12 @@ def write_package(folder: Path, *, slope: float = 2.0) -> None:
 def run(folder: Path) -> list[str]:
     """Result of the kernel in a new process, and how often its machine code was loaded."""
     done = subprocess.run(
-        [sys.executable, "-c", "import other_kernels.outer"],
+        [
+            sys.executable,
+            "-B",
+            "-c",
+            "import other_kernels.outer",
+        ],  # bytecode is compared by the second of its source
         cwd=folder,
         capture_output=True,
         text=True,
