@@ -198,7 +198,7 @@ def main() -> int:
     good = report(comparisons, console)
     plot(comparisons, out / "error.png")
     console.print(
-        f"Images: {out}/error.png, {out}/serial/image_256.png, {out}/can/image_512.png; logs in the same folders.\n"
+        f"Images: {', '.join(map(str, sorted(out.rglob('*.png'))))}; logs in the same folders.\n"
         "The images fill 235×235 and 469×469 pixels of the sizes that the unit downloads; the rest is black."
     )
     console.print(
