@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from pathlib import Path
 from typing import Self
@@ -11,7 +12,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import format_candump
 
 
-class WireLog:
+class WireLog(ABC):
     """A text log of sent and received items, written line by line.
 
     An existing file is replaced; `now` returns seconds since 1970-01-01 UTC.
@@ -21,9 +22,9 @@ class WireLog:
         self._now = now
         self._file = path.open("w", encoding="utf-8", buffering=1)
 
+    @abstractmethod
     def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:
         """Format one line, without the newline."""
-        raise NotImplementedError
 
     def _write(self, line: str) -> None:
         if not self._file.closed:
@@ -37,8 +38,9 @@ class WireLog:
         """Log an item that the transport has received."""
         self._write(self._line(self._now(), "RX", item))
 
+    @abstractmethod
     def note(self, text: str) -> None:
-        """Write a comment line; a format without comments drops it."""
+        """Write a comment line, if the format has any."""
 
     def close(self) -> None:
         """Close the file; later items are not logged."""
@@ -77,6 +79,9 @@ class CandumpLog(WireLog):
     def __init__(self, path: Path, bus: str, *, now: Callable[[], float] = time.time) -> None:
         super().__init__(path, now=now)
         self._bus = bus
+
+    def note(self, text: str) -> None:
+        """Drop a comment: the format has none."""
 
     def _line(self, time_s: float, direction: str, item: bytes | CanFrame) -> str:  # noqa: ARG002 -- not in the format
         frame = item if isinstance(item, CanFrame) else CanFrame(0, item)

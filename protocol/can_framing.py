@@ -6,7 +6,7 @@
     one frame  up to 8 bytes of data
     segment    7 bytes of data, fewer in the last one, then the number of remaining segments
 
-A message of up to 8 bytes is one frame, a longer one is segmented. Its type tells the kind of message and whether it
+A message of up to 8 bytes is one frame, a longer one is segmented. Its type gives the kind of message and whether it
 is a segment (`REQUEST_TYPES`, `REPLY_TYPES`). The CAN ID is packed by shifts because this is done for every frame:
 shifts take 3 µs to build and 7 µs to parse an ID, a `construct.BitStruct` 78 µs and 15 µs.
 """

@@ -576,7 +576,7 @@ class HostReceiver:
         else:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
         if ReplyKind.ACK not in kinds:
-            (kind,) = kinds  # the start byte tells it
+            (kind,) = kinds  # given by the start byte
         elif row_id < FIRST_TELEMETRY_ID:
             kind = ReplyKind.ACK
         else:

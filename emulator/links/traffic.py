@@ -23,7 +23,7 @@ SHOWN_VALUES: Final = 8
 """Maximum number of values in a line."""
 
 CONSOLE_ADDRESS: Final = 253
-"""CAN address of the OBC of console and recording, whose own requests are told apart by it."""
+"""CAN address of the OBC of console and recording, by which its own requests are recognised."""
 
 MAX_ADDRESSES: Final = 64
 """Maximum number of addresses whose segments are joined: a link fault can cause many random CAN IDs."""

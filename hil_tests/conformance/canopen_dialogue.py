@@ -1,4 +1,4 @@
-"""Cases told as dialogues: what the master sends, and what the node must answer.
+"""Cases written as dialogues: what the master sends, and what the node must answer.
 
     40 {text} > *; 70 > abort TOGGLE {text}; 60 > abort COMMAND; kept
 

@@ -65,7 +65,7 @@ class Reading:
 
 @dataclass(frozen=True)
 class Placement:
-    """An entry of an application object: at most one of `reading`, `parameter` and `image` tells what it reads."""
+    """An entry of an application object: at most one of `reading`, `parameter` and `image` is what it reads."""
 
     variable: ODVariable
     names: Sequence[str] = ()
