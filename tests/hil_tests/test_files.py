@@ -18,7 +18,8 @@ from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_j
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.hil_tests.wire_log import CandumpLog, SerialLog
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.candump import bus_name, read_candump
+from starhil.protocol.candump import bus_name
+from tests.candump import read_candump
 
 
 def random_image(height: int, width: int) -> np.ndarray:

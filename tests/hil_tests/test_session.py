@@ -22,9 +22,9 @@ from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.session_run import SessionRequest, _emulator, _printer, run_session
-from starhil.protocol.candump import read_candump
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
+from tests.candump import read_candump
 from tests.hil_tests.fake_device import FakeDevice
 
 ICD = load_unit()

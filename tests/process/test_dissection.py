@@ -8,9 +8,9 @@ import canopen
 import pytest
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from starhil.protocol.candump import read_candump
 from starhil.protocol.canopen import build_dictionary, build_eds
 from starhil.protocol.icd import load_unit
+from tests.candump import read_candump
 from tests.process.test_sessions import starhil
 from tests.protocol.dissection import dissect
 

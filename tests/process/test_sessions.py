@@ -8,7 +8,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from starhil.protocol.candump import read_candump
+from tests.candump import read_candump
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.protocol.dissection import dissect
 

@@ -20,9 +20,10 @@ from starhil.protocol.can_framing import (
     encode_request_frames,
     segment,
 )
-from starhil.protocol.candump import format_candump, parse_candump
+from starhil.protocol.candump import format_candump
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
+from tests.candump import parse_candump
 
 OBC, DEVICE = 1, 4
 GOOD = Request(RequestKind.TELECOMMAND, 54, bytes(range(12)), OBC)
@@ -325,12 +326,9 @@ def test_candump_lines_have_the_format_of_candump() -> None:
     assert format_candump(
         CanFrame(0x123, b"\xde\xad", extended=False, timestamp=1436509052.249713), "vcan0"
     ) == ("(1436509052.249713) vcan0 123#DEAD")
-    assert parse_candump("(1436509052.249713) vcan0 044#2A366C2BBA\n") == (
-        "vcan0",
-        CanFrame(0x44, bytes.fromhex("2A366C2BBA"), extended=False, timestamp=1436509052.249713),
+    assert format_candump(CanFrame(0x701, extended=False, remote=True, timestamp=1.0), "can1") == (
+        "(0000000001.000000) can1 701#R"
     )
-    assert parse_candump("(0000000001.000000) can1 701#R")[1].remote
-    assert parse_candump("(0000000001.000000) can1 00000123# T")[1] == CanFrame(0x123, timestamp=1.0)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -343,22 +341,5 @@ def test_candump_lines_have_the_format_of_candump() -> None:
         timestamp=st.integers(0, 2**31).map(float),
     )
 )
-def test_candump_lines_survive_writing_and_reading(one: CanFrame) -> None:
+def test_python_can_reads_the_lines_of_a_candump_log(one: CanFrame) -> None:
     assert parse_candump(format_candump(one, "can0")) == ("can0", one)
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        "",
-        "123#DEAD",
-        "(1.0) can0 12#00",
-        "(1.0) can0 123#0",
-        "(1.0) can0 FFFFFFFF#00",
-        "(x) can0 123#00",
-        "(1.0) can0 123##0",
-    ],
-)
-def test_other_lines_are_rejected(line: str) -> None:
-    with pytest.raises(ProtocolError):
-        parse_candump(line)

@@ -11,8 +11,8 @@ from pathlib import Path
 import can
 import pytest
 
-from starhil.protocol.candump import read_candump
 from starhil.protocol.icd import load_unit
+from tests.candump import read_candump
 from tests.emulator.cli.command_line import run_command_line
 
 STARHIL = [sys.executable, "-c", "from starhil.emulator.cli.app import main; main()"]

@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.candump import read_candump
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.hub import BACKLOG_LIMIT, CanHub
 from starhil.protocol.socketcand import (
@@ -24,6 +23,7 @@ from starhil.protocol.socketcand import (
     parse_frame,
     parse_send,
 )
+from tests.candump import read_candump
 
 PATIENCE_S = 20.0
 

@@ -8,8 +8,8 @@ import pytest
 
 from starhil.emulator.console.obc import ConsoleObc, Exchange, toml
 from starhil.hil_tests.script import load_script
-from starhil.protocol.candump import parse_candump
 from starhil.protocol.icd import load_unit
+from tests.candump import parse_candump
 from tests.emulator.console.pages import OPTIONS, Page
 
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
