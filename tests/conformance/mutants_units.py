@@ -35,7 +35,7 @@ def bodies(change: Callable[[bytes, SerialStack], bytes]) -> Damage:
     """Change the bodies of the frames that the device sends."""
 
     def damage(unit: SimulatedUnit) -> None:
-        framing = stack_of(unit).framing
+        framing = stack_of(unit).replies.framing
         encode = framing.encode
         framing.encode = lambda body: encode(change(body, stack_of(unit)))  # type: ignore[method-assign]
 
