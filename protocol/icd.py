@@ -35,6 +35,7 @@ from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import did_you_mean
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.text_messages import words
 from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import (
@@ -377,6 +378,14 @@ class _Reader:
                     raise IcdError(f"{where}: link.serial with framing cubespace has no echoes")
                 if can is not None:
                     raise IcdError(f"{where}: link.can has no echoes")
+                if serial is not None and (serial.format or serial.acknowledge or serial.refusal):
+                    raise IcdError(
+                        f"{where}: link.serial with `format`, `acknowledge` or `refusal` has no echoes"
+                    )
+            if row.request and serial is None:
+                raise IcdError(
+                    f"{self._path}: {row.kind} {row.name}: `request` is a text on link.serial, which the unit does not have"
+                )
         if serial is None or definition.link_is_unknown:
             return
         if isinstance(serial.framing, CubeSpaceFraming):
@@ -388,9 +397,12 @@ class _Reader:
                         name,
                     )
         try:
-            build_serial_stack(definition)
+            stack = build_serial_stack(definition)
         except IcdError as error:
             raise IcdError(f"{file}: {error}") from None
+        for row in definition.rows:
+            text_form = stack.request_formats.of(row.klass) in stack.text_formats
+            check_text_requests(row, definition, f"{file}: {row.kind} {row.name}", needed=text_form)
 
     def enum_of(self, name: str | None, where: str) -> EnumDefinition:
         """Return an enumeration of the unit or, if it has none of this name, of the device model."""
@@ -528,6 +540,8 @@ class _Reader:
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
             raise IcdError(f"{where}: last_id {last} is below ID {model.id}")
+        if model.request is not None and model.last_id is not None:
+            raise IcdError(f"{where}: `request` is the text of one row; it has no last_id")
         if kind == "telemetry" and model.readback is not None:
             raise IcdError(f"{where}: only telecommands have a readback")
         if model.readback is not None and not model.name.startswith(SETS):
@@ -569,6 +583,7 @@ class _Reader:
                 },
                 answers=("reply",) if answers is None else tuple(answers),
                 zeros=model.unbound is not None,
+                request=model.request or "",
             )
 
     def _check_answers(self, row: Row) -> None:
@@ -580,6 +595,21 @@ class _Reader:
             if kind == "row" and (name not in self._rows or self._rows[name].kind != "telemetry"):
                 text = f"{where}: no telemetry row with this name{did_you_mean(name, self._rows)}"
                 raise MissingNameError(text, name)
+
+
+def check_text_requests(row: Row, definition: InterfaceDefinition, where: str, *, needed: bool) -> None:
+    """Check the text that requests a row; `needed` if requests of other rows of its format are texts."""
+    if not row.request:
+        if needed:
+            raise IcdError(
+                f"{where}: needs `request`, a text, as the other rows of its format on link.serial"
+            )
+        return
+    if row.kind == "telecommand" and row.size:
+        raise IcdError(f"{where}: `request` is a text without data; it has no fields")
+    same = next(item for item in definition.rows if words(item.request) == words(row.request))
+    if same is not row:
+        raise IcdError(f"{where}: request {row.request!r} is already that of {same.name}")
 
 
 def _readback(model: schema.RowModel) -> schema.RowModel:
