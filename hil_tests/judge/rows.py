@@ -238,6 +238,8 @@ class Row:
         Action that a telecommand performs, and its fixed arguments.
     answers
         Answers in order: `echo`, `reply`.
+    request
+        Text that requests the row on a serial line; empty if a header does.
     """
 
     kind: RowKind
@@ -250,6 +252,7 @@ class Row:
     action: str | None = None
     arguments: Mapping[str, Value] = field(default_factory=dict)
     answers: tuple[str, ...] = ("reply",)
+    request: str = ""
 
     def __repr__(self) -> str:
         return f"Row({self.kind} {self.id} {self.name})"
