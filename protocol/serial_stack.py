@@ -529,7 +529,9 @@ class HostReceiver:
     def _awaited(self, form: MessageFormat) -> Request | None:
         """Return the request that a reply without an ID answers; None if its class has another format."""
         pending = self._pending
-        return pending if pending is None or not form.classes or pending.klass in form.classes else None
+        return (
+            pending if pending is not None and self._stack.reply_formats.of(pending.klass) is form else None
+        )
 
     def _data_size(self, form: MessageFormat, envelope: Envelope) -> int:
         values = envelope.values
@@ -563,6 +565,8 @@ class HostReceiver:
         if not klass and pending is not None and pending.id == row_id:
             klass = pending.klass
         kind = self._kind(envelope, klass, row_id)
+        if kind is ReplyKind.ACK and not values and stack.texts.acknowledge is not None:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"{body[:16]!r} is no acknowledge")
         if values.get("final", 1) and kind is not ReplyKind.UNSOLICITED:
             self._pending = None
         return Reply(

@@ -184,9 +184,11 @@ def _of_class(
 
 def _formats(unit: Unit, direction: str) -> Iterator[tuple[tuple[str, ...], Framing, Envelope]]:
     """Yield classes, framing and envelope of each format of a direction; without classes for all others, last."""
+    elsewhere: tuple[str, ...] = ()
     for model in format_models(unit.serial, direction):
         framing = _framing(unit, model.framing)
-        yield model.classes, framing, Headed(unit, framing, model.check, model.classes)
+        yield model.classes, framing, Headed(unit, framing, model.check, model.classes, elsewhere)
+        elsewhere += model.classes
 
 
 def _framing(unit: Unit, model: Any) -> Framing:
@@ -206,16 +208,23 @@ def _framing(unit: Unit, model: Any) -> Framing:
 class Headed:
     """A header by roles, and a check; or a text, which needs no header.
 
-    `classes` are those whose messages have this check, empty for all others.
+    `classes` are those whose messages have this check, empty for all others; `elsewhere` those with another format.
     """
 
     has_unsolicited = True
 
-    def __init__(self, unit: Unit, framing: Framing, check: Any, classes: tuple[str, ...]) -> None:
+    def __init__(
+        self,
+        unit: Unit,
+        framing: Framing,
+        check: Any,
+        classes: tuple[str, ...] = (),
+        elsewhere: tuple[str, ...] = (),
+    ) -> None:
         link = unit.serial
         self._unit = unit
         self._klass = classes[0] if len(classes) == 1 else ""
-        self._classes = classes
+        self._classes, self._elsewhere = classes, elsewhere
         self._start = framing.start
         self._compute = check_function(check, unit.byte_order, partial(plugin_check, unit))
         self.covers = getattr(check, "covers", [])
@@ -267,8 +276,10 @@ class Headed:
     def _request(self, opened: Opened, asked: Request | None) -> Request:
         """Return the request that an answer names, or the one that was asked if it names none."""
         if "id" not in opened.values:
-            if asked is None or (self._classes and asked.klass not in self._classes):
+            if asked is None or asked.klass in self._elsewhere:
                 raise ValueError("an answer without a request")
+            if self._classes and asked.klass not in self._classes:
+                raise ValueError("an answer in the format of another class")
             return asked
         klass = opened.klass or (asked.klass if asked is not None and asked.id == opened.values["id"] else "")
         return Request(opened.values["id"], klass=klass)
@@ -302,6 +313,8 @@ class Headed:
         row = self._unit.row(request)
         klass = request.klass or (row.klass if row is not None else "")
         telemetry = row.is_telemetry if row is not None else self._unit.is_telemetry(klass, request.id)
+        if not telemetry and not values and self._unit.serial.acknowledge is not None:
+            return Answer("malformed", data=taken.body)  # a text, but not the acknowledge
         kind: AnswerKind = "telemetry" if telemetry else "ack"
         if _refused(opened):
             kind = "nack"
