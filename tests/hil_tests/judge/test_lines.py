@@ -128,7 +128,7 @@ def test_st200_reads_as_its_flight_driver_does():
     for place in range(len(sent) + 1):
         line.clear()
         line.expect(unit.request(record))
-        damaged = sent[:place] + bytes((byte ^ 1 for byte in sent[place : place + 1])) + sent[place + 1 :]
+        damaged = sent[:place] + bytes(byte ^ 1 for byte in sent[place : place + 1]) + sent[place + 1 :]
         kinds = [answer.kind for answer in line.feed(damaged)]
         assert kinds == ["telemetry"] if damaged == sent else "telemetry" not in kinds, place
     for text, kind in (
