@@ -8,12 +8,13 @@ import pytest
 
 from starhil.emulator.cli.endurance import run_once
 from starhil.emulator.endurance.unit_under_test import UnitUnderTest
+from starhil.hil_tests.attitude import Quaternion, conjugate, product
 from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
 from starhil.hil_tests.endurance.life import Life
 from starhil.hil_tests.endurance.node import Node
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.run import ORION
-from starhil.hil_tests.endurance.truth import IDENTITY, Motion, conjugate, frame_turned, product
+from starhil.hil_tests.endurance.truth import Motion, frame_turned
 from starhil.hil_tests.endurance.violation import Violation, quantity_of
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.can_framing import CanFrame
@@ -274,6 +275,7 @@ def test_a_clock_set_to_a_time_of_day_is_not_known(tmp_path):
 # -- attitudes ---------------------------------------------------------------------------------------------------------
 
 TRUTH = Motion.of(ORION, 0.0).attitude
+IDENTITY = Quaternion(0.0, 0.0, 0.0, 1.0)
 GEN2 = load_unit("cubestar-gen2")
 
 
@@ -305,7 +307,7 @@ def judge(read, *, imaging=True, now_s=10.0, dark_since_s=None, icd=ICD, forget=
 
 def seen_at(q, known):
     """Return the direction of a star in the sensor."""
-    return product(product(q, (*known, 0.0)), conjugate(q))[:3]
+    return product(product(q, Quaternion(*known, 0.0)), conjugate(q))[:3]
 
 
 def two_stars(angle_deg, shift=0.0, q=IDENTITY):
@@ -357,7 +359,7 @@ def test_a_right_attitude_is_compared_where_it_can_be(name):
     ("sign", "scalar", "counted"), [("positive", 0.5, 1), ("positive", 0.05, 0), ("any", 0.5, 0)]
 )
 def test_three_numbers_are_an_attitude_if_the_scalar_is_known(sign, scalar, counted):
-    q = (math.sqrt(1.0 - scalar**2), 0.0, 0.0, scalar)
+    q = Quaternion(math.sqrt(1.0 - scalar**2), 0.0, 0.0, scalar)
     judge_ = AttitudeJudge(ICD.conventions.model_copy(update={"scalar_sign": sign}), SIGMA_ARCSEC)
     judge_.motions = [Motion(0.0, q, (0.0, 0.0, 0.0))]
     judge_.judge("row", reading_of(q[:3]), 10.0, oracle_of().values, imaging=True)
