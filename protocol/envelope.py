@@ -137,6 +137,13 @@ class Header:
             if role
         }
         """Value of each role for messages that do not set it."""
+        self.counts: Final = frozenset(
+            kind
+            for field in self.fields
+            for counts in (field.counts, *(bit.counts for bit in field.bits))
+            for kind in counts
+        )
+        """Messages whose `sequence` the sender counts: `reply`, `unsolicited`."""
 
     def roles_in(self, klass: str) -> frozenset[str]:
         """Return the roles that the header carries in messages of a class."""
@@ -224,11 +231,13 @@ class Header:
 
     def _counted(self, field: HeaderField, header_size: int, data_size: int) -> int:
         sizes = {**self.overhead, "header": header_size, "data": data_size}
-        return sum(sizes[part] for part in field.includes)
+        return sum(sizes[part] for part in field.includes) + field.offset
 
 
 def _bit_value(bit: HeaderBit, values: Mapping[str, int]) -> int:
     value = bit.default if bit.role is None else values.get(bit.role, bit.default)
+    if bit.role in WRAPPING:
+        return value & bit.mask
     if not 0 <= value <= bit.mask:
         raise ProtocolError(f"header: {bit.role or 'constant'} {value} does not fit {bit.width} bits")
     return value
@@ -241,6 +250,11 @@ def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderFiel
         raise IcdError(f"{where}: scale {model.scale:g} s is below a nanosecond")
     if model.role is None and model.const is None and model.default is None and not model.bits:
         raise IcdError(f"{where}: needs a role, or `const` or `default`")
+    counting = [bit.role for bit in model.bits if bit.counts] + [model.role] * bool(model.counts)
+    if any(role != "sequence" for role in counting):
+        raise IcdError(f"{where}: only role sequence has `counts`")
+    if model.offset and model.role != "length":
+        raise IcdError(f"{where}: only role length has an `offset`")
     given = {"default": _default(model), "order": model.order or byte_order}
     field = HeaderField.model_construct(**dict(model) | given | {"bits": _bits(model.bits)})
     width = sum(bit.width for bit in field.bits)
