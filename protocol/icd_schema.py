@@ -164,7 +164,9 @@ class RowKeys(DefinitionModel):
     """Action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
-    unsolicited: Annotated[float, Field(gt=0, le=100)] | Annotated[list[Event], Field(min_length=1)] | None = None
+    unsolicited: (
+        Annotated[float, Field(gt=0, le=100)] | Annotated[list[Event], Field(min_length=1)] | None
+    ) = None
     """Sends a telemetry row without a request, from the start on: at a rate in Hz, or after each of the listed
     events. `start`: the unit has started; `frame`: there is a new measurement; `mode`: the mode has changed; `error`:
     the unit has entered the error mode, or its error has changed; `validity`: the attitude has become valid or

@@ -74,14 +74,17 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
     folder = written(tmp_path / "lynx")
     file = folder / "unit.toml"
     text = file.read_text(encoding="utf-8").replace(
-        'framing = { kind = "length", start = [0x1A, 0xCF, 0xFC, 0x1D] }', 'framing = { kind = "custom", name = "cobs" }'
+        'framing = { kind = "length", start = [0x1A, 0xCF, 0xFC, 0x1D] }',
+        'framing = { kind = "custom", name = "cobs" }',
     )
     file.write_text(text.replace("[unit]", '[unit]\nplugin = "unit.py"'), encoding="utf-8")
     (source,) = [block.text for block in blocks(PAGE, "python") if block.heading == PYTHON]
     (folder / "unit.py").write_text(source, encoding="utf-8")
     result = CliRunner().invoke(build_app(), ["unit", "check", str(folder)])
     assert result.exit_code == 0, result.output
-    assert "  > 01 03 0B C0 0B 01 10 01 02 03 04" in result.stdout  # length 12 - 1, sequence 0, group 1, ID 16
+    assert (
+        "  > 01 03 0B C0 0B 01 10 01 02 03 04" in result.stdout
+    )  # length 12 - 1, sequence 0, group 1, ID 16
     stack = build_serial_stack(load_unit(folder))
     request = load_unit(folder).request_of(0x10, "command", bytes(6))
     line = stack.encode_request(request)

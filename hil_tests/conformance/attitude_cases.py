@@ -81,7 +81,11 @@ class AttitudeRow:
             if rest is not None and search is not None:
                 rest()
                 seen = access.values(self.row)
-                check(not self.is_valid(seen), "no valid attitude in standby (R11, docs/rules.md)", "a valid one")
+                check(
+                    not self.is_valid(seen),
+                    "no valid attitude in standby (R11, docs/rules.md)",
+                    "a valid one",
+                )
                 search()
             end = access.now() + ATTITUDE_S
             while not self.is_valid(seen := access.values(self.row)):

@@ -321,7 +321,6 @@ def _check_carried(probe: LinkProbe) -> None:
         raise CaseSkipped("the line has no unsolicited telemetry")
 
 
-
 def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         fields = [name for name, item in row.named.items() if (item.argument or "").startswith("telemetry[")]

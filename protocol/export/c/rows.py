@@ -209,7 +209,9 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
         return
     if fields[0].width:
         plain = " | ".join(
-            f"(uint64_t)values->{c_member(field.name)} << {field.shift}" for field in fields if not field.scaled
+            f"(uint64_t)values->{c_member(field.name)} << {field.shift}"
+            for field in fields
+            if not field.scaled
         )
         scaled = [field for field in fields if field.scaled]
         if scaled:
