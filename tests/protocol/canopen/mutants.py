@@ -178,7 +178,7 @@ MUTANTS = (
     # EDS
     Mutant("EDS with wrong defaults", "od", "eds", 'number = f"0x{item.default:X}" if item.default >= 0 else str(item.default)', 'number = f"0x{item.default ^ 1:X}"'),
     Mutant("EDS leaves out an object", "eds", "eds", '        lists[f"{kind}Objects"].append(index)\n', '        if index != 0x1005:\n            lists[f"{kind}Objects"].append(index)\n'),
-    Mutant("EDS with another number of PDOs", "eds", "eds", '("NrOfTXPDO", str(int(information.nr_of_TXPDO or 0)))', '("NrOfTXPDO", "4")'),
+    Mutant("EDS with another number of PDOs", "eds", "eds", "tpdos=information.nr_of_TXPDO", "tpdos=information.nr_of_TXPDO + 1"),
     Mutant("EDS with high limits too low", "eds", "eds", "(key, str(int(limit)))", "(key, str(int(limit) // 1000))"),
     Mutant("EDS calls everything mappable", "tpdo", "eds", '("PDOMapping", str(int(item.pdo_mappable)))', '("PDOMapping", "1")'),
 )  # fmt: skip
