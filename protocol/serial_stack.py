@@ -316,6 +316,8 @@ class SerialStack:
             formats = self.request_formats if where == "request" else self.reply_formats
             if any(form.kind == "length" for form in formats.all) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
+        if self.request_header.counts:
+            raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
         texts = list(self.text_formats)
         if self.texts.acknowledge is not None or self.texts.refusal is not None:
             texts.append(self.replies)
@@ -342,6 +344,14 @@ class SerialStack:
     def supports_unsolicited(self, dialect: Dialect | None = None) -> bool:
         """Return whether this dialect has unsolicited telemetry."""
         return ReplyKind.UNSOLICITED in self.format(dialect).headers
+
+    def counts(self, kind: ReplyKind) -> bool:
+        """Return whether the device numbers messages of this kind itself."""
+        unsolicited = kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT)
+        return (
+            kind is not ReplyKind.ECHO
+            and ("unsolicited" if unsolicited else "reply") in self.reply_header.counts
+        )
 
     def device(self) -> Deframer[Request]:
         """Return a receiver for the device's end."""
@@ -422,9 +432,8 @@ class SerialStack:
                 reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
             )
         data = b"" if refused or (self.dialects and accepted) else reply.data
-        packed = header.pack(values, reply.klass, len(data))
         if self.dialects:
-            return form.framing.encode(packed + data)
+            return form.framing.encode(header.pack(values, reply.klass, len(data)) + data)
         own = self.reply_formats.of(reply.klass)
         return own.framing.encode(own.close(own.header.pack(values, reply.klass, len(data)), data))
 

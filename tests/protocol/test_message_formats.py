@@ -169,7 +169,7 @@ STUFFING = 'framing = {{ kind = "fixed", start = [241], stuffing = {{ escape = {
         (LINK.format("") + PING + 'request = "ping"\n' + ROW.replace('doc = "d"\n', 'doc = "d"\nrequest = "ping"\n'), "request 'ping' is already that of p"),
         (LINK.format("") + PING + 'request = "ping"\n' + 'fields = [{ name = "n", type = "u8" }]\n', "`request` is a text without data; it has no fields"),
         (LINK.format("") + PING + 'request = " ping"\n', "request"),
-        (LINK.format("") + PING + 'request = "ping"\nlast_id = 4\n', "`request` is the text of one row; it has no last_id"),
+        (LINK.format("") + PING + 'request = "ping"\nlast_id = 4\n', "telecommand p_2: request 'ping' is already that of p_1"),
         (LINK.format("") + PING + 'request = "ping"\n' + ROW, "telemetry r: needs `request`, a text, as the other rows of its format on link.serial"),
         (LINK.format("") + PING + 'request = "ping"\nanswer = ["echo"]\nacknowledge = "OK"', "acknowledge"),
         (LINK.format('acknowledge = "OK"') + PING + 'request = "ping"\nanswer = ["echo"]\n', "with `format`, `acknowledge` or `refusal` has no echoes"),
