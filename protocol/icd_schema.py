@@ -25,7 +25,7 @@ from starhil.protocol.values import (
 
 Provenance = Literal["confirmed", "proxy", "ours"]
 FieldType = Literal[
-    "u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64",
+    "u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f32", "f64",
     "enum8", "enum16", "enum32", "bits8", "bits16", "bits32", "bytes", "text",
 ]  # fmt: skip
 

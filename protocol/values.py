@@ -28,7 +28,7 @@ INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {
         f"{sign}{bits}": (0, 2**bits - 1) if sign == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
         for sign in "ui"
-        for bits in (8, 16, 32, 64)
+        for bits in (8, 16, 24, 32, 64)
     }
 )
 """Lowest and highest raw value of each integer type."""
