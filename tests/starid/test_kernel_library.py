@@ -102,7 +102,7 @@ ARGUMENTS = ((1.0, 3.0), 4, Sums(7, np.array([0.5])))
 def loaded(kernel: Any, *arguments: object) -> Any:
     """The machine code of a kernel from the cache, without numba."""
     kernel(*arguments)
-    return load(kernel.read(type_names(arguments)), kernel.py_func)
+    return load(kernel.store.read(type_names(arguments)), kernel.py_func)
 
 
 def test_loaded_machine_code_returns_what_numba_returns() -> None:
@@ -156,7 +156,7 @@ def last(values: Array) -> float:
 def test_code_of_another_machine_is_left_to_numba(change: dict[str, Any]) -> None:
     inverse(4.0)
     kernel: Any = inverse
-    stored = kernel.read("float64")
+    stored = kernel.store.read("float64")
     with pytest.raises(NotLoadableError):
         load(stored._replace(**change), kernel.py_func)
 
@@ -170,7 +170,7 @@ def test_numba_loads_what_only_it_can_load(monkeypatch: pytest.MonkeyPatch) -> N
     again: Any = KernelFunction(inverse.__wrapped__)  # type: ignore[attr-defined]
     again.options = inverse.options  # type: ignore[attr-defined]
     assert again(4.0) == 0.25
-    assert again.compilations == 0
+    assert again.store.compilations == 0
 
 
 def test_a_warm_start_runs_kernels_without_numba() -> None:
