@@ -161,6 +161,22 @@ def test_code_of_another_machine_is_left_to_numba(change: dict[str, Any]) -> Non
         load(stored._replace(**change), kernel.py_func)
 
 
+def test_counts_from_object_files_are_divided_as_integers(monkeypatch: pytest.MonkeyPatch) -> None:
+    # NumPy 1 divides a uint64 by an int into a float, which frombuffer rejects
+    inverse(4.0)
+    kernel: Any = inverse
+    counts, read = [], np.frombuffer
+
+    def recorded(buffer: bytes, dtype: Any = float, count: int = -1, offset: int = 0) -> Any:
+        counts.append(count)
+        return read(buffer, dtype, count, offset)
+
+    monkeypatch.setattr(np, "frombuffer", recorded)
+    assert load(kernel.store.read("float64"), kernel.py_func)(8.0) == 0.125
+    assert len(counts) > 3
+    assert not any(isinstance(count, np.uint64) for count in counts)
+
+
 def test_numba_loads_what_only_it_can_load(monkeypatch: pytest.MonkeyPatch) -> None:
     def other_machine(*_arguments: object) -> None:
         raise NotLoadableError
