@@ -11,7 +11,6 @@ from starid.arrays import Array, Mask
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve, panels
 from starid.lab.simulation import PIXEL_DEG, turned
-from starid.plots import figure, save
 from starid.thesis.cme import matched_motion
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.fsf import (
@@ -77,16 +76,18 @@ def compute(context: Context, part: Part) -> Results:
     return found
 
 
-def _cluster_figure(context: Context, result: Results) -> str:
-    fig, axes = figure(1, 2, width=10.0, height=4.4, subplot_kw={"projection": "3d"})
-    for axis, (name, title) in zip(axes, (("exact", "exact"), ("pixels", "to whole pixels")), strict=True):
-        points, chosen = result[f"disparities_{name}"], result[f"chosen_{name}"]
-        axis.scatter(*points[~chosen].T, s=4, c="C0", alpha=0.4, label="outliers")
-        axis.scatter(*points[chosen].T, s=14, c="gold", edgecolors="black", lw=0.3, label="the cluster")
-        axis.set(xlabel="ΔA / mag", ylabel="Δd / °", zlabel="Δm / °", title=title)
-        axis.legend()
-    fig.suptitle("Figure 3.2: 441 disparities and the cluster of the true pairs")
-    return save(fig, context.folder / "figure_3_2.png")
+def _draw_clusters(e: Evaluation, result: Results) -> None:
+    curves = []
+    for name, title in (("exact", "exact"), ("pixels", "to whole pixels")):
+        _, separations, slopes = result[f"disparities_{name}"].T
+        chosen = result[f"chosen_{name}"]
+        curves += [
+            (title, Curve(separations[~chosen], slopes[~chosen], ".", "outliers")),
+            (title, Curve(separations[chosen], slopes[chosen], "o", "the cluster")),
+        ]
+    shown = panels(curves, "best", xlabel="Δd / °", ylabel="Δm / °")
+    title = "Figure 3.2: 441 disparities and the cluster of the true pairs"
+    e.draw("figure_3_2.png", shown, columns=2, width=10.0, height=4.4, title=title)
 
 
 def _draw_pair(e: Evaluation, result: Results) -> None:
@@ -125,7 +126,7 @@ def evaluate(e: Evaluation) -> None:
             printed=f"{turns.min():.2f}° … {turns.max():.2f}°",
             ours=f"{abs(float(result[f'turn_{name}'])):.3f}°",
         )
-    e.files.append(_cluster_figure(e.context, result))
+    _draw_clusters(e, result)
     _draw_pair(e, result)
     points = result["disparities_pixels"]
     columns = dict(zip(("brightness_mag", "separation_deg", "slope_deg"), points.T, strict=True))

@@ -141,7 +141,11 @@ def evaluate(e: Evaluation) -> None:
     if not e.context.quick:
         draw_sequences(e, diagonal, SETTLING)
     _compare(e, diagonal, found)
-    shown = [lines[part.key] | {"label": _label(part.values)} for part in diagonal]
+    shown = [
+        {name: "—" if value == "" else value for name, value in lines[part.key].items()}
+        | {"label": _label(part.values)}
+        for part in diagonal
+    ]
     e.note = {
         "matrices": "\n\n".join(_matrix(e, found, overlap) for overlap in e.parameters["overlaps"]),
         "errors": formatted_table(_ERRORS, shown),

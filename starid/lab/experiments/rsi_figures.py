@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -19,54 +20,37 @@ _MAX_MS: Final = 1.0
 def draw_sequences(e: Evaluation, parts: Sequence[Part], settling: int) -> None:
     """Draw all figures from the runs with μ = f; precision without the first `settling` frames."""
     parts = [part for part in parts if part.values["side"] != BY_TABLE]
-    first, last = e.parameters["overlaps"][0], e.parameters["overlaps"][-1]
-    for scale in e.parameters["scales"]:
-        # runs without noise belong to every scale
-        chosen = [p for p in parts if p.values["scale"] == scale or p.values["factor"] == 0]
-        for number, words, overlaps, panel_of, label_of in (
-            ("6_37_6_38_f_1_f_2", "6.37, 6.38, F.1, F.2", (first, last), _set, _method),
-            ("f_3_to_f_5", "F.3 to F.5", (first,), _method, _set),
-            ("6_39_to_6_41", "6.39 to 6.41", (last,), _method, _set),
-        ):
-            members = [part for part in chosen if part.values["overlap"] in overlaps]
-            title = f"Figures {words}; {noise_label(scale)}"
-            name = f"figures_{number}_x{scale:g}.png"
-            _draw_precision(e, name, title, members, panel_of, label_of, settling)
-    sequences = [
-        part
-        for part in parts
-        if part.values["scale"] == e.parameters["scales"][0]
-        and part.values["overlap"] == last
-        and part.values["tau"] != LSI_ONLY
-        and not part.values["memory"]
-    ]
-    _draw_frames(e, sequences)
+    for scale, overlap in itertools.product(e.parameters["scales"], e.parameters["overlaps"]):
+        curves = (
+            (_set(part), precision(e.results[part.key]["numbers"][0, settling:], 1.0, _method(part)))
+            for part in parts
+            # runs without noise belong to every scale
+            if (part.values["scale"] == scale or part.values["factor"] == 0)
+            and part.values["overlap"] == overlap
+        )
+        shown = panels(curves, "lower right", **precision_axes("ε_f"))
+        title = f"Figures 6.37 to 6.41 and F: p = {100 * overlap:g} %, {noise_label(scale)}"
+        name = f"figures_6_37_to_6_41_and_f_p{100 * overlap:g}_x{scale:g}.png"
+        e.draw(name, shown, columns=2, width=9.0, height=7.0, title=title, sharey=True)
+    last = [part for part in parts if part.values["overlap"] == e.parameters["overlaps"][-1]]
+    _draw_frames(
+        e,
+        [
+            part
+            for part in last
+            if part.values["scale"] == e.parameters["scales"][0]
+            and part.values["tau"] != LSI_ONLY
+            and not part.values["memory"]
+        ],
+    )
 
 
 def _method(part: Part) -> str:
-    return f"{method_of(part.values['tau'], part.values['memory'])}, p = {100 * part.values['overlap']:g} %"
+    return method_of(part.values["tau"], part.values["memory"])
 
 
 def _set(part: Part) -> str:
     return f"μ = f = {part.values['factor']}"
-
-
-def _draw_precision(
-    e: Evaluation,
-    name: str,
-    title: str,
-    parts: Sequence[Part],
-    panel_of: Callable[[Part], str],
-    label_of: Callable[[Part], str],
-    settling: int,
-) -> None:
-    """Draw a panel for each value of one function of a part, a curve for each value of another."""
-    curves = (
-        (panel_of(part), precision(e.results[part.key]["numbers"][0, settling:], 1.0, label_of(part)))
-        for part in parts
-    )
-    shown = panels(curves, "lower right", **precision_axes("ε_f"))
-    e.draw(name, shown, columns=2, width=9.0, height=7.0, title=title, sharey=True)
 
 
 def _draw_frames(e: Evaluation, parts: Sequence[Part]) -> None:

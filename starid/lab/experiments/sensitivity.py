@@ -10,7 +10,6 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Panel, curves_of
 from starid.lab.experiments.fsf import frames_of_seven, noise_of
 from starid.lab.experiments.lsi_trials import OFF, error_of, frames_under_test, share
 from starid.thesis.database import DatabaseParameters, build_database
@@ -150,23 +149,3 @@ def evaluate(e: Evaluation) -> None:
             lines.append(line | {"as_the_author_ran_it": precision, "as_printed": recall})
             e.compare(f"{quantity}: precision, recall", printed=f"{precision:.2f}, {recall:.2f} %")
     e.write("sensitivity.csv", lines)
-    _draw(e, lines)
-
-
-def _draw(e: Evaluation, lines: list[dict[str, Any]]) -> None:
-    filters = [
-        {**part.values, "accuracy": 100.0 * e.results[part.key]["indicators"][2]}
-        for part in e.parts
-        if "epsilon" in part.values
-    ]
-    accuracy = curves_of(filters, "share", "accuracy", lambda line: f"ε = {line['epsilon']:g}")
-    shown = [Panel("accuracy of the filter", accuracy, {"xlabel": "min_samples / n", "ylabel": "%"}, "best")]
-    for parameter in ("κ", "λ", "Γ_min", "K"):
-        members = [line for line in lines if line["parameter"] == parameter]
-        curves = [
-            curve
-            for column in ("as_the_author_ran_it", "as_printed")
-            for curve in curves_of(members, "value", column, lambda line: line["measure"].partition(",")[0])
-        ]
-        shown.append(Panel("", curves, {"xlabel": parameter, "ylabel": "%"}, "best"))
-    e.draw("sensitivity.png", shown, columns=2, width=9.0, height=10.5)
