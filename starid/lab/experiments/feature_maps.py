@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -63,13 +63,9 @@ def _maps(e: Evaluation) -> None:
     shape = (result["dec"].size, result["ra"].size)
     half = 0.5 * FRAME_DEG * (1.0 - e.parameters["map_percent"] / 100.0)
     extent = (-half, result["ra"][-1] + half, -90.0 - half, result["dec"][-1] + half)
-    settings = {"xlabel": "α of the centre / °", "ylabel": "δ of the centre / °"}
-    settings |= {
-        "xlim": (0, 360),
-        "ylim": (-90, 90),
-        "xticks": range(0, 361, 60),
-        "yticks": range(-90, 91, 30),
-    }
+    settings: dict[str, Any] = {"xlabel": "α of the centre / °", "ylabel": "δ of the centre / °"}
+    settings |= {"xlim": (0, 360), "xticks": range(0, 361, 60)}
+    settings |= {"ylim": (-90, 90), "yticks": range(-90, 91, 30)}
     for values, name in zip(result["features"].T, _COLUMNS, strict=True):
         number, quantity, symbol = _MAPS[name]
         options = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}

@@ -76,10 +76,13 @@ def curves_of(
     style: str = "o-",
 ) -> list[Curve]:
     """A curve for each label of lines of a table, through the values of two columns."""
-    found: dict[str, list[tuple[Any, Any]]] = {}
+    found: dict[str, list[Mapping[str, Any]]] = {}
     for line in table:
-        found.setdefault(label(line), []).append((line[x], line[y]))
-    return [Curve(*zip(*points, strict=True), style, words) for words, points in found.items()]
+        found.setdefault(label(line), []).append(line)
+    return [
+        Curve([line[x] for line in lines], [line[y] for line in lines], style, words)
+        for words, lines in found.items()
+    ]
 
 
 def panels(curves: Iterable[tuple[str, Curve]], legend: str = "", **settings: Any) -> list[Panel]:

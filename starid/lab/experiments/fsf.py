@@ -301,13 +301,12 @@ def _compare_named(e: Evaluation) -> None:
         e.parameters["kinds"], e.parameters["false_stars"], range(len(FACTORS)), _INDICATORS
     ):
         quantity = f"{indicator}, {_KINDS[kind]} noise, μ = {k}, f = {f}"
-        for name, words in (
-            (quantity, ("author", "printed")),
-            (f"{quantity}: scalable filter (ours), noise as printed", ("ours",)),
-        ):
-            if e.published(name):
-                values = _values(e, kind, f, k, indicator)
-                e.compare(name, **{word: values[word] for word in words})
+        values = _values(e, kind, f, k, indicator)
+        if e.published(quantity):
+            e.compare(quantity, author=values["author"], printed=values["printed"])
+        quantity += ": scalable filter (ours), noise as printed"
+        if e.published(quantity):
+            e.compare(quantity, ours=values["ours"])
 
 
 def _compare_motion(e: Evaluation) -> None:

@@ -125,9 +125,9 @@ def _draw_reconstruction(e: Evaluation) -> None:
         before, now = ClusterFilter()(first, second).matches.T
         motion = estimate_motion(first.positions[before], second.positions[now])
         title = f"μ = {factor:g}: γ̃ = {motion.rotation_deg:.3f}°, μ_d = {motion.mean_distance_deg:.1e}°"
-        moved = motion.apply(first.positions[before])
-        curves.append((title, Curve(*second.positions[now].T, "o", "stars", {"fillstyle": "none"})))
-        curves.append((title, Curve(*moved.T, "+", "reconstructed")))
+        (x, y), (moved_x, moved_y) = second.positions[now].T, motion.apply(first.positions[before]).T
+        curves.append((title, Curve(x, y, "o", "stars", {"fillstyle": "none"})))
+        curves.append((title, Curve(moved_x, moved_y, "+", "reconstructed")))
     limits = (-RADIUS_DEG, RADIUS_DEG)
     shown = panels(curves, "upper right", xlabel="x / °", ylabel="y / °", xlim=limits, ylim=limits)
     e.draw("figure_6_13.png", shown, columns=2, width=9.5, height=4.6, sharey=True)
