@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from starid.kernel_store import KernelStore
+from starid.kernel_store import KernelStore, record_name
 
 Kernel = TypeVar("Kernel", bound=Callable[..., object])
 Function = Callable[..., Any]
@@ -208,6 +208,8 @@ def _type_name(value: Any) -> str:
     if isinstance(value, np.ndarray):
         flags, dtype = value.flags, value.dtype
         name = dtype.name if dtype.isnative and dtype.kind in "biufc" else repr(dtype)
+        if dtype.names:
+            name = record_name((field, dtype[field].name) for field in dtype.names)
         layout = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
         return f"{'' if flags.writeable else 'readonly '}array({name}, {value.ndim}d, {layout})"
     if isinstance(value, tuple):

@@ -15,7 +15,7 @@ import os
 import pickle
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
@@ -104,6 +104,11 @@ class KernelStore:
             _warn_not_kept(path.parent.parent, error.strerror)
         else:
             evict(keep=path.parent)
+
+
+def record_name(fields: Iterable[tuple[str, str]]) -> str:
+    """Return the name of a type of record with fields of these names and types."""
+    return f"record({', '.join(' '.join(each) for each in fields)})"
 
 
 @cache
