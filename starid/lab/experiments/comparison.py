@@ -150,12 +150,6 @@ def markdown_table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
     return "\n".join(text + ["| " + " | ".join(line) + " |" for line in lines])
 
 
-def formatted_table(columns: Mapping[str, str], lines: Iterable[Mapping[str, Any]]) -> str:
-    """Format a table in Markdown from the heads of its columns and how their cells are formatted, and its lines."""
-    cells = [[cell.format(**line) for cell in columns.values()] for line in lines]
-    return markdown_table(list(columns), cells)
-
-
 _ROUNDING_ERROR: Final = 1e-12
 """A published deviation below this is a rounding error."""
 

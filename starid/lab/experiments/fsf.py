@@ -11,7 +11,7 @@ import numpy as np
 
 from starid.arrays import Mask
 from starid.lab.experiments.author_noise import filter_noise
-from starid.lab.experiments.comparison import best_constant, markdown_table
+from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve, panels
 from starid.lab.experiments.tables import CONFUSION
@@ -225,19 +225,6 @@ def _figures(e: Evaluation) -> None:
         e.draw(f"figure_6_{number}.png", shown, title=title, **size)
 
 
-def _matrix(e: Evaluation, indicator: str) -> str:
-    """Tabulate our and the published indicator: a line for each table A.1–A.18, a column for each μ."""
-    lines = []
-    for kind, f in itertools.product(e.parameters["kinds"], e.parameters["false_stars"]):
-        cells = []
-        for k in range(len(FACTORS)):
-            values = _values(e, kind, f, k, indicator)
-            cells.append("{published:.1f} / {author:.1f} / {printed:.1f}".format(**values))
-        lines.append([f"A.{3 * f + 1 + list(_KINDS).index(kind)}: f = {f}, {_KINDS[kind]}", *cells])
-    head = f"{indicator} / %: published / as the author ran it / as printed"
-    return markdown_table([head, *(f"μ = {factor}" for factor in FACTORS)], lines)
-
-
 def _compare_tables(e: Evaluation) -> None:
     """Count the sets of the tables that agree, and those with which the best constant agrees."""
     sets = list(itertools.product(e.parameters["false_stars"], range(len(FACTORS))))
@@ -338,4 +325,3 @@ def evaluate(e: Evaluation) -> None:
         _compare_predictions(e, "brightness", ("brightness",))
     _compare_named(e)
     _compare_motion(e)
-    e.note["matrix"] = _matrix(e, "recall")

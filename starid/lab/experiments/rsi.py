@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 
 from starid.lab.experiments.author_noise import identification_noise
-from starid.lab.experiments.comparison import formatted_table, markdown_table
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
 from starid.lab.experiments.fsf import track_filter
 from starid.lab.experiments.rsi_figures import draw_sequences
@@ -22,7 +21,6 @@ from starid.lab.experiments.rsi_trials import (
     START,
     measured_step,
     method_of,
-    noise_label,
     set_label,
     side_as_printed,
     statistics,
@@ -36,33 +34,6 @@ SETTLING: Final = 5
 
 _BYTES_PER_CELL: Final = 5
 _FIELD_DEG: Final = 40.0
-_ERRORS: Final = {
-    "tables H.1 and H.2, published / ours": "{label}",
-    "ε_f mean / °": "{published_error_mean} / {error_mean:.2f}",
-    "σ of ε_f / °": "{published_error_sigma} / {error_sigma:.2f}",
-    "ε_θ mean / °": "{published_roll_mean} / {roll_mean:.2f}",
-    "σ of ε_θ / °": "{published_roll_sigma} / {roll_sigma:.2f}",
-    "ε_ψ mean": "{published_psi_mean} / {psi_mean:.2f}",
-    "σ of ε_ψ": "{published_psi_sigma} / {psi_sigma:.2f}",
-}
-_UPDATES: Final = {
-    "tables 6.7, 6.8 and 6.9, published / ours": "{label}",
-    "triggers / %": "{published_trigger_percent} / {trigger_percent:.1f}",
-    "ε_ψ > τ / %": "{published_exceeded_percent} / {exceeded_percent:.1f}",
-    "Γ mean / °": "{published_side_mean} / {side_mean:.2f}",
-    "σ of Γ / °": "{published_side_sigma} / {side_sigma:.3f}",
-    "kB": "{region_kB:.2f}",
-    "1NN / ms, mean / median": "{published_search_ms} / {search_ms_median:.3f}",
-    "LASSO / ms, mean / median": "{published_lasso_ms} / {lasso_ms_median:.3f}",
-}
-_EQUATION: Final = {
-    "Γ by eq. 6.5 / °": "μ = f = {factor:g}, {noise}",
-    "μ_d / °": "{mu_d_deg:.2g}",
-    "σ_d / °": "{sigma_d_deg:.2g}",
-    "as printed": "{as_printed_deg:.2f}",
-    "Γ_min + √(μ_d·σ_d)": "{square_root_deg:.2f}",
-    "table 6.8": "{published_deg:.2f}",
-}
 _PUBLISHED: Final = (
     *(f"{name}_{measure}" for name in ("error", "roll", "psi") for measure in ("mean", "sigma")),
     *("trigger_percent", "exceeded_percent", "side_mean", "side_sigma"),
@@ -127,35 +98,24 @@ def _label(values: Mapping[str, Any]) -> str:
 def evaluate(e: Evaluation) -> None:
     """The tables beside ours, the figures, and the mean errors with memory against the published ones."""
     found = {part.key: statistics(e.results[part.key]["numbers"], SETTLING) for part in e.parts}
-    lines = {}
+    lines = []
     for part in e.parts:
         v, known = part.values, _published(part.values)
         cells = region_cells(found[part.key]["side_mean"], _FIELD_DEG, v["overlap"])
         found[part.key]["region_kB"] = 1e-3 * _BYTES_PER_CELL * cells
         published = {f"published_{name}": known.get(name, "") for name in _PUBLISHED}
         method = method_of(v["tau"], v["memory"], v["side"])
-        lines[part.key] = {**v, "method": method, **found[part.key], **published}
-    e.write("tables_6_7_6_8_6_9_h_1_h_2.csv", list(lines.values()))
+        lines.append({**v, "method": method, **found[part.key], **published})
+    e.write("tables_6_7_6_8_6_9_h_1_h_2.csv", lines)
     diagonal = [part for part in e.parts if part.values["false_stars"] == part.values["factor"]]
-    sides = _sides(e, diagonal, found)
+    _write_sides(e, diagonal, found)
     if not e.context.quick:
         draw_sequences(e, diagonal, SETTLING)
     _compare(e, diagonal, found)
-    shown = [
-        {name: "—" if value == "" else value for name, value in lines[part.key].items()}
-        | {"label": _label(part.values)}
-        for part in diagonal
-    ]
-    e.note = {
-        "matrices": "\n\n".join(_matrix(e, found, overlap) for overlap in e.parameters["overlaps"]),
-        "errors": formatted_table(_ERRORS, shown),
-        "updates": formatted_table(_UPDATES, shown),
-        "sides": sides,
-    }
 
 
-def _sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> str:
-    """Write and tabulate Γ by eq. 6.5 as printed, with the square root, and in table 6.8, for the first RSI method."""
+def _write_sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:
+    """Write Γ by eq. 6.5 as printed, with the square root, and in table 6.8, for the first RSI method."""
     settings = RsiSettings()
     tau = min(t for t, *_ in e.parameters["methods"] if t != LSI_ONLY)
     lines = []
@@ -169,24 +129,8 @@ def _sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, f
         line["as_printed_deg"] = side_as_printed(*distances, settings.gamma_min_deg)
         line["square_root_deg"] = region_side(*distances, settings)
         lines.append(line | {"published_deg": known["side_mean"]})
-    if not lines:
-        return ""
-    e.write("equation_6_5.csv", lines)
-    return formatted_table(_EQUATION, (line | {"noise": noise_label(line["scale"])} for line in lines))
-
-
-def _matrix(e: Evaluation, found: Mapping[str, dict[str, float]], overlap: float) -> str:
-    """Format the mean ε_f of the method with memory in all sets, arranged as in table 6.6."""
-    rows: dict[int, dict[str, str]] = {}
-    for part in e.parts:
-        v = part.values
-        if v["overlap"] == overlap and v["memory"] and v["scale"] == e.parameters["scales"][0]:
-            mean = f"{found[part.key]['error_mean']:.3f}"
-            rows.setdefault(v["false_stars"], {})[f"μ = {v['factor']}"] = mean
-    words = f"mean ε_f / °, p = {100 * overlap:g} %, with memory (sets of table 6.6)"
-    heads = list(dict.fromkeys(head for row in rows.values() for head in row))
-    lines = [(f"f = {f}", *(row.get(head, "—") for head in heads)) for f, row in rows.items()]
-    return markdown_table((words, *heads), lines)
+    if lines:
+        e.write("equation_6_5.csv", lines)
 
 
 def _compare(e: Evaluation, diagonal: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:
