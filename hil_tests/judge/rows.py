@@ -211,7 +211,7 @@ class Field:
             case "float":
                 number = float(self.read(bytes(self.offset) + pattern))
                 low, high = self.limits
-                return min(max(number, low), high) if abs(number) < 1e30 else 0.0
+                return min(max(number if abs(number) < 1e30 else 0.0, low), high)
             case _:
                 low_raw, high_raw = self.raw_limits
                 raw = int.from_bytes(pattern, self.order)
