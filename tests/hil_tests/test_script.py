@@ -101,6 +101,9 @@ def test_a_full_script_is_read_unchanged(load):
     assert wait.name == "wait 0.5 s"
 
 
+ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
@@ -193,6 +196,27 @@ def test_a_full_script_is_read_unchanged(load):
         (
             "[[step]]\nread = 'hole_map_1'\nexpect = { map = { min = 1 } }",
             ["'map' is bytes, and 'min' is for"],
+        ),
+        (
+            "[[step]]\ncommand = 'set_mode'\nwith = { mode = 'standby' }\nwith_hex = '00'",
+            ["give the parameters as a table 'with' or as bytes 'with_hex', not both"],
+        ),
+        (
+            "[[step]]\nset_parameter = 'exposure'\nvalue = 'long'\nrefused = 'invalid_parameter'",
+            ["'value' must be a number if a refusal is expected"],
+        ),
+        (
+            f"[truth]\nfile = 't.csv'\n{ANGLES}[[step]]\nwait_s = 1",
+            ["truth", "give an attitude or a file, not both"],
+        ),
+        ("[[step]]\nset_parameter = 'exposure'", ["'value' must be given, but is missing"]),
+        (
+            "[[step]]\nread = 'rates'\nexpect = { rate_x = [1, 2] }",
+            ["must be a number, true, false or a text, not [1, 2]"],
+        ),
+        (
+            f"[truth]\n{ANGLES}[[step]]\nread = 'quaternion'\nattitude = {{}}",
+            ["needs a tolerance: within_arcsec"],
         ),
     ],
 )
