@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode, identifying_stars
@@ -48,7 +49,7 @@ def row_cases(
         for index, (name, item) in enumerate(row.named.items()):
             for why, data in row.bad_values(item):
                 title = f"{row.name} with {name} {why} is refused, and the refused field named"
-                run = _refused(row, data, INVALID_PARAMETER, index)
+                run = partial(_refused, row, data, INVALID_PARAMETER, index)
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
@@ -103,16 +104,13 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
         for why, data in tried.items():
             if data is not None:
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
-                run = _refused(row, data, INVALID_LENGTH)
+                run = partial(_refused, row, data, INVALID_LENGTH, None)
                 yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
 
 
-def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run:
-    def run(probe: LinkProbe) -> None:
-        probe.expect_refusal(row, data, error)
-        probe.check_reported(row.id, error, index)
-
-    return run
+def _refused(row: Row, data: bytes, error: str, index: int | None, probe: LinkProbe) -> None:
+    probe.expect_refusal(row, data, error)
+    probe.check_reported(row.id, error, index)
 
 
 # --- telemetry ---
@@ -202,45 +200,38 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
-            yield case_in("commands", row.name, title, _accepted(row), row, intrusive=True)
+            yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
     for row in unit.telemetry.values():
         source = next((item.telecommand for item in row.named.values() if item.telecommand), None)
         if source is not None and unit.telecommands[source].action in (None, "nothing"):
             title = f"{row.name} reports the bytes set by {source}"
-            run = _read_back(unit.telecommands[source], row, marks)
+            run = partial(_read_back, unit.telecommands[source], row, marks)
             yield case_in("settings", row.name, title, run, row, intrusive=True)
 
 
-def _accepted(row: Row) -> Run:
+def _accepted(row: Row, probe: LinkProbe) -> None:
     """Send plain values, and both limits of each number if the row has no effect."""
-
-    def run(probe: LinkProbe) -> None:
-        probe.send_command(row, row.encode())
-        for name, item in row.named.items() if row.action == "nothing" else ():
-            for limit, given in zip(
-                item.limits if item.kind in ("integer", "float") else (),
-                (item.minimum, item.maximum),
-                strict=False,
-            ):
-                if given is not None:
-                    probe.send_command(row, row.encode({name: limit}))
-
-    return run
+    probe.send_command(row, row.encode())
+    for name, item in row.named.items() if row.action == "nothing" else ():
+        for limit, given in zip(
+            item.limits if item.kind in ("integer", "float") else (),
+            (item.minimum, item.maximum),
+            strict=False,
+        ):
+            if given is not None:
+                probe.send_command(row, row.encode({name: limit}))
 
 
-def _read_back(command: Row, row: Row, marks: bytes) -> Run:
-    def run(probe: LinkProbe) -> None:
-        before = probe.data_of(row)
-        rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
-        for turn in range(3):
-            data = command.encode(
-                {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
-            )
-            probe.send_command(command, data)
-            check_equal(probe.data_of(row), data, f"the bytes of {command.name}")
-        probe.send_command(command, before)
-
-    return run
+def _read_back(command: Row, row: Row, marks: bytes, probe: LinkProbe) -> None:
+    before = probe.data_of(row)
+    rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
+    for turn in range(3):
+        data = command.encode(
+            {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
+        )
+        probe.send_command(command, data)
+        check_equal(probe.data_of(row), data, f"the bytes of {command.name}")
+    probe.send_command(command, before)
 
 
 # --- subscriptions and floods ---
@@ -254,30 +245,29 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
             yield case_in(
-                "subscriptions", row.name, title, _subscribed(row, fields, offered), row, intrusive=True
+                "subscriptions",
+                row.name,
+                title,
+                partial(_subscribed, row, fields, offered),
+                row,
+                intrusive=True,
             )
 
 
-def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
+def _subscribed(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
     none = dict.fromkeys(fields, 0)
-
-    def run(probe: LinkProbe) -> None:
-        chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
-        probe.send_command(command, command.encode(chosen))
-        seen = probe.receive_unsolicited(SUBSCRIBED_S)
-        probe.send_command(command, command.encode(none))
-        probe.sleep(0.5)
-        wanted = {(row.id, row.size) for row in offered[: len(fields)]}
-        check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
-        check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
-        check_equal(
-            {answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes"
-        )
-        for answer in seen:
-            checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
-        check_equal(len(probe.receive_unsolicited(2.0)), 0, "messages after the end of the subscription")
-
-    return run
+    chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
+    probe.send_command(command, command.encode(chosen))
+    seen = probe.receive_unsolicited(SUBSCRIBED_S)
+    probe.send_command(command, command.encode(none))
+    probe.sleep(0.5)
+    wanted = {(row.id, row.size) for row in offered[: len(fields)]}
+    check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
+    check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
+    check_equal({answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes")
+    for answer in seen:
+        checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
+    check_equal(len(probe.receive_unsolicited(2.0)), 0, "messages after the end of the subscription")
 
 
 def _flood(probe: LinkProbe) -> None:
