@@ -38,7 +38,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, Field, PlainValidator, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
 from starhil.hil_tests.errors import BenchError, ScriptError
@@ -452,13 +460,14 @@ class Defaults(Keys):
 class Script(Keys):
     """A validated session script."""
 
+    model_config = ConfigDict(populate_by_name=False)
+
     title: str = ""
     doc: str = ""
     truth: Truth = Truth()
     emulator: EmulatorRequest = EmulatorRequest()
     defaults: Defaults = Defaults()
-    steps: Any = Field((), alias="step")
-    """Tables; in a validated script a list of `Step`."""
+    steps: tuple[Step, ...] = Field((), alias="step")
 
 
 def load_script(path: Path, icd: InterfaceDefinition) -> Script:
@@ -474,8 +483,8 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         raise ScriptError(f"{path}: cannot be read: {reason}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScriptError(f"{path}: not valid TOML: {error}") from None
+    tables = document.pop("step", [])
     script, problems = _checked(Script, {"title": path.stem.replace("_", " "), **document}, path.name)
-    tables = document.get("step", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{path.name}: 'step' must be an array of tables: write [[step]] before each")
         tables = []
@@ -483,7 +492,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         problems.append(f"{path.name}: has no steps: write [[step]] and one of the actions below it")
     captured: set[str] = set()
     context = {"icd": icd, "captured": captured, "has_truth": bool(document.get("truth"))}
-    steps = []
+    steps: list[Step | None] = []
     for number, table in enumerate(tables, 1):
         step, found = _step(f"{path.name}: step {number}", table, {**context, "number": number})
         steps.append(step)
@@ -492,7 +501,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         captured.update(names if isinstance(names, dict) else ())  # also of a step with an error
     if problems or script is None:
         raise ScriptError(*problems)
-    return script.model_copy(update={"steps": steps})
+    return script.model_copy(update={"steps": tuple(steps)})
 
 
 def _step(location: str, table: dict[str, Any], context: dict[str, Any]) -> tuple[Step | None, list[str]]:
