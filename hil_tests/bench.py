@@ -24,11 +24,8 @@ SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 class LinkOptions:
     """Options of the links and of the clients.
 
-    Attributes
-    ----------
-    serial, can : str or None
-        Port and channel; None if the link is not used. `auto` means those on the ready line of the emulator
-        that the bench started.
+    `serial` and `can` are port and channel, None if the link is not used, `auto` for those on the ready line of the emulator
+    that the bench started.
     """
 
     serial: str | None = None

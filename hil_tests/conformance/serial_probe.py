@@ -25,12 +25,8 @@ SHOWN_BYTES: Final = 48
 class SerialProbe(LinkProbe):
     """Talks to a unit over a serial port.
 
-    `dialect` is that of the answers, of a unit that has several; `baud` the bit rate of the line, None if unknown.
-
-    Attributes
-    ----------
-    raw, sent
-        All bytes received since the last drain, and those sent last.
+    `dialect` is that of the answers, of a unit that has several; `baud` the bit rate of the line, None if unknown; `raw` are all
+    bytes received since the last drain, and `sent` those sent last.
     """
 
     link = "serial"
