@@ -58,8 +58,7 @@ class Bench:
         self.icd = icd
         self.emulator = emulator
         self.log_folder = log_folder
-        self.logs: list[WireLog] = []
-        self._log_of: dict[str, WireLog] = {}
+        self.logs: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
         self._started = False
 
@@ -104,13 +103,12 @@ class Bench:
     def _log(self, link: str) -> WireLog | None:
         if self.log_folder is None:
             return None
-        if link not in self._log_of:
+        if link not in self.logs:
             path = self.log_folder / f"{link}.log"
-            self._log_of[link] = (
+            self.logs[link] = (
                 SerialLog(path) if link == "serial" else CandumpLog(path, bus_name(self._spec(link)))
             )
-            self.logs.append(self._log_of[link])
-        return self._log_of[link]
+        return self.logs[link]
 
     def close_clients(self) -> None:
         """Close all clients; they are opened again on next use."""
@@ -142,7 +140,7 @@ class Bench:
         try:
             self.close_clients()
         finally:
-            for log in self.logs:
+            for log in self.logs.values():
                 log.close()
             self._end_emulator(kind)
 

@@ -17,7 +17,7 @@ from starhil.hil_tests.expect import AttitudeCheck, resolve, show, show_angle
 from starhil.hil_tests.images import write_png
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.load_figures import percentile
-from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
+from starhil.hil_tests.raw_traffic import matches, send_and_listen
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, summarize
 from starhil.hil_tests.script import Script, Step
 from starhil.hil_tests.transactions import Ack, Reading
@@ -118,7 +118,7 @@ class SessionRunner:
         if link and link not in self._bench.links:
             detail = f"needs a {link} link, the session has {' and '.join(self._bench.links)}"
             return StepResult(step.number, step.name, link, SKIPPED, detail, 0.0)
-        for log in self._bench.logs:
+        for log in self._bench.logs.values():
             log.note(f"step {step.number}: {step.name}")
         attempt = Attempt()
         for turn in range(step.repeat):
@@ -319,13 +319,13 @@ class SessionRunner:
 
     @staticmethod
     def _send(step: scripts.Send, client: ObcClient) -> Attempt:
-        wanted = [pattern(text) for text in step.answer or ()]
-        seen = send_and_listen(client, step.data, step.listen_s, tuple(wanted), step.timeout_s)
+        wanted = step.answer or ()
+        seen = send_and_listen(client, step.data, step.listen_s, wanted, step.timeout_s)
         shown = ", ".join(text for text in seen if text) or "nothing"
         if step.answer is None:
             return Attempt(detail=f"came back: {shown}")
         if client.core.link.name == "serial":
-            wanted = ["".join(wanted)]
+            wanted = ("".join(wanted),)
         if len(seen) == len(wanted) and all(matches(a, b) for a, b in zip(wanted, seen, strict=True)):
             return Attempt(detail=f"came back: {shown}, as expected")
         return Attempt(problem=f"came back: {shown}, expected {', '.join(filter(None, wanted)) or 'nothing'}")
