@@ -127,21 +127,14 @@ def make_clock(text: str) -> RealClock | ScaledClock | SteppedClock:
 
 @dataclass
 class DeviceTime:
-    """Unix time of the device: simulation time plus an offset, which telecommand 2 sets.
-
-    Attributes
-    ----------
-    clock
-        Source of the simulation time.
-    offset_ns
-        Unix time at simulation time zero, nanoseconds.
-    was_set
-        Whether the time was set since the last start.
-    """
+    """Unix time of the device: simulation time plus an offset, which telecommand 2 sets."""
 
     clock: Clock
+    """Source of the simulation time."""
     offset_ns: int = 0
+    """Unix time at simulation time zero, nanoseconds."""
     was_set: bool = False
+    """Whether the time was set since the last start."""
 
     def unix_ns(self, run_ns: int | None = None) -> int:
         """Return the Unix time at a simulation time, or now, nanoseconds."""

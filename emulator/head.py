@@ -64,13 +64,6 @@ class Head:
         Truth of the body on which the head is mounted.
     on_warm
         Called when the pipeline is ready, also after a restart.
-
-    Attributes
-    ----------
-    ready_fields
-        Fields of the ready line: the opened ports and buses.
-    warm
-        What the pipeline reported when it was last ready; None before.
     """
 
     def __init__(
@@ -95,7 +88,9 @@ class Head:
         """The open links, in the order of opening."""
         self.traffic = Traffic()
         self.ready_fields: dict[str, str] = {}
+        """Fields of the ready line: the opened ports and buses."""
         self.warm: PipelineReady | None = None
+        """What the pipeline reported when it was last ready; None before."""
         self._wiring = wiring
         self._recorder = wiring if isinstance(wiring, Recorder) else None
         self._on_warm = on_warm

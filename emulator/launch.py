@@ -25,42 +25,28 @@ from starhil.protocol.errors import ProtocolError
 
 @dataclass(frozen=True)
 class RunOptions:
-    """Options of a run that are not part of the profile.
-
-    Attributes
-    ----------
-    truth_log
-        CSV file of truth and measurement, one row per frame; one file per head (`path_of_head`).
-    overwrite
-        Replace an existing truth log.
-    control
-        `off`, `auto` (a Unix socket that only this user can open), unix:/PATH or HOST:PORT.
-    control_token
-        Token that each request on the control channel must contain; empty for none.
-    scenario
-        Name or path of a scenario; empty for none.
-    record
-        Folder of a recording of the run, for a replay.
-    view
-        Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT.
-    view_token
-        Token of pages that may look but not command; empty for none.
-    mcap
-        MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`).
-    make_client
-        Makes the OBC for console and MCAP file; required for these.
-    """
+    """Options of a run that are not part of the profile."""
 
     truth_log: Path | None = None
+    """CSV file of truth and measurement, one row per frame; one file per head (`path_of_head`)."""
     overwrite: bool = False
+    """Replace an existing truth log."""
     control: str = "off"
+    """`off`, `auto` (a Unix socket that only this user can open), unix:/PATH or HOST:PORT."""
     control_token: str = ""
+    """Token that each request on the control channel must contain; empty for none."""
     scenario: str = ""
+    """Name or path of a scenario; empty for none."""
     record: Path | None = None
+    """Folder of a recording of the run, for a replay."""
     view: str = "off"
+    """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
     view_token: str = ""
+    """Token of pages that may look but not command; empty for none."""
     mcap: Path | None = None
+    """MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`)."""
     make_client: MakeClient | None = None
+    """Makes the OBC for console and MCAP file; required for these."""
 
     @property
     def watched(self) -> bool:
@@ -77,13 +63,6 @@ class Emulator:
         Profiles of the heads; truth and clock are those of the first.
     worker
         Pipeline worker that was started earlier; by default one is started here.
-
-    Attributes
-    ----------
-    run
-        Clock, truth and heads.
-    ended
-        Set to end the run.
     """
 
     def __init__(
@@ -100,7 +79,9 @@ class Emulator:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
             wiring = Recorder(options.record, Wiring(make_clock(profiles[0].run.clock)))
         self.run = Run(profiles, wiring, worker, previews=options.watched)
+        """Clock, truth and heads."""
         self.ended = asyncio.Event()
+        """Set to end the run."""
         self.control: ControlServer | None = None
         self.ready_fields: dict[str, str] = {}
         """Addresses of control channel and console."""

@@ -20,17 +20,12 @@ log: Final = logging.getLogger("starhil.output")
 
 
 class Output:
-    """Something that a run writes.
-
-    Attributes
-    ----------
-    failed
-        Whether something could not be written; the run then exits with status 1.
-    """
+    """Something that a run writes."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.failed = False
+        """Whether something could not be written; the run then exits with status 1."""
 
     def fail(self, why: str) -> None:
         """Report a failure: the first is logged as a warning."""

@@ -294,19 +294,13 @@ class PlayedImager:
 
 @dataclass
 class ReplayReport:
-    """Outcome of a replay.
-
-    Attributes
-    ----------
-    sent
-        Number of serial bytes or CAN frames sent, by link.
-    differences
-        One line for each link or file that differs, is missing or is truncated; empty if all are identical.
-    """
+    """Outcome of a replay."""
 
     entries: int = 0
     sent: dict[str, int] = field(default_factory=dict)
+    """Number of serial bytes or CAN frames sent, by link."""
     differences: list[str] = field(default_factory=list)
+    """One line for each link or file that differs, is missing or is truncated; empty if all are identical."""
 
 
 def read_run(folder: Path) -> tuple[Profile, bool]:

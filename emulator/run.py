@@ -48,17 +48,6 @@ class Run:
         Profiles of the heads; truth and clock are those of the first.
     worker
         Pipeline worker of the first head that was started earlier; by default it is started here.
-
-    Attributes
-    ----------
-    heads
-        The heads, once the run is open.
-    recorder
-        Records the run; None if it is not recorded.
-    stepper
-        Advances the stepped clock, once the run has begun; None with another clock.
-    time_passes
-        Set when the pipeline of every head is ready: time then passes beyond the boot.
     """
 
     def __init__(
@@ -73,11 +62,15 @@ class Run:
         self.wiring = wiring or Wiring(make_clock(self.profile.run.clock))
         self.clock = self.wiring.clock
         self.recorder = self.wiring if isinstance(self.wiring, Recorder) else None
+        """Records the run; None if it is not recorded."""
         self.stepper: StepPump | None = None
+        """Advances the stepped clock, once the run has begun; None with another clock."""
         self.time_passes = asyncio.Event()
+        """Set when the pipeline of every head is ready: time then passes beyond the boot."""
         self._switched_on_ns = time.monotonic_ns() if worker is None else worker.started_ns
         """Time at which the devices were switched on, on the monotonic wall clock, nanoseconds."""
         self.heads: list[Head] = []
+        """The heads, once the run is open."""
         host = TruthHost(
             self.clock,
             self.profile.run.clock,

@@ -14,18 +14,13 @@ class Signal(Generic[Message]):
     """Passes each message to its observers, in the order in which they were connected.
 
     An observer that fails is logged, and stops neither the sender nor the other observers.
-
-    Attributes
-    ----------
-    name
-        What is reported, for the log.
-    observers
-        The connected functions.
     """
 
     def __init__(self, name: str) -> None:
         self.name = name
+        """What is reported, for the log."""
         self.observers: list[Callable[[Message], object]] = []
+        """The connected functions."""
 
     def connect(self, observer: Callable[[Message], object]) -> None:
         """Call a function with each further message."""

@@ -36,18 +36,12 @@ STATE_FOLDER: Final = "state"
 
 
 class Wiring:
-    """Connects a run to the world: directly. A recorder or a player takes the place of these connections.
-
-    Attributes
-    ----------
-    plays
-        Whether a recording is played, so that no sockets are opened.
-    repeatable
-        Whether results must not depend on the speed of the machine.
-    """
+    """Connects a run to the world: directly. A recorder or a player takes the place of these connections."""
 
     plays = False
+    """Whether a recording is played, so that no sockets are opened."""
     repeatable = False
+    """Whether results must not depend on the speed of the machine."""
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
@@ -117,13 +111,6 @@ class Recorder(Wiring):
     ----------
     inner
         Connects the run to the world.
-
-    Attributes
-    ----------
-    file
-        The tape; None before it is opened.
-    output
-        All files of the recording.
     """
 
     repeatable = True
@@ -134,7 +121,9 @@ class Recorder(Wiring):
         self._inner = inner
         self.folder = folder
         self.file: OutputFile | None = None
+        """The tape; None before it is opened."""
         self.output = Output(f"recording {folder}")
+        """All files of the recording."""
         self._held: list[Callable[[], None]] | None = []
         """Entries that arrived while the links were being opened, which takes no time on the tape; None
         afterwards."""

@@ -104,8 +104,8 @@ def plain_text(text: str) -> str:
     return " ".join(text.replace("``", "`").split())
 
 
-def attribute_docstrings(model: type) -> dict[str, str]:
-    """Return the docstring under each field of a class.
+def attribute_docstrings(model: type, *, grouped: bool = False) -> dict[str, str]:
+    """Return the docstring under each field of a class; if `grouped`, it also describes the bare fields above it.
 
     Raises
     ------
@@ -123,6 +123,10 @@ def attribute_docstrings(model: type) -> dict[str, str]:
                 else ""
             )
             found[statement.target.id] = plain_text(str(text))
+    if grouped:
+        text = ""
+        for name in reversed(found):
+            text = found[name] = found[name] or text
     bare = [name for name, text in found.items() if not text and not name.startswith("_")]
     if bare:
         raise SystemExit(
@@ -271,14 +275,14 @@ def kind_of(model: type[BaseModel]) -> str:
 
 def sensor() -> str:
     """Keys of `[sensor]`."""
-    from starhil.emulator.sensor.model import _RANGES, SensorModel
+    from starhil.emulator.sensor.model import SensorModel
 
-    texts = documented_names(SensorModel)
+    texts = attribute_docstrings(SensorModel, grouped=True)
     rows: list[Row] = []
     for field in dataclasses.fields(SensorModel):
         if field.name in OF_PARAMETERS:
             continue
-        low, high, of = _RANGES.get(field.name, (0, 0, ""))
+        low, high, of = field.metadata.get("limits", (0, 0, ""))
         allowed = f"{low:g} to {high:g}" if of else "`8`, `12`, `16`"
         rows.append((f"`{field.name}`", of, allowed, literal(field.default), texts[field.name]))
     return table(rows)
@@ -308,7 +312,7 @@ def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> li
     """Return a row for each field of a dataclass of the sky."""
     from starhil.emulator.sky.objects import _RANGES
 
-    texts = documented_names(kind)
+    texts = attribute_docstrings(kind, grouped=True)
     rows: list[Row] = []
     for field in dataclasses.fields(kind):
         if field.name in (skipped or {}):

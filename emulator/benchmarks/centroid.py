@@ -41,43 +41,29 @@ _BRIGHTEST_COMPLETE: Final = 0.5
 
 @dataclass(frozen=True)
 class CentroidRow:
-    """Accuracy in one magnitude bin at one rate.
-
-    Attributes
-    ----------
-    rate_deg_s : float
-        Body rate across the boresight.
-    v_low, v_high : float
-        Limits of the bin.
-    stars : int
-        Isolated stars in the bin, in all frames.
-    detected_pct : float
-        Percentage of them that were detected.
-    rms_px : float
-        Error per axis, root mean square.
-    bound_px : float
-        Cramér–Rao bound per axis, root mean square over the same stars.
-    ratio : float
-        `rms_px` divided by `bound_px`.
-    predicted_px : float
-        Error predicted by the detection, root mean square.
-    normalised_squared_error : float
-        Mean of (error / predicted)² per axis; 1 if the prediction is calibrated.
-    bias_px : float
-        Length of the mean error vector.
-    """
+    """Accuracy in one magnitude bin at one rate."""
 
     rate_deg_s: float
+    """Body rate across the boresight."""
     v_low: float
     v_high: float
+    """Limits of the bin."""
     stars: int
+    """Isolated stars in the bin, in all frames."""
     detected_pct: float
+    """Percentage of them that were detected."""
     rms_px: float
+    """Error per axis, root mean square."""
     bound_px: float
+    """Cramér–Rao bound per axis, root mean square over the same stars."""
     ratio: float
+    """`rms_px` divided by `bound_px`."""
     predicted_px: float
+    """Error predicted by the detection, root mean square."""
     normalised_squared_error: float
+    """Mean of (error / predicted)² per axis; 1 if the prediction is calibrated."""
     bias_px: float
+    """Length of the mean error vector."""
 
 
 def cramer_rao_px(

@@ -61,46 +61,33 @@ INFLUENCES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class EcssPlan:
-    """A performance campaign; equal plans give equal results.
-
-    Attributes
-    ----------
-    profile
-        Name or path of the device profile.
-    overrides
-        Overrides of the profile, `section.key=value`.
-    seed
-        Seed of attitudes and noise.
-    fields, positions, repeats
-        Number of directions in the sky, sub-pixel positions for each, and frames for each position, to
-        separate the kinds of error.
-    thermal_fields, thermal_points
-        Number of directions, and of points of the orbit for each, for the thermo-elastic error.
-    dated_fields, dates, dated_repeats
-        Number of directions, of dates over a year for each, and of frames for each date, for the aberration
-        residual.
-    rest_frames
-        Number of frames at rest, at random attitudes and points of the orbit.
-    frames
-        Number of frames at each value of an influence.
-    chunk
-        Frames per part; a resumed campaign repeats only unfinished parts.
-    """
+    """A performance campaign; equal plans give equal results."""
 
     profile: str
+    """Name or path of the device profile."""
     overrides: tuple[str, ...] = ()
+    """Overrides of the profile, `section.key=value`."""
     seed: int = 1
+    """Seed of attitudes and noise."""
     fields: int = 80
     positions: int = 4
     repeats: int = 4
+    """Number of directions in the sky, sub-pixel positions for each, and frames for each position, to separate the
+    kinds of error."""
     thermal_fields: int = 24
     thermal_points: int = 12
+    """Number of directions, and of points of the orbit for each, for the thermo-elastic error."""
     dated_fields: int = 40
     dates: int = 6
     dated_repeats: int = 2
+    """Number of directions, of dates over a year for each, and of frames for each date, for the aberration
+    residual."""
     rest_frames: int = 2000
+    """Number of frames at rest, at random attitudes and points of the orbit."""
     frames: int = 100
+    """Number of frames at each value of an influence."""
     chunk: int = 50
+    """Frames per part; a resumed campaign repeats only unfinished parts."""
 
     def conditions(self) -> list[Condition]:
         """Return all conditions of the campaign."""

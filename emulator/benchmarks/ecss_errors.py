@@ -37,40 +37,26 @@ Labels = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class ErrorSeries:
-    """Errors at known conditions.
-
-    Attributes
-    ----------
-    error_arcsec : ndarray (n, 3)
-        Rotation vectors of the errors, arcseconds.
-    field : ndarray (n,)
-        Number of the direction of the sky.
-    condition : ndarray (n,)
-        Number of the condition within each field: the sub-pixel position, the temperature or the date.
-    """
+    """Errors at known conditions."""
 
     error_arcsec: Vectors
+    """Rotation vectors of the errors, arcseconds, (n, 3)."""
     field: Labels
+    """Number of the direction of the sky, (n,)."""
     condition: Labels
+    """Number of the condition within each field: the sub-pixel position, the temperature or the date, (n,)."""
 
 
 @dataclass(frozen=True)
 class ErrorLine:
-    """One kind of error.
-
-    Attributes
-    ----------
-    name : str
-        Name in the standard.
-    arcsec : ndarray (3,) or None
-        Size about x, y and z at the confidence level, arcseconds; 0 if not significant. None: not evaluated.
-    resolution_arcsec : ndarray (3,)
-        Smallest size that would have been significant.
-    """
+    """One kind of error."""
 
     name: str
+    """Name in the standard."""
     arcsec: Vectors | None
+    """Size about x, y and z at the confidence level, arcseconds, (3,); 0 if not significant. None: not evaluated."""
     resolution_arcsec: Vectors
+    """Smallest size that would have been significant, (3,)."""
 
     @property
     def across_arcsec(self) -> float:

@@ -38,24 +38,17 @@ PLOTS: Final = {
 
 @dataclass(frozen=True)
 class Outcomes:
-    """Numbers of frames under a condition with a correct, a wrong and no attitude.
-
-    Attributes
-    ----------
-    influence, value
-        The varied influence, and its value.
-    frames, correct, wrong
-        Number of frames, of correct attitudes, and of wrong ones.
-    reasons
-        Reason of an invalid attitude → number of frames.
-    """
+    """Numbers of frames under a condition with a correct, a wrong and no attitude."""
 
     influence: str
     value: float
+    """The varied influence, and its value."""
     frames: int
     correct: int
     wrong: int
+    """Number of frames, of correct attitudes, and of wrong ones."""
     reasons: Mapping[str, int]
+    """Reason of an invalid attitude → number of frames."""
 
     @property
     def availability(self) -> float:
@@ -65,30 +58,20 @@ class Outcomes:
 
 @dataclass(frozen=True)
 class EcssReport:
-    """Figures of a campaign.
-
-    Attributes
-    ----------
-    plan
-        The campaign.
-    confidence
-        Confidence level of the errors.
-    lines
-        Errors by kind.
-    measured_arcsec
-        Quantile of the errors at rest about x, y and z at the confidence level, over sky and orbit.
-    outcomes
-        Correct, wrong and invalid attitudes by condition; the first is at rest.
-    stars
-        Median number of stars detected at rest.
-    """
+    """Figures of a campaign."""
 
     plan: EcssPlan
+    """The campaign."""
     confidence: float
+    """Confidence level of the errors."""
     lines: tuple[ErrorLine, ...]
+    """Errors by kind."""
     measured_arcsec: np.ndarray
+    """Quantile of the errors at rest about x, y and z at the confidence level, over sky and orbit."""
     outcomes: tuple[Outcomes, ...]
+    """Correct, wrong and invalid attitudes by condition; the first is at rest."""
     stars: float
+    """Median number of stars detected at rest."""
 
     @property
     def total(self) -> ErrorLine:

@@ -36,23 +36,16 @@ _MAX_TRIES: Final = 20
 
 @dataclass(frozen=True)
 class StageRow:
-    """Time of one stage over many frames.
-
-    Attributes
-    ----------
-    stage : str
-        "render", "detect", "identify", or "all".
-    frames : int
-        Number of measured frames.
-    median_ms, p99_ms, least_ms : float
-        Median, 99th percentile and minimum, milliseconds.
-    """
+    """Time of one stage over many frames."""
 
     stage: str
+    """`render`, `detect`, `identify`, or `all`."""
     frames: int
+    """Number of measured frames."""
     median_ms: float
     p99_ms: float
     least_ms: float
+    """Median, 99th percentile and minimum, milliseconds."""
 
 
 def measure_frames(
@@ -110,28 +103,19 @@ def measure_frames(
 
 @dataclass(frozen=True)
 class BodiesRow:
-    """Time of frames with Sun, Moon, Earth, planets and aberration, and of the same frames with stars only.
-
-    Attributes
-    ----------
-    in_field : str
-        Bodies in the field of view: "none", "earth" or "moon".
-    stage : str
-        "render" or, with detection and identification, "all".
-    frames : int
-        Number of measured frames of each kind.
-    without_ms, with_ms : float
-        Medians, milliseconds.
-    ratio : float
-        `with_ms` divided by `without_ms`.
-    """
+    """Time of frames with Sun, Moon, Earth, planets and aberration, and of the same frames with stars only."""
 
     in_field: str
+    """Bodies in the field of view: `none`, `earth` or `moon`."""
     stage: str
+    """`render` or, with detection and identification, `all`."""
     frames: int
+    """Number of measured frames of each kind."""
     without_ms: float
     with_ms: float
+    """Medians, milliseconds."""
     ratio: float
+    """`with_ms` divided by `without_ms`."""
 
 
 def measure_bodies(

@@ -35,25 +35,17 @@ BMP_HEAD: Final = struct.Struct("<2sIHHIIiiHHIIiiII")
 
 @dataclass(frozen=True)
 class StoredImage:
-    """A square 8-bit image, which is also a file.
-
-    Attributes
-    ----------
-    edge, pixels
-        Edge in pixels, and the pixels row by row from the top.
-    frame
-        Index of its exposure.
-    number
-        Number of the image since start-up, from 1 to 255 and again from 1; the counter of its file.
-    unix_ns
-        Time on the device's clock when it was stored.
-    """
+    """A square 8-bit image, which is also a file."""
 
     edge: int
     pixels: bytes
+    """Edge in pixels, and the pixels row by row from the top."""
     frame: int
+    """Index of its exposure."""
     number: int
+    """Number of the image since start-up, from 1 to 255 and again from 1; the counter of its file."""
     unix_ns: int = 0
+    """Time on the device's clock when it was stored."""
 
     def binned(self, edge: int) -> StoredImage:
         """Return the image reduced to `edge` by averaging squares of pixels."""

@@ -24,24 +24,16 @@ class Phase(StrEnum):
 
 @dataclass(frozen=True)
 class FrameTiming:
-    """Timing of the frames.
-
-    Attributes
-    ----------
-    running
-        Whether frames are taken.
-    start_ns
-        Start of the last exposure, simulation time.
-    busy_s
-        Time from the start of an exposure to the end of its processing, seconds.
-    period_s
-        Time from exposure to exposure, seconds.
-    """
+    """Timing of the frames."""
 
     running: bool
+    """Whether frames are taken."""
     start_ns: int
+    """Start of the last exposure, simulation time."""
     busy_s: float
+    """Time from the start of an exposure to the end of its processing, seconds."""
     period_s: float
+    """Time from exposure to exposure, seconds."""
 
 
 class PowerModel:

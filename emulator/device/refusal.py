@@ -6,20 +6,13 @@ from starhil.protocol.messages import ErrorCode
 
 
 class Refused(Exception):  # noqa: N818 (an answer on the bus, not an error of the program)
-    """A request that the device answers with an error code.
-
-    Attributes
-    ----------
-    code
-        The error.
-    argument
-        Name of the invalid argument or parameter, if any.
-    index
-        Index of the invalid telecommand field, for the telemetry row `acknowledge`.
-    """
+    """A request that the device answers with an error code."""
 
     def __init__(self, code: ErrorCode, argument: str | None = None) -> None:
         super().__init__(code.name.lower())
         self.code = code
+        """The error."""
         self.argument = argument
+        """Name of the invalid argument or parameter, if any."""
         self.index = 0
+        """Index of the invalid telecommand field, for the telemetry row `acknowledge`."""

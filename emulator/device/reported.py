@@ -27,27 +27,18 @@ GIMBAL_LOCK_RAD: Final = 1e-7
 
 @dataclass(frozen=True)
 class Reported:
-    """Reported attitude and rate.
-
-    Attributes
-    ----------
-    reason
-        Why the attitude is invalid, `ok` if it is valid.
-    quaternion_xyzw
-        ICRS → reported frame in the convention of the unit, scalar last; zeros if invalid.
-    rate_rad_s
-        Body rate in the reported frame, rad/s; zeros if unknown.
-    attitude
-        ICRS → reported frame; the identity if invalid.
-    mounted
-        ICRS → sensor frame after the mounting angles; the reported frame differs from it in the names of its axes.
-    """
+    """Reported attitude and rate."""
 
     reason: str
+    """Why the attitude is invalid, `ok` if it is valid."""
     quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 0.0)
+    """ICRS → reported frame in the convention of the unit, scalar last; zeros if invalid."""
     rate_rad_s: Triple = ZERO
+    """Body rate in the reported frame, rad/s; zeros if unknown."""
     attitude: Attitude = _IDENTITY
+    """ICRS → reported frame; the identity if invalid."""
     mounted: Attitude = _IDENTITY
+    """ICRS → sensor frame after the mounting angles; the reported frame differs from it in the names of its axes."""
 
     @property
     def valid(self) -> bool:

@@ -34,13 +34,6 @@ class Surroundings:
     ----------
     truth
         Truth of the sensor; what it describes may change during a run.
-
-    Attributes
-    ----------
-    faults
-        Optical faults: fields of the sky objects that differ from the profile's.
-    has_aberration
-        Whether the sky has aberration.
     """
 
     def __init__(
@@ -48,7 +41,9 @@ class Surroundings:
     ) -> None:
         self.truth = truth
         self.has_aberration = profile.images.used or bool(has_aberration(profile.sky))
+        """Whether the sky has aberration."""
         self.faults: dict[str, Any] = {}
+        """Optical faults: fields of the sky objects that differ from the profile's."""
         self._radiation = profile.radiation
         self._start_unix_s = profile.start_unix_s
         self._orbit = orbit_of(profile)

@@ -44,15 +44,7 @@ TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
 
 
 class MemoryTransport(Transport[Item]):
-    """The device's end of a link without a wire.
-
-    Attributes
-    ----------
-    sent
-        Items that the device has sent and nobody has taken, each with its time, seconds.
-    reads
-        Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader.
-    """
+    """The device's end of a link without a wire."""
 
     immediate: ClassVar[bool] = True
 
@@ -60,7 +52,9 @@ class MemoryTransport(Transport[Item]):
         super().__init__(description)
         self._now_s = now_s
         self.sent: list[tuple[float, Item]] = []
+        """Items that the device has sent and nobody has taken, each with its time, seconds."""
         self.reads = True
+        """Whether the peer reads; otherwise what the device sends is dropped, as on a pty without a reader."""
 
     async def _open(self) -> None:
         """Do nothing: there is no port."""
@@ -145,11 +139,6 @@ class UnitUnderTest:
         Whether images are rendered and solved, in a process; otherwise the pipeline is an error model.
     record
         Folder of a recording, which holds the time since power was last switched on.
-
-    Attributes
-    ----------
-    frames, exposed_s
-        Number of images solved in all, and the sum of their periods, seconds.
     """
 
     def __init__(
@@ -185,6 +174,7 @@ class UnitUnderTest:
         self._run: Run | None = None
         self.frames = 0
         self.exposed_s = 0.0
+        """Number of images solved in all, and the sum of their periods, seconds."""
         self._unlimited = resource.getrlimit(resource.RLIMIT_FSIZE)
         self._transports: dict[str, MemoryTransport[Any]] = {}
         self._errors = _InternalErrors()

@@ -44,24 +44,16 @@ _CANOPEN: Final = (
 
 @dataclass(frozen=True, slots=True)
 class WireItem:
-    """Bytes or a CAN frame on a link.
-
-    Attributes
-    ----------
-    at_s
-        Unix time.
-    bus
-        `serial` or `can`.
-    outgoing
-        True if the device sent it.
-    item
-        Bytes, or a CAN frame.
-    """
+    """Bytes or a CAN frame on a link."""
 
     at_s: float
+    """Unix time."""
     bus: str
+    """`serial` or `can`."""
     outgoing: bool
+    """True if the device sent it."""
     item: bytes | CanFrame
+    """Bytes, or a CAN frame."""
 
 
 class Traffic:

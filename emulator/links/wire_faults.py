@@ -16,28 +16,19 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class WireFaultSettings:
-    """Faults of a link.
-
-    Attributes
-    ----------
-    drop, corrupt
-        Probability that an outgoing item (a serial reply or a CAN frame) is lost, or has one bit flipped.
-    delay_s
-        Delay of every outgoing item, seconds.
-    split
-        Size of the chunks in which a serial reply is sent, bytes; 0: not split.
-    gap_s
-        Pause between the chunks of a split reply, seconds.
-    junk
-        Probability that random bytes (serial) or a random frame (CAN) are sent before an item.
-    """
+    """Faults of a link."""
 
     drop: float = 0.0
     corrupt: float = 0.0
+    """Probability that an outgoing item (a serial reply or a CAN frame) is lost, or has one bit flipped."""
     delay_s: float = 0.0
+    """Delay of every outgoing item, seconds."""
     split: int = 0
+    """Size of the chunks in which a serial reply is sent, bytes; 0: not split."""
     gap_s: float = 0.02
+    """Pause between the chunks of a split reply, seconds."""
     junk: float = 0.0
+    """Probability that random bytes (serial) or a random frame (CAN) are sent before an item."""
 
     @property
     def none(self) -> bool:

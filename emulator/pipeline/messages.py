@@ -40,41 +40,29 @@ IMAGE_EDGES: Final = (1024, 512, 256, 128, 64)
 
 @dataclass(frozen=True)
 class PipelineSetup:
-    """Configuration of the pipeline, fixed for a run.
-
-    Attributes
-    ----------
-    camera, sensor, sky, identifier
-        Fields of the camera, the sensor model and the sky objects, and options of the algorithm, by name.
-    catalog_path, epoch
-        Catalogue file (empty: the installed one) and the Julian year of the star positions.
-    algorithm
-        `geometric`, `lsi` or `rsi`.
-    seed
-        Seed of all noise.
-    build_in_background
-        Whether frames are solved with the current star index while another is being built. If false, frames
-        wait for the new index, so that a run on the stepped clock is reproducible byte for byte.
-    previews
-        Whether frames may be displayed, so that previews must be possible.
-    dark_frames
-        Number of frames averaged into the dark frame that is subtracted from each image; 0: none.
-    images
-        Source of images instead of rendering: keys of `[images]` in a profile.
-    """
+    """Configuration of the pipeline, fixed for a run."""
 
     camera: dict[str, Any]
     sensor: dict[str, Any]
     sky: dict[str, Any]
     identifier: dict[str, Any]
+    """Fields of the camera, the sensor model and the sky objects, and options of the algorithm, by name."""
     catalog_path: str
     epoch: float
+    """Catalogue file (empty: the installed one) and the Julian year of the star positions."""
     algorithm: str
+    """`geometric`, `lsi` or `rsi`."""
     seed: int
+    """Seed of all noise."""
     build_in_background: bool = False
+    """Whether frames are solved with the current star index while another is being built. If false, frames wait for
+    the new index, so that a run on the stepped clock is reproducible byte for byte."""
     previews: bool = False
+    """Whether frames may be displayed, so that previews must be possible."""
     dark_frames: int = 0
+    """Number of frames averaged into the dark frame that is subtracted from each image; 0: none."""
     images: dict[str, Any] = field(default_factory=dict)
+    """Source of images instead of rendering: keys of `[images]` in a profile."""
 
 
 @dataclass(frozen=True)
@@ -108,172 +96,116 @@ DIRECTION_BITS: Final = 32
 
 @dataclass(frozen=True)
 class CatalogUpset:
-    """A bit flipped in the unit's star catalogue.
-
-    Attributes
-    ----------
-    hip
-        Hipparcos number of the star.
-    component
-        Component of the direction: 0, 1 or 2 for x, y or z.
-    bit
-        Bit of the component in single precision, 0 the least significant.
-    """
+    """A bit flipped in the unit's star catalogue."""
 
     hip: int
+    """Hipparcos number of the star."""
     component: int
+    """Component of the direction: 0, 1 or 2 for x, y or z."""
     bit: int
+    """Bit of the component in single precision, 0 the least significant."""
 
 
 @dataclass(frozen=True)
 class FrameRequest:
-    """Request to render an exposure and, optionally, to solve it.
-
-    Attributes
-    ----------
-    index
-        Number of the frame since the start of the run, which together with the seed determines the noise.
-    truth
-        Truth of the sensor at mid-exposure; without a date, only typed bodies are rendered.
-    exposure_s, gain
-        Exposure in seconds and analog gain.
-    solve
-        Whether to detect and identify stars; if false, the image is only rendered and kept for download.
-    predicted
-        Predicted attitude at mid-exposure, for tracking; None: lost in space.
-    settings
-        Parameters of detection and identification.
-    faults
-        Fields of the sky objects that are overridden by the control channel.
-    temperature_c
-        Temperature of detector and lens, °C; None: as in the sensor model.
-    particles_s
-        Particles per second that hit the detector, in addition to the sky's particles.
-    upsets
-        Bits flipped by radiation in the unit's star catalogue.
-    observer_velocity
-        Velocity (3,) of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct
-        aberration; None: no correction.
-    preview
-        Whether to return the image too, compressed for display.
-    """
+    """Request to render an exposure and, optionally, to solve it."""
 
     index: int
+    """Number of the frame since the start of the run, which together with the seed determines the noise."""
     truth: TruthState
+    """Truth of the sensor at mid-exposure; without a date, only typed bodies are rendered."""
     exposure_s: float
     gain: float
+    """Exposure in seconds and analog gain."""
     solve: bool = True
+    """Whether to detect and identify stars; if false, the image is only rendered and kept for download."""
     predicted: Attitude | None = None
+    """Predicted attitude at mid-exposure, for tracking; None: lost in space."""
     settings: SolverSettings = field(default_factory=SolverSettings)
+    """Parameters of detection and identification."""
     faults: dict[str, Any] = field(default_factory=dict)
+    """Fields of the sky objects that are overridden by the control channel."""
     temperature_c: float | None = None
+    """Temperature of detector and lens, °C; None: as in the sensor model."""
     particles_s: float = 0.0
+    """Particles per second that hit the detector, in addition to the sky's particles."""
     upsets: tuple[CatalogUpset, ...] = ()
+    """Bits flipped by radiation in the unit's star catalogue."""
     observer_velocity: NDArray[np.float64] | None = None
+    """Velocity (3,) of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct aberration;
+    None: no correction."""
     preview: bool = False
+    """Whether to return the image too, compressed for display."""
 
 
 @dataclass(frozen=True)
 class Preview:
-    """An image for display, and its overlay.
-
-    Attributes
-    ----------
-    jpeg
-        The image, 8 bits, stretched so that faint stars are visible.
-    overlay
-        The overlay: a JSON object, made in the worker so that it takes no time on the links.
-    """
+    """An image for display, and its overlay."""
 
     jpeg: bytes
+    """The image, 8 bits, stretched so that faint stars are visible."""
     overlay: bytes = b"{}"
+    """The overlay: a JSON object, made in the worker so that it takes no time on the links."""
 
 
 @dataclass(frozen=True)
 class MatchedStar:
-    """An identified star.
-
-    Attributes
-    ----------
-    hip
-        Hipparcos number.
-    x, y
-        Position, pixels.
-    magnitude, snr
-        Measured magnitude and signal-to-noise ratio.
-    vector
-        Measured direction in the sensor frame, by the camera of the profile.
-    icrs
-        Modelled direction: that of the star in the catalogue, in ICRS, without aberration.
-    """
+    """An identified star."""
 
     hip: int
+    """Hipparcos number."""
     x: float
     y: float
+    """Position, pixels."""
     magnitude: float
     snr: float
+    """Measured magnitude and signal-to-noise ratio."""
     vector: Triple
+    """Measured direction in the sensor frame, by the camera of the profile."""
     icrs: Triple
+    """Modelled direction: that of the star in the catalogue, in ICRS, without aberration."""
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Result of a frame request.
-
-    Attributes
-    ----------
-    valid, reason
-        Whether the attitude is valid, and the reason if not, as named in the interface definition.
-    tracked
-        Whether the frame was solved from the prediction.
-    quaternion_xyzw
-        Attitude ICRS→sensor at mid-exposure; zeros if invalid.
-    sigma_cross_arcsec, sigma_roll_arcsec
-        Standard deviation about an axis across the boresight, and about the boresight.
-    rate_rad_s
-        Body rate, if the algorithm estimates one.
-    detected, refused, matched
-        Number of detected stars, of rejected detections, and of identified stars.
-    stars
-        The brightest identified stars, brightest first.
-    probability_false, rms_px
-        As in `starid.solution.Solution`.
-    index_pending
-        Whether the frame was solved with the star index of earlier settings, because a new one is being
-        built.
-    background_dn, noise_dn
-        Level and noise of the background, counts.
-    in_field
-        Bodies in the field of view or within their exclusion angles: `sun`, `moon`, `earth`.
-    render_s, detect_s, identify_s
-        Wall time of each step, for the log but not for telemetry.
-    preview
-        The image, if requested.
-    """
+    """Result of a frame request."""
 
     index: int
     valid: bool = False
     reason: str = "no_frame"
+    """Whether the attitude is valid, and the reason if not, as named in the interface definition."""
     tracked: bool = False
+    """Whether the frame was solved from the prediction."""
     quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 0.0)
+    """Attitude ICRS→sensor at mid-exposure; zeros if invalid."""
     sigma_cross_arcsec: float = 0.0
     sigma_roll_arcsec: float = 0.0
+    """Standard deviation about an axis across the boresight, and about the boresight."""
     rate_rad_s: Triple | None = None
+    """Body rate, if the algorithm estimates one."""
     detected: int = 0
     refused: int = 0
     matched: int = 0
+    """Number of detected stars, of rejected detections, and of identified stars."""
     stars: tuple[MatchedStar, ...] = ()
+    """The brightest identified stars, brightest first."""
     probability_false: float = 1.0
     rms_px: float = 0.0
+    """As in `starid.solution.Solution`."""
     index_pending: bool = False
+    """Whether the frame was solved with the star index of earlier settings, because a new one is being built."""
     background_dn: float = 0.0
     noise_dn: float = 0.0
+    """Level and noise of the background, counts."""
     in_field: tuple[str, ...] = ()
+    """Bodies in the field of view or within their exclusion angles: `sun`, `moon`, `earth`."""
     solved: bool = True
     render_s: float = 0.0
     detect_s: float = 0.0
     identify_s: float = 0.0
+    """Wall time of each step, for the log but not for telemetry."""
     preview: Preview | None = field(default=None, repr=False, compare=False)
+    """The image, if requested."""
 
 
 @dataclass(frozen=True)
@@ -295,21 +227,14 @@ class ImageResult:
 
 @dataclass(frozen=True)
 class PipelineReady:
-    """Message that the pipeline is ready.
-
-    Attributes
-    ----------
-    camera
-        Fields of the camera, with derived constants.
-    stars
-        Number of stars in the catalogue.
-    seconds
-        Wall time of the start.
-    """
+    """Message that the pipeline is ready."""
 
     camera: dict[str, Any]
+    """Fields of the camera, with derived constants."""
     stars: int
+    """Number of stars in the catalogue."""
     seconds: float
+    """Wall time of the start."""
 
 
 @dataclass(frozen=True)

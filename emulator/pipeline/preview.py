@@ -34,60 +34,43 @@ OUTLINE_POINTS: Final = 96
 
 @dataclass(frozen=True)
 class Body:
-    """A body in the sky, for display.
-
-    Attributes
-    ----------
-    name
-        `sun`, `moon`, `earth`, or the name of a planet.
-    ra_deg, dec_deg, radius_deg
-        Direction of the centre, ICRS, and angular radius; 0 for a point.
-    outline_px
-        Outline of the disc as pairs of pixel coordinates; None where the lens maps no direction. A point has
-        one pair.
-    """
+    """A body in the sky, for display."""
 
     name: str
+    """`sun`, `moon`, `earth`, or the name of a planet."""
     ra_deg: float
     dec_deg: float
     radius_deg: float
+    """Direction of the centre, ICRS, and angular radius; 0 for a point."""
     outline_px: list[tuple[float, float] | None]
+    """Outline of the disc as pairs of pixel coordinates; None where the lens maps no direction. A point has one
+    pair."""
 
 
 @dataclass(frozen=True)
 class Overlay:
-    """Marks that are drawn over an image.
-
-    Attributes
-    ----------
-    width, height
-        Size of the image, pixels.
-    detections
-        Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first.
-    hips
-        Hipparcos number of each detection; 0 if the solution does not have it.
-    unused
-        Hipparcos number of the catalogue star at the place of each detection without `hips`; 0 if there is none. With
-        a slightly wrong calibration, the solution leaves out bright stars, which deviate by more than their small noise.
-    catalogue
-        Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first.
-    false_stars
-        Positions of the false stars in the image.
-    bodies
-        Sun, Moon, Earth and planets.
-    covered
-        Polygons, pixels, of the areas that are covered by something near the lens.
-    """
+    """Marks that are drawn over an image."""
 
     width: int
     height: int
+    """Size of the image, pixels."""
     detections: list[tuple[float, float, float, float]]
+    """Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first."""
     hips: list[int]
+    """Hipparcos number of each detection; 0 if the solution does not have it."""
     unused: list[int]
+    """Hipparcos number of the catalogue star at the place of each detection without one in `hips`; 0 if there is none.
+
+    With a slightly wrong calibration, the solution leaves out bright stars, which deviate by more than their small noise.
+    """
     catalogue: list[tuple[int, float, float, float]]
+    """Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first."""
     false_stars: list[tuple[float, float]]
+    """Positions of the false stars in the image."""
     bodies: list[Body]
+    """Sun, Moon, Earth and planets."""
     covered: list[list[tuple[float, float]]]
+    """Polygons, pixels, of the areas that are covered by something near the lens."""
 
 
 def make_preview(

@@ -37,27 +37,18 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
 
 @dataclass(frozen=True)
 class StarIdentifierSetup:
-    """Everything a star identifier depends on.
-
-    Attributes
-    ----------
-    algorithm
-        `geometric`, `lsi` or `rsi`.
-    camera
-        Camera as calibrated in the device's parameters.
-    margin
-        Tolerance of triangle sides relative to the nominal one; geometric algorithm only.
-    options
-        Keyword arguments of the algorithm's class, sorted by name.
-    upsets
-        Bits flipped in the directions of the stars; geometric algorithm only.
-    """
+    """Everything a star identifier depends on."""
 
     algorithm: str
+    """`geometric`, `lsi` or `rsi`."""
     camera: Camera
+    """Camera as calibrated in the device's parameters."""
     margin: float
+    """Tolerance of triangle sides relative to the nominal one; geometric algorithm only."""
     options: tuple[tuple[str, Any], ...]
+    """Keyword arguments of the algorithm's class, sorted by name."""
     upsets: tuple[CatalogUpset, ...] = ()
+    """Bits flipped in the directions of the stars; geometric algorithm only."""
 
     def make(self, catalog: StarCatalog) -> StarIdentifier:
         """Make the star identifier, which takes seconds if its index is not cached on disk."""

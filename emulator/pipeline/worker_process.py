@@ -15,16 +15,11 @@ EXIT_GRACE_S: Final = 2.0
 
 
 class WorkerProcess:
-    """A pipeline worker process and the socket connected to it.
-
-    Attributes
-    ----------
-    started_ns : int
-        Time at which it was started, on the monotonic wall clock, nanoseconds.
-    """
+    """A pipeline worker process and the socket connected to it."""
 
     def __init__(self) -> None:
         self.started_ns = time.monotonic_ns()
+        """Time at which it was started, on the monotonic wall clock, nanoseconds."""
         self.socket, inherited = socket.socketpair()
         command = [sys.executable, "-m", "starhil.emulator.pipeline.worker", str(inherited.fileno())]
         # in a process group of its own, so that Ctrl-C does not reach it while it imports

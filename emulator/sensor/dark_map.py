@@ -19,18 +19,12 @@ _LONGEST_S: Final = 1.0
 
 @dataclass(frozen=True)
 class DarkMap:
-    """The dark signal of each pixel above the typical dark signal.
-
-    Attributes
-    ----------
-    sensor : SensorModel
-        The sensor.
-    rate_dn_s : ndarray (h, w), float32
-        Counts/s at gain 1 and the sensor's `reference_c`.
-    """
+    """The dark signal of each pixel above the typical dark signal."""
 
     sensor: SensorModel
+    """The sensor."""
     rate_dn_s: npt.NDArray[np.float32]
+    """Counts/s at gain 1 and the sensor's `reference_c`, (h, w), float32."""
 
     def subtracted(
         self, image: npt.NDArray[Any], exposure_s: float, gain: float, temperature_c: float

@@ -16,22 +16,15 @@ _HOT_LOG_SPREAD: Final = 1.0
 
 @dataclass(frozen=True)
 class FixedPattern:
-    """Differences between pixels that are the same in every frame.
-
-    Attributes
-    ----------
-    sensitivity : ndarray (h, w), float32
-        Signal relative to the mean pixel; 0 for a dead pixel.
-    dark_e_s : ndarray (h, w), float32
-        Dark current, electrons/s.
-    hot, dead : ndarray (n, 2), int
-        Rows and columns of the hot and of the dead pixels.
-    """
+    """Differences between pixels that are the same in every frame."""
 
     sensitivity: npt.NDArray[np.float32]
+    """Signal relative to the mean pixel, (h, w), float32; 0 for a dead pixel."""
     dark_e_s: npt.NDArray[np.float32]
+    """Dark current, electrons/s, (h, w), float32."""
     hot: npt.NDArray[np.int64]
     dead: npt.NDArray[np.int64]
+    """Rows and columns of the hot and of the dead pixels, (n, 2), int."""
 
 
 def make_fixed_pattern(sensor: SensorModel, height: int, width: int) -> FixedPattern:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Self
 
 from starhil.emulator.errors import EmulatorError
@@ -17,39 +16,10 @@ SOLAR_COLOUR_B_V: Final = 0.65
 
 _BITS: Final = (8, 12, 16)
 
-_RANGES: Final[dict[str, tuple[float, float, str]]] = {
-    "exposure_s": (1e-6, 60.0, "seconds"),
-    "aperture_m": (1e-4, 1.0, "metres"),
-    "transmission": (1e-3, 1.0, "a share"),
-    "quantum_efficiency": (1e-3, 1.0, "a share"),
-    "zero_point_photons_s_m2": (1e6, 1e13, "photons/s/m²"),
-    "colour_term": (-2.0, 2.0, "magnitudes a magnitude of B−V"),
-    "psf_sigma_px": (0.3, 12.0, "pixels"),
-    "psf_growth": (0.0, 5.0, "a share"),
-    "gain": (0.01, 1000.0, "times"),
-    "adc_range_e": (1.0, 1e7, "electrons"),
-    "offset_share": (0.0, 0.5, "a share of the converter's range"),
-    "full_well_e": (10.0, 1e7, "electrons"),
-    "read_noise_e": (0.0, 1e4, "electrons"),
-    "dark_e_s": (0.0, 1e6, "electrons/s"),
-    "temperature_c": (-100.0, 150.0, "°C"),
-    "reference_c": (-100.0, 150.0, "°C"),
-    "dark_doubling_c": (1.0, 100.0, "°C"),
-    "row_time_s": (0.0, 0.01, "seconds"),
-    "boresight_drift_x": (-1000.0, 1000.0, "arcseconds/°C"),
-    "boresight_drift_y": (-1000.0, 1000.0, "arcseconds/°C"),
-    "boresight_drift_z": (-1000.0, 1000.0, "arcseconds/°C"),
-    "focal_drift": (-1e-3, 1e-3, "a share/°C"),
-    "k1_drift": (-1e-2, 1e-2, "1/°C"),
-    "sky_mag_arcsec2": (-10.0, 40.0, "magnitudes/arcsec²"),
-    "dsnu": (0.0, 2.0, "a share of the dark current"),
-    "prnu": (0.0, 0.3, "a share"),
-    "hot_pixels": (0, 10_000_000, "pixels"),
-    "hot_e_s": (0.0, 1e7, "electrons/s"),
-    "dead_pixels": (0, 10_000_000, "pixels"),
-    "pattern_seed": (0, 2**63 - 1, "a whole number"),
-    "limiting_magnitude": (-2.0, 20.0, "magnitudes"),
-}
+
+def _limited(default: float, low: float, high: float, unit: str) -> Any:
+    """Return a field with its default and limits; whole numbers if the limits are."""
+    return field(default=default, metadata={"limits": (low, high, unit)})
 
 
 @dataclass(frozen=True)
@@ -61,107 +31,76 @@ class SensorModel:
     photons/s/m²/nm (Bessell 1979), of which the photon spectrum of a G2 star averages 0.92 over the 500 nm.
     With a transmission of 0.75 and a quantum efficiency of 0.45 this gives 1.8e6 electrons/s, or 1 400 in 0.2
     s for V = 6.
-
-    Attributes
-    ----------
-    exposure_s : float
-        Exposure, seconds.
-    aperture_m : float
-        Diameter of the entrance pupil, metres.
-    transmission, quantum_efficiency : float
-        Fractions of photons that pass the lens and that free an electron, averaged over the band.
-    zero_point_photons_s_m2 : float
-        Photons/s/m² in the band from a star of V = 0 and solar colour.
-    colour_term : float
-        The sensor's magnitude is V − colour_term·(B−V − 0.65); about 0.4 for silicon, which favours red
-        stars.
-    psf_sigma_px : float
-        Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot
-        that can be fitted without pixel-phase error.
-    psf_growth : float
-        Relative increase of the spot width from the image centre to the edge: along x with the square of x,
-        along y with the square of y.
-    gain : float
-        Analog gain before the converter.
-    bits : int
-        8, 12 or 16.
-    adc_range_e : float
-        Full range of the converter at gain 1, electrons.
-    offset_share : float
-        Black level as a fraction of the range.
-    full_well_e : float
-        Full-well capacity, electrons.
-    read_noise_e : float
-        Electrons, standard deviation.
-    dark_e_s : float
-        Mean dark current at `reference_c`, electrons/s.
-    temperature_c : float
-        Temperature of detector and lens, °C, unless another is given for a frame.
-    reference_c : float
-        Temperature at which dark currents, lens and mounting have their stated values, °C.
-    dark_doubling_c : float
-        Temperature rise that doubles the dark current, °C; 5 to 8 for silicon.
-    row_time_s : float
-        Time from the exposure of one row to the next, seconds: 0 for a global shutter, which exposes all rows
-        at once. The middle row of a rolling shutter is exposed at the time of the frame.
-    boresight_drift_x, boresight_drift_y, boresight_drift_z : float
-        Rotation of the optics relative to the mounting about the axes of the sensor frame, arcseconds/°C.
-    focal_drift : float
-        Relative change of the focal length, 1/°C.
-    k1_drift : float
-        Change of the distortion k1, 1/°C.
-    sky_mag_arcsec2 : float
-        Brightness of the sky background (zodiacal light and unresolved stars), V magnitudes/arcsec².
-    dsnu, prnu : float
-        Standard deviation between pixels of the dark current and of the sensitivity, relative to their means.
-    hot_pixels, dead_pixels : int
-        Number of pixels with excessive dark current, and without signal.
-    hot_e_s : float
-        Median dark current of hot pixels at `reference_c`, electrons/s; log-normal with a factor of 2.7 per
-        sigma.
-    pattern_seed : int
-        Seed of the fixed pattern.
-    limiting_magnitude : float
-        V of the faintest rendered stars; fainter companions within two pixels of one are rendered too.
     """
 
-    exposure_s: float = 0.2
-    aperture_m: float = 0.012
-    transmission: float = 0.75
-    quantum_efficiency: float = 0.45
-    zero_point_photons_s_m2: float = 4.6e10
-    colour_term: float = 0.0
-    psf_sigma_px: float = 0.8
-    psf_growth: float = 0.0
-    gain: float = 1.0
+    exposure_s: float = _limited(0.2, 1e-6, 60.0, "seconds")
+    """Exposure, seconds."""
+    aperture_m: float = _limited(0.012, 1e-4, 1.0, "metres")
+    """Diameter of the entrance pupil, metres."""
+    transmission: float = _limited(0.75, 1e-3, 1.0, "a share")
+    quantum_efficiency: float = _limited(0.45, 1e-3, 1.0, "a share")
+    """Fractions of photons that pass the lens and that free an electron, averaged over the band."""
+    zero_point_photons_s_m2: float = _limited(4.6e10, 1e6, 1e13, "photons/s/m²")
+    """Photons/s/m² in the band from a star of V = 0 and solar colour."""
+    colour_term: float = _limited(0.0, -2.0, 2.0, "magnitudes a magnitude of B−V")
+    """The sensor's magnitude is V − colour_term·(B−V − 0.65); about 0.4 for silicon, which favours red stars."""
+    psf_sigma_px: float = _limited(0.8, 0.3, 12.0, "pixels")
+    """Standard deviation of the Gaussian spot at the image centre, pixels. 0.8 is about the smallest spot that can be
+    fitted without pixel-phase error."""
+    psf_growth: float = _limited(0.0, 0.0, 5.0, "a share")
+    """Relative increase of the spot width from the image centre to the edge: along x with the square of x, along y
+    with the square of y."""
+    gain: float = _limited(1.0, 0.01, 1000.0, "times")
+    """Analog gain before the converter."""
     bits: int = 8
-    adc_range_e: float = 6400.0
-    offset_share: float = 0.03
-    full_well_e: float = 15000.0
-    read_noise_e: float = 12.0
-    dark_e_s: float = 30.0
-    temperature_c: float = 20.0
-    reference_c: float = 20.0
-    dark_doubling_c: float = 6.5
-    row_time_s: float = 0.0
-    boresight_drift_x: float = 0.0
-    boresight_drift_y: float = 0.0
-    boresight_drift_z: float = 0.0
-    focal_drift: float = 0.0
-    k1_drift: float = 0.0
-    sky_mag_arcsec2: float = 22.1
-    dsnu: float = 0.2
-    prnu: float = 0.01
-    hot_pixels: int = 30
-    hot_e_s: float = 10000.0
-    dead_pixels: int = 10
-    pattern_seed: int = 0
-    limiting_magnitude: float = 6.0
+    """8, 12 or 16."""
+    adc_range_e: float = _limited(6400.0, 1.0, 1e7, "electrons")
+    """Full range of the converter at gain 1, electrons."""
+    offset_share: float = _limited(0.03, 0.0, 0.5, "a share of the converter's range")
+    """Black level as a fraction of the range."""
+    full_well_e: float = _limited(15000.0, 10.0, 1e7, "electrons")
+    """Full-well capacity, electrons."""
+    read_noise_e: float = _limited(12.0, 0.0, 1e4, "electrons")
+    """Electrons, standard deviation."""
+    dark_e_s: float = _limited(30.0, 0.0, 1e6, "electrons/s")
+    """Mean dark current at `reference_c`, electrons/s."""
+    temperature_c: float = _limited(20.0, -100.0, 150.0, "°C")
+    """Temperature of detector and lens, °C, unless another is given for a frame."""
+    reference_c: float = _limited(20.0, -100.0, 150.0, "°C")
+    """Temperature at which dark currents, lens and mounting have their stated values, °C."""
+    dark_doubling_c: float = _limited(6.5, 1.0, 100.0, "°C")
+    """Temperature rise that doubles the dark current, °C; 5 to 8 for silicon."""
+    row_time_s: float = _limited(0.0, 0.0, 0.01, "seconds")
+    """Time from the exposure of one row to the next, seconds: 0 for a global shutter, which exposes all rows at once.
+    The middle row of a rolling shutter is exposed at the time of the frame."""
+    boresight_drift_x: float = _limited(0.0, -1000.0, 1000.0, "arcseconds/°C")
+    boresight_drift_y: float = _limited(0.0, -1000.0, 1000.0, "arcseconds/°C")
+    boresight_drift_z: float = _limited(0.0, -1000.0, 1000.0, "arcseconds/°C")
+    """Rotation of the optics relative to the mounting about the axes of the sensor frame, arcseconds/°C."""
+    focal_drift: float = _limited(0.0, -1e-3, 1e-3, "a share/°C")
+    """Relative change of the focal length, 1/°C."""
+    k1_drift: float = _limited(0.0, -1e-2, 1e-2, "1/°C")
+    """Change of the distortion k1, 1/°C."""
+    sky_mag_arcsec2: float = _limited(22.1, -10.0, 40.0, "magnitudes/arcsec²")
+    """Brightness of the sky background (zodiacal light and unresolved stars), V magnitudes/arcsec²."""
+    dsnu: float = _limited(0.2, 0.0, 2.0, "a share of the dark current")
+    prnu: float = _limited(0.01, 0.0, 0.3, "a share")
+    """Standard deviation between pixels of the dark current and of the sensitivity, relative to their means."""
+    hot_pixels: int = _limited(30, 0, 10_000_000, "pixels")
+    """Number of pixels with excessive dark current."""
+    hot_e_s: float = _limited(10000.0, 0.0, 1e7, "electrons/s")
+    """Median dark current of hot pixels at `reference_c`, electrons/s; log-normal with a factor of 2.7 per sigma."""
+    dead_pixels: int = _limited(10, 0, 10_000_000, "pixels")
+    """Number of pixels without signal."""
+    pattern_seed: int = _limited(0, 0, 2**63 - 1, "a whole number")
+    """Seed of the fixed pattern."""
+    limiting_magnitude: float = _limited(6.0, -2.0, 20.0, "magnitudes")
+    """V of the faintest rendered stars; fainter companions within two pixels of one are rendered too."""
 
     def __post_init__(self) -> None:
         if self.bits not in _BITS or isinstance(self.bits, bool):
             raise EmulatorError(f"sensor bits: must be 8, 12 or 16, not {self.bits!r}")
-        for name, (low, high, unit) in _RANGES.items():
+        for name, (low, high, unit) in _LIMITS.items():
             value = getattr(self, name)
             whole = isinstance(low, int)
             if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
@@ -172,10 +111,10 @@ class SensorModel:
 
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; an unknown name is an error."""
-        unknown = sorted(changes.keys() - {field.name for field in dataclasses.fields(self)})
+        unknown = sorted(changes.keys() - {each.name for each in fields(self)})
         if unknown:
             raise EmulatorError(f"sensor {unknown[0]}: no such field of the sensor model")
-        return dataclasses.replace(self, **changes)
+        return replace(self, **changes)
 
     @property
     def zero_magnitude_e_s(self) -> float:
@@ -231,4 +170,8 @@ class SensorModel:
             gain_e_per_dn=self.gain_e_per_dn,
             saturation_dn=self.saturation_dn,
         )
-        return dataclasses.replace(settings, **changes)
+        return replace(settings, **changes)
+
+
+_LIMITS: Final = {each.name: each.metadata["limits"] for each in fields(SensorModel) if each.metadata}
+"""Lowest and highest value of each field, and their unit."""

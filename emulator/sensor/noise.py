@@ -34,27 +34,18 @@ _LN2: Final = np.float32(0.6931471805599453)
 
 @dataclass(frozen=True)
 class Digitizer:
-    """Parameters of a sensor's noise and converter, from electrons to counts.
-
-    Attributes
-    ----------
-    read_noise_e : float
-        Standard deviation of the read noise, electrons.
-    full_well_e : float
-        Full-well capacity, electrons.
-    gain_e_per_dn : float
-        Electrons per count.
-    offset_dn : float
-        Black level, counts.
-    max_dn : int
-        Largest count of the converter.
-    """
+    """Parameters of a sensor's noise and converter, from electrons to counts."""
 
     read_noise_e: float
+    """Standard deviation of the read noise, electrons."""
     full_well_e: float
+    """Full-well capacity, electrons."""
     gain_e_per_dn: float
+    """Electrons per count."""
     offset_dn: float
+    """Black level, counts."""
     max_dn: int
+    """Largest count of the converter."""
 
 
 def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:

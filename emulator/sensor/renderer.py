@@ -48,84 +48,55 @@ _CONE_MARGIN_RAD: Final = math.radians(1.0)
 
 @dataclass(frozen=True)
 class StarTruth:
-    """Catalogue stars in an image, including companions beyond the limiting magnitude, brightest first.
-
-    Attributes
-    ----------
-    hip : ndarray (n,), int32
-        Hipparcos numbers.
-    catalog_index : ndarray (n,), int64
-        Rows of the renderer's catalogue.
-    xy_px : ndarray (n, 2)
-        Position at mid-exposure, pixels.
-    electrons : ndarray (n,)
-        Mean electrons of the star in the exposure.
-    magnitude : ndarray (n,)
-        V magnitude.
-    visible : ndarray (n,) of bool
-        False for hidden or omitted stars.
-    """
+    """Catalogue stars in an image, including companions beyond the limiting magnitude, brightest first."""
 
     hip: npt.NDArray[np.int32]
+    """Hipparcos numbers, (n,), int32."""
     catalog_index: npt.NDArray[np.int64]
+    """Rows of the renderer's catalogue, (n,), int64."""
     xy_px: npt.NDArray[np.float64]
+    """Position at mid-exposure, pixels, (n, 2)."""
     electrons: npt.NDArray[np.float64]
+    """Mean electrons of the star in the exposure, (n,)."""
     magnitude: npt.NDArray[np.float64]
+    """V magnitude, (n,)."""
     visible: npt.NDArray[np.bool_]
+    """False for hidden or omitted stars, (n,) of bool."""
 
 
 @dataclass(frozen=True)
 class ObjectTruth:
-    """Other objects in an image.
-
-    Attributes
-    ----------
-    false_xy_px : ndarray (n, 2)
-        Positions of the false stars, the fixed ones first.
-    planet_xy_px : ndarray (m, 2)
-        Positions of the planets in the order of `SkyObjects.planets`; NaN outside the image.
-    cosmic_rays_px : ndarray (k, 4)
-        x, y of both ends of each streak.
-    covered_share : float
-        Fraction of the image that receives less than half of the sky's light.
-    """
+    """Other objects in an image."""
 
     false_xy_px: npt.NDArray[np.float64]
+    """Positions of the false stars, the fixed ones first, (n, 2)."""
     planet_xy_px: npt.NDArray[np.float64]
+    """Positions of the planets in the order of `SkyObjects.planets`, (m, 2); NaN outside the image."""
     cosmic_rays_px: npt.NDArray[np.float64]
+    """x, y of both ends of each streak, (k, 4)."""
     covered_share: float
+    """Fraction of the image that receives less than half of the sky's light."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One exposure and its truth.
-
-    Attributes
-    ----------
-    image : ndarray (h, w), uint8 or uint16
-        Counts.
-    stars : StarTruth
-        Catalogue stars in the image.
-    objects : ObjectTruth or None
-        Other objects in the image, if the sky has any.
-    attitude : Attitude
-        Attitude at mid-exposure.
-    rate_rad_s : tuple of 3 floats
-        Body rate during the exposure, sensor frame.
-    exposure_s : float
-        Length of the exposure, seconds.
-    seed, frame_index : int
-        Seeds of the noise.
-    """
+    """One exposure and its truth."""
 
     image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    """Counts, (h, w), uint8 or uint16."""
     stars: StarTruth
+    """Catalogue stars in the image."""
     attitude: Attitude
+    """Attitude at mid-exposure."""
     rate_rad_s: tuple[float, float, float]
+    """Body rate during the exposure, sensor frame."""
     exposure_s: float
+    """Length of the exposure, seconds."""
     seed: int
     frame_index: int
+    """Seeds of the noise."""
     objects: ObjectTruth | None = None
+    """Other objects in the image, if the sky has any."""
 
 
 def frame_without_truth(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], frame_index: int) -> Frame:

@@ -57,19 +57,13 @@ SLOT_S: Final = 600.0
 
 @dataclass(frozen=True)
 class Observer:
-    """Date, place and velocity of the sensor.
-
-    Attributes
-    ----------
-    unix_s : float
-        Unix time.
-    offset_m, relative_velocity_m_s : ndarray (3,) or None
-        Position and velocity relative to the Earth's centre, GCRS; None: at the centre, without an Earth.
-    """
+    """Date, place and velocity of the sensor."""
 
     unix_s: float
+    """Unix time."""
     offset_m: Vector | None = None
     relative_velocity_m_s: Vector | None = None
+    """Position and velocity relative to the Earth's centre, GCRS, (3,); None: at the centre, without an Earth."""
 
     @cached_property
     def _motion(self) -> Vector:

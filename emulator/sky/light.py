@@ -54,24 +54,16 @@ _WIDE_EARTH_DEG: Final = 20.0
 
 @dataclass(frozen=True)
 class Patch:
-    """Light and shadow in part of an image.
-
-    Attributes
-    ----------
-    box : (int, int, int, int)
-        Its rows and columns.
-    light : ndarray (h', w'), float32
-        Electrons/s in a pixel of mean sensitivity.
-    passed : ndarray (h', w'), float32
-        Fraction of the light from behind that is visible, 0…1.
-    hides_glare : bool
-        Whether it is in front of the light scattered in the lens too.
-    """
+    """Light and shadow in part of an image."""
 
     box: Box
+    """Its rows and columns."""
     light: Image
+    """Electrons/s in a pixel of mean sensitivity, (h', w'), float32."""
     passed: Image
+    """Fraction of the light from behind that is visible, 0…1, (h', w'), float32."""
     hides_glare: bool = True
+    """Whether it is in front of the light scattered in the lens too."""
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
@@ -86,31 +78,21 @@ class Patch:
 
 @dataclass(frozen=True)
 class AreaLight:
-    """Light of extended objects, and the fraction of the sky's light that passes them.
-
-    Attributes
-    ----------
-    size : (int, int)
-        Width and height of the image, pixels.
-    glare : ndarray (gh, gw), float32, or None
-        Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row.
-    near : tuple of NearGlare
-        What is not smooth of that light.
-    earth : WideEarth or None
-        An Earth in front of `glare`, sky and the patches before the last `in_front`.
-    behind, in_front : tuple of Patch
-        What lies behind and in front of that Earth.
-    flooded : bool
-        Light passes the baffle and saturates the image; the rest is then empty.
-    """
+    """Light of extended objects, and the fraction of the sky's light that passes them."""
 
     size: tuple[int, int]
+    """Width and height of the image, pixels."""
     glare: Image | None = None
+    """Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row, (gh, gw)."""
     near: tuple[NearGlare, ...] = ()
+    """What is not smooth of that light."""
     earth: WideEarth | None = None
+    """An Earth in front of `glare`, sky and the patches before the last `in_front`."""
     behind: tuple[Patch, ...] = ()
     in_front: tuple[Patch, ...] = ()
+    """What lies behind and in front of that Earth."""
     flooded: bool = False
+    """Light passes the baffle and saturates the image; the rest is then empty."""
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) at positions (n, 2); outside the image that of its edge."""

@@ -28,39 +28,26 @@ GLARE_STEP: Final = 8
 
 @dataclass(frozen=True)
 class Backdrop:
-    """An exposure without bodies, and how exact their light must be.
-
-    Attributes
-    ----------
-    still : ndarray (h, w), float32
-        Mean electrons of sky and dark current.
-    sensitivity : ndarray (h, w), uint16
-        Relative signal of each pixel, in units of `unit`.
-    unit : float
-        Relative signal of a sensitivity of 1.
-    dark : ndarray (h, w), uint16
-        Square roots of the dark current of each pixel.
-    dark_unit_e : float
-        Electrons at a root of 1.
-    sky_e_s : float
-        Light of the sky, electrons/s in a pixel of mean sensitivity.
-    exposure_s : float
-        Length of the exposure.
-    min_glare_e : float
-        Glare of fewer electrons everywhere is left out.
-    saturated_e : float
-        Electrons above which light need not be exact.
-    """
+    """An exposure without bodies, and how exact their light must be."""
 
     still: Image
+    """Mean electrons of sky and dark current, (h, w), float32."""
     sensitivity: Sensitivity
+    """Relative signal of each pixel, in units of `unit`, (h, w), uint16."""
     unit: float
+    """Relative signal of a sensitivity of 1."""
     dark: Roots
+    """Square roots of the dark current of each pixel, (h, w), uint16."""
     dark_unit_e: float
+    """Electrons at a root of 1."""
     sky_e_s: float
+    """Light of the sky, electrons/s in a pixel of mean sensitivity."""
     exposure_s: float
+    """Length of the exposure."""
     min_glare_e: float = 0.0
+    """Glare of fewer electrons everywhere is left out."""
     saturated_e: float = math.inf
+    """Electrons above which light need not be exact."""
 
 
 @inner

@@ -42,34 +42,23 @@ class CelestialBody:
 
 @dataclass(frozen=True)
 class Moon(CelestialBody):
-    """The Moon: a saturated disc, and its light scattered in the lens.
-
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Direction of its centre, ICRS.
-    diameter_deg : float
-        Apparent diameter.
-    magnitude : float
-        V of the whole disc; −12.7 when full.
-    illuminated : float
-        Illuminated fraction of the disc, 0…1.
-    bright_limb_deg : float
-        Position angle of the midpoint of the bright limb, from north through east.
-    glare_share : float
-        Fraction of its light that the lens scatters over the field; falls with the square of the angle.
-    reach_deg : float
-        Angle from the boresight beyond which none of its light enters the lens.
-    """
+    """The Moon: a saturated disc, and its light scattered in the lens."""
 
     ra_deg: float
     dec_deg: float
+    """Direction of its centre, ICRS."""
     diameter_deg: float = 0.52
+    """Apparent diameter."""
     magnitude: float = -12.7
+    """V of the whole disc; −12.7 when full."""
     illuminated: float = 1.0
+    """Illuminated fraction of the disc, 0…1."""
     bright_limb_deg: float = 90.0
+    """Position angle of the midpoint of the bright limb, from north through east."""
     glare_share: float = 1e-3
+    """Fraction of its light that the lens scatters over the field; falls with the square of the angle."""
     reach_deg: float = 180.0
+    """Angle from the boresight beyond which none of its light enters the lens."""
 
     @property
     def radius_rad(self) -> float:
@@ -79,25 +68,17 @@ class Moon(CelestialBody):
 
 @dataclass(frozen=True)
 class SunGlare(CelestialBody):
-    """The Sun: stray light, and in the field of view a disc whose light, scattered in the lens, saturates the image.
-
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Direction of the Sun, ICRS.
-    electrons_s : float
-        Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle.
-    exclusion_deg : float
-        Angle from the boresight within which sunlight passes the baffle and saturates the image.
-    reach_deg : float
-        Angle from the boresight beyond which no sunlight enters the lens.
-    """
+    """The Sun: stray light, and in the field of view a disc whose light, scattered in the lens, saturates the image."""
 
     ra_deg: float
     dec_deg: float
+    """Direction of the Sun, ICRS."""
     electrons_s: float = 1000.0
+    """Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle."""
     exclusion_deg: float = 0.0
+    """Angle from the boresight within which sunlight passes the baffle and saturates the image."""
     reach_deg: float = 180.0
+    """Angle from the boresight beyond which no sunlight enters the lens."""
 
     @property
     def radius_rad(self) -> float:
@@ -112,33 +93,23 @@ class SunGlare(CelestialBody):
 
 @dataclass(frozen=True)
 class EarthLimb(CelestialBody):
-    """The Earth's disc in front of part of the sky.
-
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Direction of the Earth's centre, ICRS.
-    radius_deg : float
-        Angular radius of the Earth; 64° at an altitude of 700 km.
-    electrons_s : float
-        Electrons/s per pixel of the disc: 0 for the night side, millions for the day side.
-    atmosphere_deg : float
-        Angular height over which the limb fades.
-    exclusion_deg : float
-        Angle between the boresight and the nearest point of the disc, if that is lit, within which its light
-        passes the baffle and saturates the image; 0 for no baffle.
-    sun_ra_deg, sun_dec_deg : float, optional
-        Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit.
-    """
+    """The Earth's disc in front of part of the sky."""
 
     ra_deg: float
     dec_deg: float
+    """Direction of the Earth's centre, ICRS."""
     radius_deg: float = 64.0
+    """Angular radius of the Earth; 64° at an altitude of 700 km."""
     electrons_s: float = 1e6
+    """Electrons/s per pixel of the disc: 0 for the night side, millions for the day side."""
     atmosphere_deg: float = 0.15
+    """Angular height over which the limb fades."""
     exclusion_deg: float = 0.0
+    """Angle between the boresight and the nearest point of the disc, if that is lit, within which its light passes
+    the baffle and saturates the image; 0 for no baffle."""
     sun_ra_deg: float | None = None
     sun_dec_deg: float | None = None
+    """Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit."""
 
     @cached_property
     def sun_direction(self) -> npt.NDArray[np.float64] | None:
@@ -155,44 +126,29 @@ class EarthLimb(CelestialBody):
 
 @dataclass(frozen=True)
 class PointSource(CelestialBody):
-    """A planet, satellite or other point source that is not in the star catalogue.
-
-    Attributes
-    ----------
-    ra_deg, dec_deg : float
-        Direction, ICRS.
-    magnitude : float
-        V magnitude in the sensor's band.
-    name : str
-        Name in the truth.
-    """
+    """A planet, satellite or other point source that is not in the star catalogue."""
 
     ra_deg: float
     dec_deg: float
+    """Direction, ICRS."""
     magnitude: float
+    """V magnitude in the sensor's band."""
     name: str = ""
+    """Name in the truth."""
 
 
 @dataclass(frozen=True)
 class Obstruction:
-    """A dark object near the lens that covers the image beyond a straight edge or inside a polygon.
-
-    Attributes
-    ----------
-    share : float
-        Fraction of the image beyond the edge, 0…1; not used with a polygon.
-    angle_deg : float
-        Direction from the image to the covered side, 0 to the right, 90 down.
-    polygon_px : tuple of (x, y)
-        Corners, pixels; empty for an edge.
-    softness_px : float
-        Blur of the out-of-focus outline, pixels.
-    """
+    """A dark object near the lens that covers the image beyond a straight edge or inside a polygon."""
 
     share: float = 0.5
+    """Fraction of the image beyond the edge, 0…1; not used with a polygon."""
     angle_deg: float = 0.0
+    """Direction from the image to the covered side, 0 to the right, 90 down."""
     polygon_px: tuple[tuple[float, float], ...] = ()
+    """Corners, pixels; empty for an edge."""
     softness_px: float = 3.0
+    """Blur of the out-of-focus outline, pixels."""
 
 
 _RANGES: Final[dict[str, tuple[float, float]]] = {
@@ -229,41 +185,28 @@ def range_of(field: str) -> tuple[float, float] | None:
 
 @dataclass(frozen=True)
 class SkyObjects:
-    """Everything that changes an image besides the catalogue stars.
-
-    Attributes
-    ----------
-    moon, sun, earth : optional
-        The bodies, if present.
-    planets : tuple of PointSource
-        Point sources at fixed directions.
-    obstructions : tuple of Obstruction
-        Objects that cover parts of the image.
-    false_stars : int
-        Number of false stars at random positions that change with every frame.
-    fixed_false_stars : int
-        Number of false stars at random positions that stay the same during a run.
-    false_star_magnitudes : (float, float)
-        Range of the magnitudes of false stars, brighter first; uniformly distributed.
-    missing_stars : int
-        Number of catalogue stars omitted, the brightest in the field.
-    cosmic_rays_s : float
-        Mean number of particles per second that hit the detector, each leaving a streak.
-    blank : bool
-        True if no light reaches the detector.
-    """
+    """Everything that changes an image besides the catalogue stars."""
 
     moon: Moon | None = None
     sun: SunGlare | None = None
     earth: EarthLimb | None = None
+    """The bodies, if present."""
     planets: tuple[PointSource, ...] = ()
+    """Point sources at fixed directions."""
     obstructions: tuple[Obstruction, ...] = ()
+    """Objects that cover parts of the image."""
     false_stars: int = 0
+    """Number of false stars at random positions that change with every frame."""
     fixed_false_stars: int = 0
+    """Number of false stars at random positions that stay the same during a run."""
     false_star_magnitudes: tuple[float, float] = (1.0, 5.5)
+    """Range of the magnitudes of false stars, brighter first; uniformly distributed."""
     missing_stars: int = 0
+    """Number of catalogue stars omitted, the brightest in the field."""
     cosmic_rays_s: float = 0.0
+    """Mean number of particles per second that hit the detector, each leaving a streak."""
     blank: bool = False
+    """True if no light reaches the detector."""
 
     def __post_init__(self) -> None:
         if self.earth is not None and (self.earth.sun_ra_deg is None) != (self.earth.sun_dec_deg is None):

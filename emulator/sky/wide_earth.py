@@ -37,28 +37,19 @@ Gain = npt.NDArray[np.uint16]
 
 @dataclass(frozen=True)
 class WideEarth:
-    """An Earth that covers much of the field, as smooth functions of the position in the image.
-
-    Attributes
-    ----------
-    grid : ndarray (3, gh, gw), float32
-        At every `GLARE_STEP`-th column and row: cosines of the angles to the Earth's centre and to the Sun, and the height
-        above the limb in heights of the atmosphere.
-    distance : float
-        Distance of the Earth's centre in its radii.
-    behind : float
-        Cosine of the Sun's zenith distance at the point opposite to the nadir.
-    brightness : float
-        Electrons/s per pixel where the Sun is in the zenith.
-    step_rad : float
-        Angle between points of the grid.
-    """
+    """An Earth that covers much of the field, as smooth functions of the position in the image."""
 
     grid: Image
+    """At every `GLARE_STEP`-th column and row: cosines of the angles to the Earth's centre and to the Sun, and the
+    height above the limb in heights of the atmosphere, (3, gh, gw), float32."""
     distance: float
+    """Distance of the Earth's centre in its radii."""
     behind: float
+    """Cosine of the Sun's zenith distance at the point opposite to the nadir."""
     brightness: float
+    """Electrons/s per pixel where the Sun is in the zenith."""
     step_rad: float
+    """Angle between points of the grid."""
 
     def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """Return the transmission (n,) of the atmosphere at positions (n, 2)."""

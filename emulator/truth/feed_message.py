@@ -46,27 +46,18 @@ Order = Literal["xyzw", "wxyz"]
 
 @dataclass(frozen=True)
 class FeedMessage:
-    """A decoded message.
-
-    Attributes
-    ----------
-    t
-        Seconds on the sender's clock, or None.
-    attitude
-        ICRS→body.
-    rate_rad_s
-        Body rate (3,), rad/s, body frame, or None.
-    orbit
-        Position and velocity, GCRS, or None.
-    unix_s
-        Date as Unix time, or None.
-    """
+    """A decoded message."""
 
     t: float | None
+    """Seconds on the sender's clock, or None."""
     attitude: Attitude
+    """ICRS→body."""
     rate_rad_s: Vector | None = None
+    """Body rate (3,), rad/s, body frame, or None."""
     orbit: OrbitState | None = None
+    """Position and velocity, GCRS, or None."""
     unix_s: float | None = None
+    """Date as Unix time, or None."""
 
 
 class FeedFormat(Protocol):

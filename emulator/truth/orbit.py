@@ -44,28 +44,20 @@ class Orbit(Protocol):
 
 @dataclass(frozen=True)
 class KeplerOrbit:
-    """An elliptic orbit about the Earth.
-
-    Attributes
-    ----------
-    epoch_unix_s
-        Unix time of the elements.
-    semi_major_axis_m, eccentricity
-        Size and shape.
-    inclination_rad, raan_rad, argument_of_perigee_rad, mean_anomaly_rad
-        Angles at the epoch, radians.
-    j2
-        Whether node, perigee and mean anomaly drift at the secular rates due to the Earth's oblateness.
-    """
+    """An elliptic orbit about the Earth."""
 
     epoch_unix_s: float
+    """Unix time of the elements."""
     semi_major_axis_m: float
     eccentricity: float = 0.0
+    """Size and shape."""
     inclination_rad: float = 0.0
     raan_rad: float = 0.0
     argument_of_perigee_rad: float = 0.0
     mean_anomaly_rad: float = 0.0
+    """Angles at the epoch, radians."""
     j2: bool = True
+    """Whether node, perigee and mean anomaly drift at the secular rates due to the Earth's oblateness."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.eccentricity <= LARGEST_ECCENTRICITY:

@@ -52,27 +52,18 @@ class TruthStatus(StrEnum):
 
 @dataclass(frozen=True)
 class TruthState:
-    """Attitude and rate at one time, with date and orbit if known.
-
-    Attributes
-    ----------
-    attitude
-        ICRS→sensor.
-    rate_rad_s
-        Body rate (3,), rad/s, sensor frame.
-    status
-        Whether the state is known, extrapolated or stale.
-    orbit
-        Position and velocity relative to the Earth's centre, GCRS.
-    unix_s
-        Date as Unix time (UTC), seconds.
-    """
+    """Attitude and rate at one time, with date and orbit if known."""
 
     attitude: Attitude
+    """ICRS→sensor."""
     rate_rad_s: Vector
+    """Body rate (3,), rad/s, sensor frame."""
     status: TruthStatus = TruthStatus.OK
+    """Whether the state is known, extrapolated or stale."""
     orbit: OrbitState | None = None
+    """Position and velocity relative to the Earth's centre, GCRS."""
     unix_s: float | None = None
+    """Date as Unix time (UTC), seconds."""
 
     def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
         """Return the state with the date and orbit of the run if the source has none."""
@@ -108,16 +99,11 @@ class FixedTruth:
 
 @dataclass(frozen=True)
 class RateTruth:
-    """A rotation at a constant rate that starts with `attitude` at `start_s`.
-
-    Attributes
-    ----------
-    rate_rad_s
-        Body rate (3,), rad/s, sensor frame.
-    """
+    """A rotation at a constant rate that starts with `attitude` at `start_s`."""
 
     attitude: Attitude
     rate_rad_s: Vector
+    """Body rate (3,), rad/s, sensor frame."""
     start_s: float = 0.0
     kind: str = "rate"
 
@@ -143,21 +129,14 @@ class RateSegment:
 
 @dataclass(frozen=True)
 class SlewSegment:
-    """Slew about one axis to an attitude, from rest to rest.
-
-    Attributes
-    ----------
-    shape
-        `smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant
-        braking).
-    acceleration_rad_s2
-        Acceleration of the `limited` shape, rad/s².
-    """
+    """Slew about one axis to an attitude, from rest to rest."""
 
     to: Attitude
     rate_rad_s: float
     shape: Literal["smooth", "limited"] = "smooth"
+    """`smooth` (quintic, no jump in acceleration) or `limited` (constant acceleration, coast, constant braking)."""
     acceleration_rad_s2: float = math.radians(0.1)
+    """Acceleration of the `limited` shape, rad/s²."""
 
 
 Segment: TypeAlias = HoldSegment | RateSegment | SlewSegment

@@ -26,34 +26,23 @@ SMALL_TURN_RAD: Final = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class FileTruth:
-    """Attitudes interpolated in time; at rest before the first row and after the last.
-
-    Attributes
-    ----------
-    times_s
-        Times (n,) of the rows, seconds, increasing.
-    rates_rad_s
-        Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows.
-    orbit
-        Position and velocity of each row; None if the file has none.
-    smooth
-        Whether the attitude between two rows also has their rates.
-    start_unix_s
-        Date of time zero as Unix time; None if the file has no dates.
-    start_s
-        Simulation time of time zero.
-    repeat
-        Whether to start again after the last row.
-    """
+    """Attitudes interpolated in time; at rest before the first row and after the last."""
 
     times_s: NDArray[np.float64]
+    """Times (n,) of the rows, seconds, increasing."""
     attitudes: Sequence[Attitude]
     rates_rad_s: NDArray[np.float64] | None = None
+    """Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows."""
     orbit: Sequence[OrbitState] | None = None
+    """Position and velocity of each row; None if the file has none."""
     smooth: bool = False
+    """Whether the attitude between two rows also has their rates."""
     start_unix_s: float | None = None
+    """Date of time zero as Unix time; None if the file has no dates."""
     start_s: float = 0.0
+    """Simulation time of time zero."""
     repeat: bool = False
+    """Whether to start again after the last row."""
     kind: str = "file"
 
     def __post_init__(self) -> None:

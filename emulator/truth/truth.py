@@ -29,30 +29,20 @@ from starid.attitude import Attitude
 
 @dataclass(frozen=True)
 class TruthHost:
-    """The run, as its truth sees it.
-
-    Attributes
-    ----------
-    clock
-        Clock of the run.
-    clock_name
-        Configured clock: that of a replay differs.
-    time_passes
-        Set when every pipeline is ready.
-    step
-        Advances the stepped clock, for lock-step.
-    record
-        Records an entry on the tape, if there is one: its kind and values.
-    opens_sockets
-        Whether live feeds open sockets; the messages of a replay come from the tape.
-    """
+    """The run, as its truth sees it."""
 
     clock: Clock
+    """Clock of the run."""
     clock_name: str
+    """Configured clock: that of a replay differs."""
     time_passes: asyncio.Event
+    """Set when every pipeline is ready."""
     step: Step
+    """Advances the stepped clock, for lock-step."""
     record: Callable[..., None]
+    """Records an entry on the tape, if there is one: its kind and values."""
     opens_sockets: bool = True
+    """Whether live feeds open sockets; the messages of a replay come from the tape."""
 
     def now_s(self) -> float:
         """Return the simulation time, seconds."""
@@ -68,27 +58,19 @@ class Truth:
         The configured truth; `open` builds it.
     folder
         Folder to which relative paths of truth files refer.
-
-    Attributes
-    ----------
-    configured
-        The configured truth.
-    source
-        Truth of the body: attitude ICRS→body, rate in the body frame.
-    mount
-        Mount in the configuration that has replaced the first one; None: each head has that of its profile.
-    feed
-        The live feed, or None.
-    address
-        Address of the live feed; empty if there is none.
     """
 
     def __init__(self, config: TruthConfig, folder: Path, host: TruthHost) -> None:
         self.configured = config
+        """The configured truth."""
         self.source: TruthSource = FixedTruth(Attitude.identity())
+        """Truth of the body: attitude ICRS→body, rate in the body frame."""
         self.mount: Attitude | None = None
+        """Mount in the configuration that has replaced the first one; None: each head has that of its profile."""
         self.feed: LiveFeed | None = None
+        """The live feed, or None."""
         self.address = ""
+        """Address of the live feed; empty if there is none."""
         self._wanted_address = ""
         """Address of the live feed as configured."""
         self._folder = folder
