@@ -31,16 +31,11 @@ FLUSH_S: Final = 0.51
 
 @dataclass
 class Heard:
-    """Requests of the OBC on a link, without those of the console.
-
-    Attributes
-    ----------
-    last_s
-        Time of the last one on the loop's clock, seconds; None before the first.
-    """
+    """Requests of the OBC on a link, without those of the console."""
 
     requests: int = 0
     last_s: float | None = None
+    """Time of the last one on the loop's clock, seconds; None before the first."""
 
     def count(self) -> None:
         """Count a request."""
