@@ -66,6 +66,9 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._held_input: deque[Request | LinkFault] = deque()
         """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
         self._pending: PendingAnswer[list[Reply]] | None = None
+        self._executing = False
+        self._caused: list[Reply] = []
+        """Unsolicited messages that the request being executed has caused; they follow its replies."""
         self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
         device.signals.unsolicited.connect(self._send_unsolicited)
         device.signals.restarted.connect(self._reset_receiver)
@@ -84,7 +87,10 @@ class DeviceLink(ABC, Generic[Item, Style]):
 
     def _send_unsolicited(self, reply: Reply) -> None:
         """Send unsolicited telemetry."""
-        self._send(reply, self._reply_style())
+        if self._executing:
+            self._caused.append(reply)
+        else:
+            self._send(reply, self._reply_style())
 
     async def start(self) -> str:
         """Open the transport; return its description."""
@@ -115,13 +121,20 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._requests.count_fault(event)
             return
         style = self._reply_style()  # a change of format is answered in the old format
-        answer = self._requests.handle(event)
+        self._executing = True
+        try:
+            answer = self._requests.handle(event)
+        finally:
+            self._executing = False
         if isinstance(answer, PendingAnswer):
             self._pending = answer
             answer.when_done(partial(self._answer_later, answer, style))
-            return
-        for reply in answer:
-            self._answer(reply, style)
+        else:
+            for reply in answer:
+                self._answer(reply, style)
+        caused, self._caused = self._caused, []
+        for reply in caused:
+            self._send_unsolicited(reply)
 
     def _answer_later(self, answer: PendingAnswer[list[Reply]], style: Style, replies: list[Reply]) -> None:
         for reply in replies:
