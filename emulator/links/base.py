@@ -6,7 +6,7 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
@@ -29,6 +29,20 @@ FLUSH_S: Final = 0.51
 """Delay after which an incomplete message is dropped, seconds; just above the receivers' timeout, 0.5 s."""
 
 
+@dataclass
+class Heard:
+    """Requests of the OBC on a link, without those of the console."""
+
+    requests: int = 0
+    last_s: float | None = None
+    """Time of the last one on the loop's clock, seconds; None before the first."""
+
+    def count(self) -> None:
+        """Count a request."""
+        self.requests += 1
+        self.last_s = asyncio.get_running_loop().time()
+
+
 class Link(Protocol):
     """An open link of any kind."""
 
@@ -38,6 +52,10 @@ class Link(Protocol):
     @property
     def transport(self) -> Transport[Any]:
         """Transport of the link."""
+
+    @property
+    def heard(self) -> Heard:
+        """Requests of the OBC."""
 
     @property
     def wire(self) -> WireFaults[Any]:
@@ -61,6 +79,7 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._device = device
         self._loop = asyncio.get_running_loop()
         self.transport: Final = transport
+        self.heard: Final = Heard()
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
         self._held_input: deque[Request | LinkFault] = deque()
@@ -84,6 +103,10 @@ class DeviceLink(ABC, Generic[Item, Style]):
     @abstractmethod
     def _send(self, reply: Reply, style: Style) -> None:
         """Send a reply."""
+
+    @abstractmethod
+    def _is_console(self, request: Request) -> bool:
+        """Return whether console or recording sent a request."""
 
     def _send_unsolicited(self, reply: Reply) -> None:
         """Send unsolicited telemetry."""
@@ -121,9 +144,12 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._requests.count_fault(event)
             return
         style = self._reply_style()  # a change of format is answered in the old format
+        console = self._is_console(event)
+        if not console:
+            self.heard.count()
         self._executing = True
         try:
-            answer = self._requests.handle(event)
+            answer = self._requests.handle(event, console=console)
         finally:
             self._executing = False
         if isinstance(answer, PendingAnswer):
