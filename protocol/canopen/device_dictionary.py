@@ -240,25 +240,9 @@ def _slot_of(icd: InterfaceDefinition, reference: str) -> tuple[Row, Slot, list[
 
 
 class DeviceDictionary(Dictionary):
-    """Object dictionary of a device, built from its interface definition.
+    """Object dictionary of a device, built from its interface definition and the indices of its layout.
 
-    Parameters
-    ----------
-    icd
-        The interface definition.
-    layout
-        Indices of its rows, fields and parameters.
-    application
-        Device behind the dictionary; none for one that is only described, so that nothing reads it.
-
-    Attributes
-    ----------
-    readings
-        Key of an entry → the part of a telemetry row that it reads.
-    sources
-        Telemetry row → keys of the entries that contain it.
-    parameters
-        Parameter → key of its entry.
+    Without an application it is only described: nothing may read or write the entries of a device.
     """
 
     def __init__(
@@ -269,6 +253,7 @@ class DeviceDictionary(Dictionary):
         self.application = cast("Application", application)
         self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
+        """Telemetry row → keys of the entries that contain it."""
         self.parameters: dict[str, Key] = {}
         self._names: dict[str, Key] = {}
         self._placed: dict[tuple[str, str, int | None], Key] = {}

@@ -35,31 +35,19 @@ later."""
 
 @dataclass(slots=True)
 class Entry:
-    """One variable of a node's object dictionary with its current value.
-
-    Attributes
-    ----------
-    variable
-        Description in the library's object dictionary.
-    value
-        Current value as on the wire; unused if there is a `reader`.
-    reader
-        Returns the current value from the device instead of `value`.
-    writer
-        Writes a value that passed the access, length and range checks, before `value` changes; raises
-        `SdoAbortError` to refuse.
-    maximum_size
-        Longest value, bytes, of a type without a fixed size.
-    persistent
-        Whether store (1010h) saves it.
-    """
+    """One variable of a node's object dictionary with its current value."""
 
     variable: ODVariable
     value: bytes = b""
+    """Current value as on the wire; unused if there is a `reader`."""
     reader: Callable[[], bytes] | None = None
+    """Returns the current value from the device."""
     writer: Writer | None = None
+    """Called before `value` changes."""
     maximum_size: int = MAXIMUM_STRING
+    """Longest value, bytes, of a type without a fixed size."""
     persistent: bool = False
+    """Whether store (1010h) saves it."""
 
     @property
     def key(self) -> tuple[int, int]:
@@ -104,13 +92,7 @@ def encode(variable: ODVariable, value: Value) -> bytes:
 
 
 class Dictionary:
-    """Object dictionary of one node.
-
-    Parameters
-    ----------
-    od
-        Description of the objects. Each variable gets an entry; `load_defaults` sets the default values.
-    """
+    """Object dictionary of one node, with an entry for each variable; `load_defaults` sets their default values."""
 
     def __init__(self, od: ObjectDictionary) -> None:
         self.od = od

@@ -31,14 +31,7 @@ _EVENTS_SIZE: Final = 256 * _EVENT.size
 
 
 class PtyPeers:
-    """Watches the slave side of a pseudo-terminal, which this process must not have open.
-
-    Parameters
-    ----------
-    master
-        File descriptor of the master side.
-    path
-        Path of the slave side.
+    """Watches the slave side of a pseudo-terminal, a path that this process must not have open, by its master.
 
     Without inotify (if the system has no free instance), a peer that is replaced at once goes unnoticed.
     """
