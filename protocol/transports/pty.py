@@ -21,7 +21,7 @@ from typing import Final
 
 from starhil.protocol.flow import TURN
 from starhil.protocol.transports.base import TransportError
-from starhil.protocol.transports.paced import PacedTransport, PacingSchedule, termios_as_os_error, write_fd
+from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _IN_CLOSE: Final = 0x08 | 0x10
@@ -124,8 +124,8 @@ class PtyTransport(PacedTransport):
     read when it leaves.
     """
 
-    def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
-        super().__init__("pty", schedule)
+    def __init__(self, pace: int | None, symlink: Path | None) -> None:
+        super().__init__("pty", pace)
         self._symlink = symlink
         self._path = ""
         self._master = -1
