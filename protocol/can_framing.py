@@ -301,7 +301,9 @@ _Event = TypeVar("_Event")
 class _Receiver(ABC, Generic[_Event]):
     """Base of both ends: CAN frames in, messages and faults out."""
 
-    def __init__(self, address: int, max_size: int, timeout_s: float) -> None:
+    def __init__(
+        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
+    ) -> None:
         self.address = address
         """Address of this end; may change at any time."""
         self._assembler = _Assembler(max_size, timeout_s)
@@ -340,11 +342,6 @@ class CanDeviceReceiver(_Receiver[Request]):
 
     Frames to other addresses are ignored.
     """
-
-    def __init__(
-        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
-    ) -> None:
-        super().__init__(address, max_size, timeout_s)
 
     def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Request | LinkFault]:
         is_telemetry = can_id.id >= FIRST_TELEMETRY_ID
@@ -399,7 +396,7 @@ class CanHostReceiver(_Receiver[Reply]):
         max_size: int = DEFAULT_MAX_SIZE,
         timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
-        super().__init__(address, max_size, timeout_s)
+        super().__init__(address, max_size=max_size, timeout_s=timeout_s)
         self._device = device
 
     def _concerns(self, can_id: CanId) -> bool:

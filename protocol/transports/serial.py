@@ -9,7 +9,7 @@ import os
 import select
 from abc import abstractmethod
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
 import serial
@@ -223,8 +223,10 @@ class _StreamProtocol(TurnProtocol):
 class _TcpTransport(_ReconnectingSerial):
     """Base of both TCP transports."""
 
-    def __init__(self, scheme: str, host: str, port: int, pace: int | None) -> None:
-        super().__init__(f"{scheme}://{host}:{port}", pace)
+    scheme: ClassVar[str]
+
+    def __init__(self, host: str, port: int, pace: int | None) -> None:
+        super().__init__(f"{self.scheme}://{host}:{port}", pace)
         self._host = host
         self._port = port
         self._stream: asyncio.Transport | None = None
@@ -269,8 +271,7 @@ class _TcpTransport(_ReconnectingSerial):
 class _ConnectTransport(_TcpTransport):
     """A TCP connection to a serial server."""
 
-    def __init__(self, host: str, port: int, pace: int | None) -> None:
-        super().__init__("socket", host, port, pace)
+    scheme = "socket"
 
     async def _attach(self) -> None:
         loop = asyncio.get_running_loop()
@@ -288,9 +289,8 @@ class _ConnectTransport(_TcpTransport):
 class _ListenTransport(_TcpTransport):
     """A TCP port for one peer at a time; without a peer, bytes are lost as on an open line."""
 
-    def __init__(self, host: str, port: int, pace: int | None) -> None:
-        super().__init__("listen", host, port, pace)
-        self._server: asyncio.Server | None = None
+    scheme = "listen"
+    _server: asyncio.Server | None = None
 
     async def _attach(self) -> None:
         loop = asyncio.get_running_loop()
