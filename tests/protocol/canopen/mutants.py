@@ -151,7 +151,7 @@ MUTANTS = (
     Mutant("TPDOs of one SYNC from different samples", "design", "device_dictionary", "if self._cached_at != self.instant:", "if True:"),
     Mutant("RPDO acts in PRE-OPERATIONAL", "rpdo", "slave", "        if self.state is NmtState.OPERATIONAL:\n            pdo.receive", "        if self._context.communicates:\n            pdo.receive"),
     Mutant("synchronous RPDO acts at once", "rpdo", "pdo", "            self._pending = data\n", "            self._apply(data)\n"),
-    Mutant("short RPDO processed", "rpdo", "pdo", "if len(data) < self._size:", "if not data:"),
+    Mutant("short RPDO processed", "rpdo", "pdo", "        if len(data) < self._size:\n", "        data = data.ljust(self._size, b'\\0')\n        if not data:\n"),
     Mutant("short RPDO not reported", "rpdo", "pdo", "            self._error(EmergencyCode.PDO_LENGTH_LOW, detail)\n", ""),
     Mutant("long RPDO not reported", "rpdo", "pdo", "active=len(data) > self._size)", "active=False)"),
     Mutant("place holders do not count", "rpdo", "pdo", "                position += mapped.size\n", "                position += mapped.size if mapped.entry is not None else 0\n"),
