@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.conventions import Conventions, Order
@@ -18,14 +18,16 @@ from starhil.protocol.values import (
     DeviceParameter,
     EnumDefinition,
     Name,
+    Number,
     ParameterType,
     Scalar,
     Section,
+    bounded,
 )
 
 Provenance = Literal["confirmed", "proxy", "ours"]
 FieldType = Literal[
-    "u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64",
+    "u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f32", "f64",
     "enum8", "enum16", "enum32", "bits8", "bits16", "bits32", "bytes", "text",
 ]  # fmt: skip
 
@@ -64,7 +66,7 @@ class BitKeys(DefinitionModel):
     """Quantity that a telemetry field reports."""
     argument: str | None = None
     """Argument of the row's action that a telecommand field sets."""
-    const: int | float | None = None
+    const: Annotated[int | float, AfterValidator(bounded)] | None = None
     """Value that is always sent, and required in a telecommand."""
     doc: str = ""
     """Description."""
@@ -76,13 +78,13 @@ class FieldKeys(BitKeys):
     unit: str = ""
     """Unit of the physical value, converted from or to the unit of the quantity or argument
     (s, ms, us, ns; rad, deg, arcmin, arcsec; rad/s, deg/s …)."""
-    scale: float = 1.0
+    scale: Number = 1.0
     """Physical = raw × scale + offset."""
-    bias: float = Field(default=0.0, alias="offset")
+    bias: Number = Field(default=0.0, alias="offset")
     """Physical = raw × scale + offset."""
-    minimum: float | None = Field(default=None, alias="min")
+    minimum: Number | None = Field(default=None, alias="min")
     """Lowest physical value."""
-    maximum: float | None = Field(default=None, alias="max")
+    maximum: Number | None = Field(default=None, alias="max")
     """Highest physical value."""
     wrap: bool = False
     """Whether an out-of-range value is sent modulo the range (a counter) instead of as the nearest limit."""
@@ -99,8 +101,8 @@ class _MappedModel(BitKeys):
     """Number on the wire → value of the quantity or argument, or a list of values that share the number."""
 
 
-class BitModel(_MappedModel):
-    """One bit or a group of bits; unused and sent as zeros if it has no name."""
+class BitModel(_MappedModel, FieldKeys):
+    """One bit or a group of bits, an unsigned number; unused and sent as zeros if it has no name."""
 
     width: Annotated[int, Field(ge=1, le=31)] = 1
     """Width in bits."""
@@ -142,6 +144,10 @@ class FieldModel(_MappedModel, FieldKeys):
         return {"text": given} if isinstance(given, str) else given
 
 
+Event = Literal["start", "frame", "mode", "error", "validity"]
+"""What a unit may report unsolicited; described in `RowKeys.unsolicited`."""
+
+
 class RowKeys(DefinitionModel):
     """Keys that a row keeps."""
 
@@ -160,6 +166,13 @@ class RowKeys(DefinitionModel):
     """Action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
+    unsolicited: (
+        Annotated[float, Field(gt=0, le=100)] | Annotated[list[Event], Field(min_length=1)] | None
+    ) = None
+    """Sends a telemetry row without a request, from the start on: at a rate in Hz, or after each of the listed
+    events. `start`: the unit has started; `frame`: there is a new measurement; `mode`: the mode has changed; `error`:
+    the unit has entered the error mode, or its error has changed; `validity`: the attitude has become valid or
+    invalid."""
 
 
 class RowModel(RowKeys):

@@ -19,7 +19,9 @@ HEX: Final = {"format": "hex"}
 Code = Annotated[int, Field(ge=0, le=0xFFFF, json_schema_extra=HEX)]
 Byte = Annotated[int, Field(ge=0, le=0xFF, json_schema_extra=HEX)]
 CheckType = Literal["u8", "u16", "u32", "u64"]
-HeaderType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "bits8", "bits16", "bits32"]
+HeaderType = Literal[
+    "u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "bits8", "bits16", "bits32"
+]
 CoveredPart = Literal["start", "header", "data"]
 SizedPart = Literal["start", "header", "data", "check", "end"]
 Role = Literal[
@@ -27,6 +29,7 @@ Role = Literal[
     "status", "ack", "final", "flags", "ticks", "time",
 ]  # fmt: skip
 """Meaning of a header field; described in `HeaderFieldModel`."""
+CountedMessage = Literal["reply", "unsolicited"]
 
 
 class MessageClass(DefinitionModel):
@@ -180,12 +183,23 @@ class SumCheck(_CheckModel):
 
 
 class XorCheck(_CheckModel):
-    """XOR of the bytes."""
+    """XOR of the bytes, or of words of two bytes."""
 
     kind: Literal["xor"]
     """Selects this check."""
-    init: Byte = 0
+    type: Literal["u8", "u16"] = "u8"
+    """Width: a byte, or a word in the byte order of the checksum. A zero completes an odd number of bytes."""
+    init: Code = 0
     """Initial value."""
+
+
+class FletcherCheck(_CheckModel):
+    """Fletcher's checksum of two bytes: the lower is the sum of the bytes, the upper the sum of these sums."""
+
+    kind: Literal["fletcher16"]
+    """Selects this check."""
+    modulus: Literal[255, 256] = 255
+    """Number below which both sums stay: 255, or 256 as in RFC 1146 and UBX."""
 
 
 class CrcCheck(_CheckModel):
@@ -224,7 +238,8 @@ class CustomCheck(_CheckModel):
 
 
 CheckModel = Annotated[
-    NoCheck | SumCheck | XorCheck | CrcCheck | XxHashCheck | CustomCheck, Field(discriminator="kind")
+    NoCheck | SumCheck | XorCheck | FletcherCheck | CrcCheck | XxHashCheck | CustomCheck,
+    Field(discriminator="kind"),
 ]
 
 
@@ -239,6 +254,8 @@ class HeaderBitModel(DefinitionModel):
     """Value that is sent, and required on reception."""
     default: Annotated[int, Field(ge=0)] | None = None
     """Value that is sent if the message sets none; not checked on reception, except for an address."""
+    counts: list[CountedMessage] = []
+    """Messages that a `sequence` numbers, beginning with 0 after a start, instead of repeating a request's number."""
 
 
 class HeaderFieldModel(DefinitionModel):
@@ -246,7 +263,7 @@ class HeaderFieldModel(DefinitionModel):
 
     Roles: `address` is the address of the device, in both directions; `source` (in a request) and
     `destination` (in a reply) are the address of the OBC. `class`, `id` and `status` are the codes of class,
-    row and error. `length` counts the parts in `includes`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
+    row and error. `length` is the number of bytes of the parts in `includes`, plus `offset`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
     the last reply to a request. A reply repeats the `sequence` and `flags` of its request. `ticks` is the
     time since start, `time` the time of the unit's clock.
     """
@@ -259,12 +276,16 @@ class HeaderFieldModel(DefinitionModel):
     """Value that is sent, and required on reception."""
     default: int | None = None
     """Value that is sent if the message sets none; not checked on reception, except for an address."""
+    counts: list[CountedMessage] = []
+    """Messages that a `sequence` numbers, beginning with 0 after a start, instead of repeating a request's number."""
     order: Order | None = None
     """Byte order; default: the unit's."""
     scale: Annotated[float, Field(gt=0)] = 1.0
     """Seconds per count of `ticks` or `time`."""
     includes: list[SizedPart] = ["data"]
     """Parts of the message that a `length` counts; `header` includes the length field itself."""
+    offset: int = 0
+    """Number added to a `length` (CCSDS packets: -1)."""
     classes: list[str] | None = None
     """Classes whose messages have the field; default: all."""
     bits: list[HeaderBitModel] = []

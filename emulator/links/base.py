@@ -6,7 +6,7 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
 
@@ -29,6 +29,20 @@ FLUSH_S: Final = 0.51
 """Delay after which an incomplete message is dropped, seconds; just above the receivers' timeout, 0.5 s."""
 
 
+@dataclass
+class Heard:
+    """Requests of the OBC on a link, without those of the console."""
+
+    requests: int = 0
+    last_s: float | None = None
+    """Time of the last one on the loop's clock, seconds; None before the first."""
+
+    def count(self) -> None:
+        """Count a request."""
+        self.requests += 1
+        self.last_s = asyncio.get_running_loop().time()
+
+
 class Link(Protocol):
     """An open link of any kind."""
 
@@ -38,6 +52,10 @@ class Link(Protocol):
     @property
     def transport(self) -> Transport[Any]:
         """Transport of the link."""
+
+    @property
+    def heard(self) -> Heard:
+        """Requests of the OBC."""
 
     @property
     def wire(self) -> WireFaults[Any]:
@@ -61,11 +79,15 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._device = device
         self._loop = asyncio.get_running_loop()
         self.transport: Final = transport
+        self.heard: Final = Heard()
         self._receiver = self._new_receiver()
         self._timer: Event | None = None
         self._held_input: deque[Request | LinkFault] = deque()
         """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
         self._pending: PendingAnswer[list[Reply]] | None = None
+        self._executing = False
+        self._caused: list[Reply] = []
+        """Unsolicited messages that the request being executed has caused; they follow its replies."""
         self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
         device.signals.unsolicited.connect(self._send_unsolicited)
         device.signals.restarted.connect(self._reset_receiver)
@@ -82,9 +104,16 @@ class DeviceLink(ABC, Generic[Item, Style]):
     def _send(self, reply: Reply, style: Style) -> None:
         """Send a reply."""
 
+    @abstractmethod
+    def _is_console(self, request: Request) -> bool:
+        """Return whether console or recording sent a request."""
+
     def _send_unsolicited(self, reply: Reply) -> None:
         """Send unsolicited telemetry."""
-        self._send(reply, self._reply_style())
+        if self._executing:
+            self._caused.append(reply)
+        else:
+            self._send(reply, self._reply_style())
 
     async def start(self) -> str:
         """Open the transport; return its description."""
@@ -115,13 +144,23 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._requests.count_fault(event)
             return
         style = self._reply_style()  # a change of format is answered in the old format
-        answer = self._requests.handle(event)
+        console = self._is_console(event)
+        if not console:
+            self.heard.count()
+        self._executing = True
+        try:
+            answer = self._requests.handle(event, console=console)
+        finally:
+            self._executing = False
         if isinstance(answer, PendingAnswer):
             self._pending = answer
             answer.when_done(partial(self._answer_later, answer, style))
-            return
-        for reply in answer:
-            self._answer(reply, style)
+        else:
+            for reply in answer:
+                self._answer(reply, style)
+        caused, self._caused = self._caused, []
+        for reply in caused:
+            self._send_unsolicited(reply)
 
     def _answer_later(self, answer: PendingAnswer[list[Reply]], style: Style, replies: list[Reply]) -> None:
         for reply in replies:

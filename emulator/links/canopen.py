@@ -17,6 +17,7 @@ from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.base import Heard
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
 from starhil.emulator.links.wire_faults import WireFaults
@@ -24,6 +25,7 @@ from starhil.emulator.pipeline.messages import ImageResult
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
+from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -180,6 +182,7 @@ class CanopenLink:
     ) -> None:
         device = self._device = requests.device
         self.transport: Final = transport
+        self.heard: Final = Heard()
         self.application = DeviceApplication(requests, self._finish_write)
         dictionary = build_dictionary(device.icd, self.application)
         self.slave = CanopenSlave(
@@ -235,6 +238,8 @@ class CanopenLink:
 
     def _receive(self, frame: CanFrame) -> None:
         if not frame.extended and not self._device.unresponsive:
+            if frame.id == SDO_RECEIVE + self.slave.node_id:
+                self.heard.count()
             self._run_action(lambda now: self.slave.receive(frame, now))
 
     def _run_action(self, action: Action) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
@@ -38,16 +39,30 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
     """Connects a device to a serial transport, at the bit rate in its parameter `serial_baud`.
 
     The CubeSpace family has three dialects of replies, of which only c has unsolicited telemetry.
+
+    Parameters
+    ----------
+    console
+        Whether the line is that of console and recording.
     """
 
     bus: ClassVar[str] = "serial"
 
-    def __init__(self, requests: Requests, transport: SerialTransport, seed: int = 0) -> None:
+    def __init__(
+        self, requests: Requests, transport: SerialTransport, seed: int = 0, *, console: bool = False
+    ) -> None:
+        self._console = console
         self._stack = build_serial_stack(requests.device.icd)
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
+        self._numbered = 0
+        """Messages that the device has numbered since its start."""
+        self._device.signals.started.connect(self._restart_numbers)
         self._device.signals.parameters_changed.connect(self._parameters_changed)
+
+    def _restart_numbers(self, _cause: str) -> None:
+        self._numbered = 0
 
     def _wanted_baud(self) -> int:
         return int(self._device.parameters["serial_baud"])
@@ -60,6 +75,9 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         if self._baud != self._wanted_baud():
             self._baud = self._wanted_baud()
             self._port.set_baud(self._baud)
+
+    def _is_console(self, request: Request) -> bool:  # noqa: ARG002 (nobody else is on its line)
+        return self._console
 
     def _new_receiver(self) -> Receiver[bytes, Request]:
         return self._stack.device()
@@ -75,8 +93,12 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         return self.dialect
 
     def _send(self, reply: Reply, style: Dialect | None) -> None:
+        numbered = self._stack.counts(reply.kind)
+        if numbered:
+            reply = replace(reply, sequence=self._numbered)
         data = self._stack.encode_reply(reply, style)
         if data:  # the unit may have no such reply
+            self._numbered += numbered
             self.wire.send(data)
 
     def _send_unsolicited(self, reply: Reply) -> None:

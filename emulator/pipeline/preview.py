@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.bodies import SEEN_PX
 from starhil.emulator.pipeline.messages import Preview
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame
@@ -56,7 +57,12 @@ class Overlay:
     detections: list[tuple[float, float, float, float]]
     """Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first."""
     hips: list[int]
-    """Hipparcos number of each detection; 0 if it was not identified."""
+    """Hipparcos number of each detection; 0 if the solution does not have it."""
+    unused: list[int]
+    """Hipparcos number of the catalogue star at the place of each detection without one in `hips`; 0 if there is none.
+
+    With a slightly wrong calibration, the solution leaves out bright stars, which deviate by more than their small noise.
+    """
     catalogue: list[tuple[int, float, float, float]]
     """Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first."""
     false_stars: list[tuple[float, float]]
@@ -96,18 +102,18 @@ def make_overlay(
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
     bright &= np.all((stars.xy_px > -0.5) & (stars.xy_px < (width - 0.5, height - 0.5)), axis=1)
+    hip, xy_px = stars.hip[bright], stars.xy_px[bright]
     catalogue = zip(
-        stars.hip[bright].tolist(),
-        *stars.xy_px[bright].round(1).T.tolist(),
-        stars.magnitude[bright].round(2).tolist(),
-        strict=True,
+        hip.tolist(), *xy_px.round(1).T.tolist(), stars.magnitude[bright].round(2).tolist(), strict=True
     )
     detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
+    unused = [] if found is None else unused_stars(found.xy_px, hips, hip, xy_px)
     return Overlay(
         width=width,
         height=height,
         detections=detections,
         hips=hips,
+        unused=unused,
         catalogue=list(catalogue),
         false_stars=[] if objects is None else [(x, y) for x, y in objects.false_xy_px.round(1).tolist()],
         bodies=_bodies(sky, camera, frame.attitude),
@@ -145,6 +151,20 @@ def _detections(
         *found.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
     )
     return list(rows), hips.tolist()
+
+
+def unused_stars(
+    detections_xy: NDArray[np.float64], hips: list[int], hip: NDArray[np.int32], xy_px: NDArray[np.float64]
+) -> list[int]:
+    """Return for each detection (n, 2) without a Hipparcos number that of the star (m, 2), brightest first, at its place."""
+    unused = [0] * len(hips)
+    left = ~np.isin(hip, hips)
+    for number, place in zip(hip[left].tolist(), xy_px[left], strict=True):
+        distances = np.hypot(*(detections_xy - place).T)
+        row = int(distances.argmin()) if len(distances) else -1
+        if row >= 0 and distances[row] <= SEEN_PX and hips[row] == unused[row] == 0:
+            unused[row] = number
+    return unused
 
 
 def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:

@@ -6,7 +6,7 @@ The judge (`starhil.hil_tests.judge`) encodes and decodes; a probe adds the port
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Protocol
@@ -40,24 +40,16 @@ REPORTED: Final = {
 
 @dataclass(frozen=True)
 class ProbeTimes:
-    """Timeouts of the tester.
-
-    Attributes
-    ----------
-    answer_s
-        Maximum time for an answer.
-    quiet_s
-        Silence that counts as no answer.
-    boot_s
-        Maximum time from a reset to the first answer in standby.
-    image_s
-        Maximum time for taking an image.
-    """
+    """Timeouts of the tester."""
 
     answer_s: float = 1.0
+    """Maximum time for an answer."""
     quiet_s: float = 0.1
+    """Silence that counts as no answer."""
     boot_s: float = 15.0
+    """Maximum time from a reset to the first answer in standby."""
     image_s: float = 20.0
+    """Maximum time for taking an image."""
 
 
 class Settings(Protocol):
@@ -93,19 +85,15 @@ class ReadableSettings:
 class LinkProbe(ABC):
     """Talks to a unit over a link.
 
-    `settings` are what a run restores; by default, those that can be read.
-
-    Attributes
-    ----------
-    has_unsolicited
-        Whether the link carries unsolicited telemetry.
-    truth
-        The true attitude, if the tester knows it; set by the run.
+    `settings` are what a run restores; by default, those that can be read. The run sets `truth` if the true attitude is known.
     """
 
     link: str
     """`serial` or `can`."""
     has_unsolicited = True
+    """Whether the link carries unsolicited telemetry."""
+    numbers = 0
+    """How many numbers the header has for messages; 0 if it has none."""
     has_codes = True
     """Whether a refusal carries a code."""
 
@@ -158,9 +146,27 @@ class LinkProbe(ABC):
     def unexpected_answer(self, quiet_s: float) -> Answer:
         """Return an unexpected answer within a time."""
 
+    def receive_unsolicited(self, seconds: float, after: Callable[[], None] | None = None) -> list[Answer]:
+        """Return the messages of unsolicited telemetry that arrive within a time, counted from the end of an action."""
+        self._clear_unsolicited()
+        if after is not None:
+            after()
+        self.sleep(seconds)
+        return self._unsolicited_answers()
+
     @abstractmethod
-    def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that arrive within a time."""
+    def _clear_unsolicited(self) -> None:
+        """Discard the messages of unsolicited telemetry."""
+
+    @abstractmethod
+    def _unsolicited_answers(self) -> list[Answer]:
+        """Return the messages of unsolicited telemetry since they were discarded."""
+
+    def check_numbers(self, answers: Sequence[Answer]) -> None:
+        """Fail the case unless the numbers that the unit has given successive messages are successive."""
+        seen = [answer.number for answer in answers if answer.number is not None]
+        if seen:
+            check_equal(seen, [(seen[0] + step) % self.numbers for step in range(len(seen))], "the numbers")
 
     @abstractmethod
     def _receive(self, timeout_s: float) -> bool:

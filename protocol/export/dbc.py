@@ -30,8 +30,6 @@ from starhil.protocol.values import EnumDefinition, IcdError
 EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""
 
-_SIGNED: Final = ("i8", "i16", "i32", "i64")
-
 
 class _Signal(NamedTuple):
     """One signal of a message: a field, or one byte of a string."""
@@ -120,7 +118,7 @@ def _signals(field: Field) -> Iterator[_Signal]:
         return
     big = field.slot.order == "big"
     byte, bit = field.place(field.bit_count - 1 if big else 0)
-    sign = "-" if field.slot.type in _SIGNED or field.kind == "float" else "+"
+    sign = "-" if field.slot.type.startswith("i") or field.kind == "float" else "+"
     yield _Signal(
         field.name, 8 * byte + bit, field.bit_count, int(not big), sign, field.scale, field.bias, *_limits(field), field.unit
     )  # fmt: skip

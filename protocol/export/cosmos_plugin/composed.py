@@ -16,6 +16,7 @@ from starhil.protocol.link_schema import (
     CustomFraming,
     DelimitedFraming,
     EscapedFraming,
+    FletcherCheck,
     NoCheck,
     SlipFraming,
     SumCheck,
@@ -87,6 +88,8 @@ def _check(stack: SerialStack) -> dict[str, Any]:
             constants["COMPLEMENT"] = model.complement
         case XorCheck():
             constants["INITIAL"] = model.init
+        case FletcherCheck():
+            constants["MODULUS"] = model.modulus
         case CrcCheck():
             constants |= {
                 "POLYNOMIAL": model.poly,
@@ -114,6 +117,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
         "REPLY_CLASSES": reply | unsolicited,
         "UNSOLICITED": sorted(unsolicited),
         "LENGTH_INCLUDES": sorted(length[0].includes) if length else [],
+        "LENGTH_OFFSET": length[0].offset if length else 0,
         "REQUEST_HEADER": list(_fields(stack.request_header, codes)),
         "REPLY_HEADER": list(_fields(stack.reply_header, codes)),
     }
@@ -129,6 +133,7 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
             "default": 0 if field.bits else field.default,
             "classes": None if field.classes is None else sorted(codes[name] for name in field.classes),
             "includes": sorted(field.includes) if field.role == "length" else [],
+            "offset": field.offset,
             "bits": [(bit.role, bit.mask.bit_length(), bit.default) for bit in field.bits],
         }
 
