@@ -17,6 +17,7 @@ from starhil.protocol.export.templates import text_of
 from starhil.protocol.link_schema import (
     CountedMessage,
     CubeSpaceFraming,
+    FormatModel,
     HeaderFieldModel,
     SerialLinkModel,
 )
@@ -37,7 +38,7 @@ _PLACEHOLDERS: Final = {
 """Placeholder names for bytes of the example messages."""
 
 
-def _text(table: str) -> dict[str, Any]:
+def texts_of(table: str) -> dict[str, Any]:
     """Return a table of the texts."""
     texts: dict[str, Any] = _texts()[table]
     return texts
@@ -50,7 +51,7 @@ def _texts() -> dict[str, Any]:
 
 def _section(name: str, rows: Iterable[tuple[str, ...]], **values: object) -> Section:
     """Return a section with its texts filled in; a paragraph that is empty then is left out."""
-    texts = _text(name)
+    texts = texts_of(name)
     paragraphs = [paragraph.format(**values) for paragraph in texts.get("paragraphs", ())]
     return Section(
         heading=texts["heading"],
@@ -70,7 +71,7 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     if icd.link.serial is not None:
         cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
         serial = icd.link.serial
-        found.append(_serial(icd, serial) if cubespace else _composed(serial, icd.conventions.byte_order))
+        found.append(_serial(icd, serial) if cubespace else _composed(icd, serial))
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
@@ -83,8 +84,8 @@ def _conventions(icd: InterfaceDefinition) -> Section:
     epoch = conventions.epoch
     start = "midnight of the current day" if epoch == "midnight" else EPOCHS.get(epoch, epoch)
     rows = [
-        ("quaternion", _text("quaternion")[conventions.quaternion]),
-        ("sign", _text("sign")[conventions.scalar_sign]),
+        ("quaternion", texts_of("quaternion")[conventions.quaternion]),
+        ("sign", texts_of("sign")[conventions.scalar_sign]),
         (
             "axes x, y, z of the reported frame",
             f"{', '.join(conventions.axes)} of the sensor frame (+x right in the image, +y down, +z boresight)",
@@ -127,7 +128,8 @@ def _errors(icd: InterfaceDefinition) -> Section:
     return _section("errors", ((f"{number} ({number:02X}h)", name) for name, number in numbers.items()))
 
 
-def _composed(link: SerialLinkModel, order: Order) -> Section:
+def _composed(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
+    order = icd.conventions.byte_order
     rows = (
         (message, *cells)
         for message, header in (("request", link.request_header), ("reply", link.reply_header))
@@ -135,7 +137,26 @@ def _composed(link: SerialLinkModel, order: Order) -> Section:
         for cells in _header_cells(field, order)
     )
     framing, check = _settings(link.framing), _settings(link.check)
-    return _section("composed", rows, baud=link.baud, framing=framing, check=check)
+    formats = " ".join(_format_text(item) for item in link.format)
+    texts = "; ".join(f"`{row.name}` by `{row.request}`" for row in icd.rows if row.request)
+    answers = [
+        f"{what} by the text `{text}`"
+        for what, text in (("acknowledged", link.acknowledge), ("refused", link.refusal))
+        if text is not None
+    ]
+    said = [f"Rows are requested by texts: {texts}."] * bool(texts)
+    said += [f"Requests are {' and '.join(answers)}."] * bool(answers)
+    return _section(
+        "composed", rows, baud=link.baud, framing=framing, check=check, formats=formats, texts=" ".join(said)
+    )
+
+
+def _format_text(item: FormatModel) -> str:
+    """Describe in a sentence which messages have another framing or check."""
+    whose = f" of class {' or '.join(item.classes)}" if item.classes else ""
+    what = {"request": "Requests", "reply": "Replies"}.get(item.direction or "", "Messages")
+    parts = (("framing", item.framing), ("check", item.check))
+    return f"{what}{whose}: {', '.join(f'{name} {_settings(model)}' for name, model in parts if model is not None)}."
 
 
 def _settings(model: BaseModel) -> str:
@@ -166,11 +187,11 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
             bit.role or "constant",
             f"{type_}, bits {bits} to {bits + bit.width - 1}",
             _fixed_value(bit.const, bit.default),
-            _counter(bit.counts) or _text("role").get(bit.role or "", ""),
+            _counter(bit.counts) or texts_of("role").get(bit.role or "", ""),
         )
         bits += bit.width
     if not field.bits:
-        meaning = _text("role").get(field.role or "", "")
+        meaning = texts_of("role").get(field.role or "", "")
         if field.role == "length":
             offset = f" {'+' if field.offset > 0 else '−'} {abs(field.offset)}" if field.offset else ""
             meaning = f"number of bytes of {', '.join(field.includes) or 'nothing'}{offset}"
@@ -183,7 +204,7 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
 
 def _counter(counts: list[CountedMessage]) -> str:
     """Describe a number that counts messages."""
-    return str(_text("counted")["".join(sorted(set(counts)))]) if counts else ""
+    return str(texts_of("counted")["".join(sorted(set(counts)))]) if counts else ""
 
 
 def _fixed_value(const: int | None, default: int | None) -> str:
