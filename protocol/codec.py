@@ -56,6 +56,11 @@ class Slot:
     order: Order = "little"
 
     @property
+    def bytewise(self) -> bool:
+        """Whether `struct` has no format for this number, whose bytes are therefore packed here."""
+        return self.type != "bytes" and self.type not in STRUCT_CODES
+
+    @property
     def code(self) -> str:
         """Format of the slot for `struct`, without the byte order."""
         return STRUCT_CODES.get(self.type) or f"{self.size}s"
@@ -354,6 +359,8 @@ class Row(RowKeys):
     """Answers in order: `echo`, `reply`, `row:NAME`."""
     zeros: bool = False
     """Whether fields without a binding are sent as zeros."""
+    request: str = ""
+    """Text that requests the row on the serial line; empty: its header does."""
 
     def __repr__(self) -> str:
         """Return kind, ID and name."""
@@ -377,6 +384,15 @@ class Row(RowKeys):
             codes = [slot.code if slot.index in self._sent else f"{slot.size}x" for slot in slots]
             runs.append((Struct(BYTE_ORDERS[order] + "".join(codes)), sum("x" not in code for code in codes)))
         return tuple(runs)
+
+    @cached_property
+    def _bytewise(self) -> tuple[tuple[int, Slot], ...]:
+        """The slots that are packed here, each with its position among the packed values."""
+        return tuple(
+            (position, self.slots[index])
+            for position, index in enumerate(self._sent)
+            if self.slots[index].bytewise
+        )
 
     @cached_property
     def _values(self) -> tuple[tuple[str, Field, int], ...]:
@@ -419,6 +435,8 @@ class Row(RowKeys):
                 value = item.empty
             packed: Any = item.to_raw(value, where, check=check, saturate=saturate, index=index)
             raw[position] = raw[position] | packed << item.shift if item.width else packed
+        for position, slot in self._bytewise:
+            raw[position] = raw[position].to_bytes(slot.size, slot.order, signed=slot.type.startswith("i"))
         numbers = iter(raw)
         return b"".join(packer.pack(*islice(numbers, count)) for packer, count in self._runs)
 
@@ -436,6 +454,8 @@ class Row(RowKeys):
         for packer, _ in self._runs:
             raw += packer.unpack_from(data, offset)
             offset += packer.size
+        for position, slot in self._bytewise:
+            raw[position] = int.from_bytes(raw[position], slot.order, signed=slot.type.startswith("i"))
         values: dict[str, Value] = {}
         for index, (name, item, position) in enumerate(self._values):
             number = raw[position]

@@ -40,24 +40,16 @@ REPORTED: Final = {
 
 @dataclass(frozen=True)
 class ProbeTimes:
-    """Timeouts of the tester.
-
-    Attributes
-    ----------
-    answer_s
-        Maximum time for an answer.
-    quiet_s
-        Silence that counts as no answer.
-    boot_s
-        Maximum time from a reset to the first answer in standby.
-    image_s
-        Maximum time for taking an image.
-    """
+    """Timeouts of the tester."""
 
     answer_s: float = 1.0
+    """Maximum time for an answer."""
     quiet_s: float = 0.1
+    """Silence that counts as no answer."""
     boot_s: float = 15.0
+    """Maximum time from a reset to the first answer in standby."""
     image_s: float = 20.0
+    """Maximum time for taking an image."""
 
 
 class Settings(Protocol):
@@ -90,22 +82,25 @@ class ReadableSettings:
             probe.send_command(command, data)
 
 
+def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
+    """Return the smallest row whose errors show: of several bytes, in a class that can be refused, read without effect."""
+
+    def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
+        return row.action is not None, not can_refuse(row.klass), row.size < SHOWING, row.size
+
+    return min(unit.telemetry.values(), key=unsuitable)
+
+
 class LinkProbe(ABC):
     """Talks to a unit over a link.
 
-    `settings` are what a run restores; by default, those that can be read.
-
-    Attributes
-    ----------
-    has_unsolicited
-        Whether the link carries unsolicited telemetry.
-    truth
-        The true attitude, if the tester knows it; set by the run.
+    `settings` are what a run restores; by default, those that can be read. The run sets `truth` if the true attitude is known.
     """
 
     link: str
     """`serial` or `can`."""
     has_unsolicited = True
+    """Whether the link carries unsolicited telemetry."""
     numbers = 0
     """How many numbers the header has for messages; 0 if it has none."""
     has_codes = True
@@ -124,15 +119,8 @@ class LinkProbe(ABC):
 
     @cached_property
     def lively(self) -> Row:
-        """Row that is requested to check that the unit answers.
-
-        The smallest whose errors show: of several bytes, in a class that can be refused, and read without effect.
-        """
-
-        def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
-            return row.action is not None, not self.can_refuse(row.klass), row.size < SHOWING, row.size
-
-        return min(self.unit.telemetry.values(), key=unsuitable)
+        """Row that is requested to check that the unit answers."""
+        return lively_row(self.unit, self.can_refuse)
 
     # --- the link ---
 

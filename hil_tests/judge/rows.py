@@ -23,7 +23,7 @@ from starhil.hil_tests.judge.messages import Value
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 RowKind = Literal["telecommand", "telemetry"]
 SIZES: Final = {
-    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
+    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u24": 3, "i24": 3, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
 }  # fmt: skip
 """Bytes of each type of number."""
 LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
@@ -238,6 +238,8 @@ class Row:
         Action that a telecommand performs, and its fixed arguments.
     answers
         Answers in order: `echo`, `reply`.
+    request
+        Text that requests the row on a serial line; empty if a header does.
     unsolicited
         Rate in Hz at which it is sent without a request, or events after which it is sent; None if it is not.
     """
@@ -252,6 +254,7 @@ class Row:
     action: str | None = None
     arguments: Mapping[str, Value] = field(default_factory=dict)
     answers: tuple[str, ...] = ("reply",)
+    request: str = ""
     unsolicited: float | Sequence[str] | None = None
 
     def __repr__(self) -> str:
