@@ -18,13 +18,7 @@ from starhil.emulator.truth.config import Strict
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values if they are valid fields of `SkyObjects`.
-
-    Raises
-    ------
-    ValueError
-        A field is invalid; the message names it and the allowed values.
-    """
+    """Return the values if they are valid fields of `SkyObjects`; ValueError names the field and the allowed values."""
     try:
         SkyObjects.from_dict(values)
     except EmulatorError as error:
@@ -110,13 +104,7 @@ class FaultRequest(Strict):
 
 
 class Faults:
-    """The currently injected faults.
-
-    Parameters
-    ----------
-    links
-        The links of the device, also those that are opened later.
-    """
+    """The currently injected faults, also of links that are opened later."""
 
     def __init__(self, device: Device, links: Sequence[Link]) -> None:
         self._device = device

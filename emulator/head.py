@@ -54,16 +54,9 @@ log = logging.getLogger("starhil.run")
 
 
 class Head:
-    """One device of a run.
+    """One device of a run, with its pipeline, which is not started yet, and the truth of the body on which it is mounted.
 
-    Parameters
-    ----------
-    imager
-        Its pipeline, which is not started yet.
-    truth
-        Truth of the body on which the head is mounted.
-    on_warm
-        Called when the pipeline is ready, also after a restart.
+    `on_warm` is called when the pipeline is ready, also after a restart.
     """
 
     def __init__(

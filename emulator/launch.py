@@ -55,12 +55,7 @@ class RunOptions:
 class Emulator:
     """A run with truth logs, recording, scenario, control channel and console.
 
-    Parameters
-    ----------
-    profiles
-        Profiles of the heads; truth and clock are those of the first.
-    worker
-        Pipeline worker that was started earlier; by default one is started here.
+    Truth and clock are those of the first profile. A pipeline worker may have been started earlier.
     """
 
     def __init__(

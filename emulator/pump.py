@@ -85,16 +85,8 @@ class ClockPump:
 class StepPump:
     """Runs events on request, once time passes; before each, it waits for the pipelines and for the links to send.
 
-    Parameters
-    ----------
-    devices
-        Scheduler and pipeline of each device on the clock. Simultaneous events run in the
-        order of the devices.
-    transports
-        Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not wait for its
-        transport until it reads again.
-    time_passes
-        Set when every pipeline is ready; steps wait for it.
+    Simultaneous events run in the order of the devices. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not
+    wait for its transport until it reads again.
     """
 
     def __init__(

@@ -178,10 +178,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
 class Player(Wiring):
     """Connects a run to a recording instead of the world.
 
-    Parameters
-    ----------
-    ends_at_once
-        Whether slow writes ended at once in the recorded run, as on the stepped clock.
+    `ends_at_once`: whether slow writes ended at once in the recorded run, as on the stepped clock.
     """
 
     plays = repeatable = True
@@ -277,13 +274,7 @@ class PlayedImager:
         await self._inner.settle()
 
     async def deliver(self) -> None:
-        """Deliver the next reply.
-
-        Raises
-        ------
-        _DeviationError
-            The device has sent fewer requests than in the recorded run.
-        """
+        """Deliver the next reply; _DeviationError if the device has sent fewer requests than in the recorded run."""
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
@@ -350,10 +341,8 @@ def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
 async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
     """Play a recording on the stepped clock, and compare sent items and measurements with it.
 
-    Parameters
-    ----------
-    profile
-        Profile of the device, instead of the recorded one; `run` except the algorithm, and `links`, are as recorded.
+    The device may have another profile than the recorded one; `run` except the algorithm, and `links`, are as
+    recorded.
     """
     recorded, ends = read_run(folder)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
@@ -430,13 +419,7 @@ class _Playing:
         return recording
 
     async def entry(self, entry: Entry) -> None:
-        """Play one entry at the current time.
-
-        Raises
-        ------
-        _DeviationError
-            The device behaves differently, so that the entry cannot be played.
-        """
+        """Play one entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
         match entry:
             case _Plain():
                 await self._plain(entry)

@@ -42,12 +42,8 @@ from starhil.protocol.icd_bindings import unbound
 class Run:
     """A run of one or several heads.
 
-    Parameters
-    ----------
-    profiles
-        Profiles of the heads; truth and clock are those of the first.
-    worker
-        Pipeline worker of the first head that was started earlier; by default it is started here.
+    Truth and clock are those of the first profile. The pipeline worker of the first head may have been started
+    earlier.
     """
 
     def __init__(

@@ -105,13 +105,7 @@ def from_json(value: Any) -> bytes | CanFrame:
 
 
 class Recorder(Wiring):
-    """Writes the tape of a run.
-
-    Parameters
-    ----------
-    inner
-        Connects the run to the world.
-    """
+    """Writes the tape of a run, which `inner` connects to the world."""
 
     repeatable = True
 

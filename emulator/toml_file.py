@@ -11,13 +11,7 @@ from starid.files import read_text
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Read a TOML file.
-
-    Parameters
-    ----------
-    what
-        Kind of file, for messages: `profile`, `scenario`.
-    """
+    """Read a TOML file; `what` is its kind, for messages: `profile`, `scenario`."""
     try:
         return tomllib.loads(read_text(path))
     except OSError as error:

@@ -14,16 +14,9 @@ from starid.errors import plain
 def explain(
     error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
 ) -> str:
-    """Describe the first validation error in one line: key, problem and remedy.
+    """Describe the first validation error of a model in one line: key, problem and remedy.
 
-    Parameters
-    ----------
-    error, model
-        The error, and the model that rejected the input.
-    under
-        Path of keys in the model to the validated input.
-    also
-        Further keys allowed at the top level.
+    `under` is the path of keys in the model to the validated input; `also` are further keys allowed at the top level.
     """
     first = _most_helpful_error(error)
     loc = (*under, *first["loc"])

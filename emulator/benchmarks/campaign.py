@@ -254,9 +254,7 @@ def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
 def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
     """Open the folder of a campaign, with its plan, the versions of everything that affects it, and chunks.
 
-    Raises
-    ------
-    StaridError : the folder holds another plan, or cannot be used.
+    StaridError if it holds another plan, or cannot be used.
     """
     return ResultStore(folder, {**plan, "made_by": made_by()}, "campaign")
 
@@ -266,11 +264,8 @@ def run_parts(
 ) -> Iterator[tuple[str, Results]]:
     """Yield name and results of each part as it finishes; stored parts are loaded.
 
-    Parameters
-    ----------
-    parts : name of a part → function that returns its results, and the arguments of the function.
-    store : store for finished parts, or None.
-    jobs : number of processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
+    `parts` has the function that returns the results of each name, and its arguments. `jobs` is a number of
+    processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
     """
     from joblib import Parallel, delayed
 
@@ -301,15 +296,7 @@ def run_campaign(
 ) -> Iterator[npt.NDArray[np.void]]:
     """Run a campaign and yield the rows of each chunk as it finishes; finished chunks in `folder` are loaded.
 
-    Parameters
-    ----------
-    plan : definition of the campaign.
-    folder : folder for finished chunks, or None.
-    jobs : number of processes, as in `run_parts`.
-
-    Raises
-    ------
-    StaridError : `folder` holds another campaign or a file that cannot be read.
+    `jobs` is as in `run_parts`. StaridError if `folder` holds another campaign or a file that cannot be read.
     """
     store = None if folder is None else open_store(folder, asdict(plan))
     chunks = {f"chunk-{chunk:06d}": (_chunk_results, plan, chunk) for chunk in range(plan.chunks)}

@@ -75,20 +75,10 @@ def cramer_rao_px(
     sensor: SensorModel,
     background_e: float,
 ) -> tuple[float, float]:
-    """Return the Cramér–Rao bound of the position of a star, as standard deviations along x and y in pixels.
+    """Return the Cramér–Rao bound of the position (2,) of a star, as standard deviations along x and y in pixels.
 
-    Parameters
-    ----------
-    xy_px : array (2,)
-        Position of the star.
-    electrons : float
-        Electrons from the star in the exposure.
-    sigma_px, trail_px
-        Standard deviation of the spot, and the trail along x and y.
-    background_variance_e2, background_e : float
-        Variance of a pixel without star light (electrons²), and its mean (electrons).
-    sensor : SensorModel
-        Sensor with the spread of sensitivity and the saturation level.
+    The star has a spot of standard deviation `sigma_px` and a trail along x and y. The variance of a pixel without
+    its light is in electrons², the mean in electrons.
     """
     reach = math.ceil(6.0 * sigma_px + 0.5 * math.hypot(*trail_px)) + 2
     left, top = round(xy_px[0]) - reach, round(xy_px[1]) - reach
@@ -113,25 +103,9 @@ def measure_centroids(
     sensor: SensorModel | None = None,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> list[CentroidRow]:
-    """Measure the accuracy of centroids in frames of random attitude.
+    """Measure the accuracy of centroids in frames of random attitude, by rate and magnitude; bins without stars are omitted.
 
-    Parameters
-    ----------
-    rates_deg_s : sequence of float
-        Body rates, about an axis across the boresight with a random direction in every frame.
-    frames : int
-        Frames per rate.
-    seed : int
-        Seed of attitudes, directions and noise.
-    sensor : optional
-        Default: the product's.
-    progress : callable, optional
-        Receives a line about each step.
-
-    Returns
-    -------
-    list of CentroidRow
-        By rate and magnitude; bins without stars are omitted.
+    The body turns about an axis across the boresight, with a random direction in every frame.
     """
     if frames < 1 or not rates_deg_s:
         raise EmulatorError(

@@ -306,22 +306,7 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
 def run_ecss(
     plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1
 ) -> Iterator[tuple[str, int, Results]]:
-    """Run a campaign; yield condition name, chunk number and results of each part as it finishes.
-
-    Parameters
-    ----------
-    plan
-        Definition of the campaign.
-    folder
-        Folder for finished parts, or None.
-    jobs
-        Number of processes.
-
-    Raises
-    ------
-    EmulatorError, StaridError
-        The profile is invalid, or the folder holds another campaign.
-    """
+    """Run a campaign, as `run_campaign`; yield condition name, chunk number and results of each part as it finishes."""
     profile = load_profile(plan.profile, plan.overrides)
     described = {**asdict(plan), "device": profile.model_dump(mode="json")}
     store = None if folder is None else open_store(folder, described)

@@ -56,18 +56,8 @@ def measure_frames(
 ) -> list[StageRow]:
     """Measure the processor time of each stage over frames of random attitude, after a warm-up.
 
-    The thread's processor time is used because other programs on the machine have little effect on it.
-
-    Parameters
-    ----------
-    frames : int
-        Number of measured frames.
-    seed : int
-        Seed of attitudes and noise.
-    rate_deg_s : float
-        Body rate during the exposures, about an axis across the boresight.
-    progress : callable, optional
-        Receives one line per step.
+    The body turns about an axis across the boresight. The thread's processor time is used because other programs on
+    the machine have little effect on it.
     """
     if frames < 1:
         raise EmulatorError(f"bench frame: frames must be at least one, not {frames}")

@@ -28,15 +28,7 @@ _COSMIC_RAYS_S: Final = 50.0
 
 
 def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
-    """Make a hard sky: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun.
-
-    Parameters
-    ----------
-    attitude : Attitude
-        Attitude of the sensor.
-    rng : Generator
-        Random generator for everything that differs between frames.
-    """
+    """Make a hard sky around an attitude: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun."""
     planets = tuple(
         PointSource(
             *direction_around(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES))

@@ -75,13 +75,7 @@ Answer = dict[str, Any]
 
 
 class ControlServer:
-    """Serves the control channel of a run.
-
-    Parameters
-    ----------
-    token
-        Token that each request must carry; empty for none.
-    """
+    """Serves the control channel of a run; each request must carry the token, unless it is empty."""
 
     def __init__(self, run: Run, quit_run: Callable[[], None], token: str = "") -> None:
         self._run = run

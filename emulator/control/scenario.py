@@ -88,16 +88,9 @@ class Scenario(Strict):
     """Events, in any order."""
 
     def enter(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> None:
-        """Schedule all events; their files are read and checked now.
+        """Schedule all events, relative to a simulation time in seconds; their files are read and checked now.
 
-        Parameters
-        ----------
-        head
-            The head that the faults affect; its links are open.
-        truth
-            The truth of the run; None if another head sets it.
-        start_s
-            Simulation time to which the times of the events are added, seconds.
+        The faults affect a head whose links are open. The truth is that of the run; None if another head sets it.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             at_s = start_s + event.run_time_s

@@ -78,13 +78,7 @@ class Modes:
         self._on_change = on_change
 
     def allows(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Return whether a mode can be commanded.
-
-        Parameters
-        ----------
-        has_attitude
-            Whether there is an attitude from which tracking can start.
-        """
+        """Return whether a mode can be commanded; tracking needs an attitude to start from."""
         return wanted in COMMANDED[self.mode] and (wanted is not Mode.TRACKING or has_attitude)
 
     def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
@@ -110,14 +104,7 @@ class Modes:
     def solved(self, *, valid: bool, tracked: bool, tracking_enabled: bool) -> None:
         """Change the mode according to the result of an exposure.
 
-        Parameters
-        ----------
-        valid
-            Whether the attitude is valid.
-        tracked
-            Whether it was solved from a prediction, not lost in space.
-        tracking_enabled
-            Whether the configuration enables tracking.
+        An attitude was `tracked` if it was solved from a prediction, not lost in space.
         """
         if self.mode is Mode.LOST_IN_SPACE and valid and tracking_enabled:
             self._enter(Mode.TRACKING, Cause.ATTITUDE_FOUND)

@@ -17,10 +17,7 @@ ParameterValue = bool | int | float | str
 def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> NDArray[np.float64] | None:
     """Return the velocity (3,) that the device assumes, relative to the barycentre, ICRS, m/s.
 
-    Returns
-    -------
-    ndarray (3,) or None
-        None if the device does not correct aberration.
+    It is None if the device does not correct aberration.
     """
     if not parameters.get("corrects_aberration", False):
         return None

@@ -75,12 +75,8 @@ def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...
 class Parameters(Mapping[str, ParameterValue]):
     """All parameters, each always within its limits.
 
-    Parameters
-    ----------
-    defaults
-        Defaults of this device that differ from the definition.
-    on_change
-        Called after each change with the names of the changed parameters.
+    `defaults` are those of this device that differ from the definition. `on_change` is called after each change with
+    the names of the changed parameters.
     """
 
     def __init__(
@@ -123,13 +119,7 @@ class Parameters(Mapping[str, ParameterValue]):
         return self._defaults[name]
 
     def set(self, changes: Mapping[str, Value]) -> None:
-        """Set parameters, all or none.
-
-        Raises
-        ------
-        MessageError
-            A value is outside its limits, or two values contradict each other.
-        """
+        """Set parameters, all or none; MessageError if a value is outside its limits, or two values contradict each other."""
         self._assign(self._checked(self._values, changes))
 
     def flip_bit(self, name: str, bit: int) -> bool:

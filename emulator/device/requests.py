@@ -73,13 +73,7 @@ class Requests:
             self.device.counters.count_fault(fault)
 
     def telemetry(self, name: str) -> bytes:
-        """Return the current data of a telemetry row.
-
-        Raises
-        ------
-        Refused
-            The row cannot be read now.
-        """
+        """Return the current data of a telemetry row; raises Refused if it cannot be read now."""
         try:
             return self.telemetry_bindings[name].encode(self.device)
         except Refused:

@@ -28,13 +28,7 @@ class Conditions:
 
 
 class Surroundings:
-    """The surroundings of a sensor.
-
-    Parameters
-    ----------
-    truth
-        Truth of the sensor; what it describes may change during a run.
-    """
+    """The surroundings of a sensor; what its truth describes may change during a run."""
 
     def __init__(
         self, profile: Profile, truth: TruthSource, thermal: ThermalModel, now_ns: Callable[[], int]

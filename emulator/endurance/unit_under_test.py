@@ -119,26 +119,11 @@ class _InternalErrors(logging.Handler):
 
 
 class UnitUnderTest:
-    """An emulated unit in memory.
+    """An emulated unit in memory, with the open links and the keys of a profile.
 
-    Parameters
-    ----------
-    icd
-        Definition of the unit.
-    unit
-        Its name or folder.
-    links
-        The links to open.
-    profile
-        Keys of the profile.
-    seed
-        Seed of the noise.
-    folder
-        Folder of the state, best in memory (tmpfs).
-    rendered
-        Whether images are rendered and solved, in a process; otherwise the pipeline is an error model.
-    record
-        Folder of a recording, which holds the time since power was last switched on.
+    The folder of its state is best in memory too (tmpfs). Images are `rendered` and solved in a process; otherwise
+    the pipeline is an error model. `record` is the folder of a recording of the time since power was last switched
+    on.
     """
 
     def __init__(
@@ -249,15 +234,7 @@ class UnitUnderTest:
         self.exposed_s += measurement.period_s
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
-        """Let simulation time pass, and the same time of the event loop.
-
-        Parameters
-        ----------
-        seconds
-            Time.
-        most
-            End early after about this many events in the unit.
-        """
+        """Let simulation time pass, and the same time of the event loop; end early after about `most` events in the unit."""
         stepper = self._stepper
         left, chunk, done = seconds, seconds if most is None else 1.0, 0
         while left > 0.0:

@@ -50,13 +50,7 @@ class Damage(Protocol[Item]):
 
 
 class WireFaults(Generic[Item]):
-    """The outgoing side of a link, with its faults; items stay in order.
-
-    Parameters
-    ----------
-    clock, scheduler
-        Clock and scheduler of the device; delays are in simulation time.
-    """
+    """The outgoing side of a link, with its faults; items stay in order. Delays are in simulation time."""
 
     def __init__(
         self,

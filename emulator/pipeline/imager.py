@@ -170,12 +170,7 @@ class ProcessImager(_RequestQueue):
     async def restart(self) -> PipelineReady:
         """Start another worker after one has ended, and wait until it is ready.
 
-        Raises
-        ------
-        EmulatorError
-            The start failed.
-        OSError
-            The process could not be created.
+        EmulatorError if the start failed, OSError if the process could not be created.
         """
         self._disconnect()
         await asyncio.get_running_loop().run_in_executor(None, self._worker.end)

@@ -117,12 +117,7 @@ class _Build:
 class StarIdentifiers:
     """Provides the star identifier for a setup, or the previous one while it is being built.
 
-    Parameters
-    ----------
-    make
-        Makes a star identifier.
-    in_background
-        Whether to build in a thread; otherwise `get` blocks until the build is done.
+    It is built in a thread if `in_background`; otherwise `get` blocks until that is done.
     """
 
     def __init__(self, make: Callable[[StarIdentifierSetup], StarIdentifier], *, in_background: bool) -> None:

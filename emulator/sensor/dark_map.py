@@ -35,20 +35,9 @@ class DarkMap:
 
 
 def measure_dark_map(sensor: SensorModel, height: int, width: int, frames: int, seed: int) -> DarkMap:
-    """Average exposures with the lens covered, at gain 1 and `reference_c`.
+    """Average exposures with the lens covered, at gain 1 and `reference_c`; the seed is that of their noise.
 
     The exposure, at most 1 s, is chosen so that the mean dark signal fills half of the converter's range.
-
-    Parameters
-    ----------
-    sensor : SensorModel
-        The sensor.
-    height, width : int
-        Size of the pixel array.
-    frames : int
-        Number of exposures.
-    seed : int
-        Seed of their noise.
     """
     unit = sensor.with_(gain=1.0, temperature_c=sensor.reference_c)
     exposure_s = min(_LONGEST_S, _HEADROOM * unit.adc_range_e / max(unit.dark_e_s, 1.0))

@@ -49,16 +49,9 @@ class Digitizer:
 
 
 def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
-    """Return the initial states of the generators of one frame.
+    """Return the initial states (4, LANES), uint32, of the generators of one frame.
 
-    Parameters
-    ----------
-    seed, frame_index : int
-        Non-negative; every pair gives streams independent of all others (`numpy.random.SeedSequence`).
-
-    Returns
-    -------
-    ndarray, shape (4, LANES), uint32
+    Every pair of seed and index, not negative, gives streams independent of all others (`numpy.random.SeedSequence`).
     """
     bits = np.random.Philox(np.random.SeedSequence((seed, frame_index))).random_raw(2 * LANES)
     return np.frombuffer(bits.tobytes(), dtype=np.uint32).reshape(4, LANES).copy()
@@ -211,21 +204,10 @@ def _digitize_kernel(
 def digitize(
     expected_e: npt.NDArray[np.float32], digitizer: Digitizer, seed: int, frame_index: int
 ) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Convert mean electrons to the counts of an image, with noise.
+    """Convert mean electrons (h, w), float32, not negative, to the counts (h, w) of an image, with noise.
 
-    Parameters
-    ----------
-    expected_e : ndarray (h, w), float32
-        Mean electrons of every pixel: star light, sky, dark current; not negative.
-    digitizer : Digitizer
-        Noise of the pixels, and converter.
-    seed, frame_index : int
-        Determine the noise; the same pair and input give the same bytes.
-
-    Returns
-    -------
-    ndarray (h, w)
-        uint8 for converters of up to 8 bits, else uint16.
+    The counts are uint8 for converters of up to 8 bits, else uint16. Seed and index determine the noise; the same
+    pair and input give the same bytes.
     """
     rounding_e = digitizer.gain_e_per_dn / math.sqrt(12.0)
     few = FEW_ELECTRONS if math.hypot(digitizer.read_noise_e, rounding_e) < QUIET_NOISE_E else -1.0

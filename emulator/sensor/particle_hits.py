@@ -17,15 +17,10 @@ _STREAK_SPREAD: Final = 0.6
 def add_cosmic_rays(
     mean_e: npt.NDArray[np.float32], count: int, rng: np.random.Generator
 ) -> npt.NDArray[np.float64]:
-    """Add the charge of particles to an image, in place.
+    """Add the charge of particles to an image, in place; return x, y of both ends of each streak (count, 4), pixels.
 
-    Each particle leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with
-    about 900 electrons per pixel, log-normally distributed along the streak.
-
-    Returns
-    -------
-    ndarray (count, 4)
-        x, y of both ends of each streak, pixels.
+    Each particle leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with about
+    900 electrons per pixel, log-normally distributed along the streak.
     """
     height, width = mean_e.shape
     ends = np.empty((count, 4))

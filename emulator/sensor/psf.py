@@ -32,21 +32,11 @@ def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
 
 
 def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the quadrature rule that sums a moving spot to a smooth trail.
+    """Return the quadrature rule that sums a spot, moving along a path of up to `longest_px` pixels, to a smooth trail.
 
-    Parameters
-    ----------
-    longest_px : float
-        Longest path of any star during the exposure, pixels.
-    sigma_px : float
-        Standard deviation of the spot.
-
-    Returns
-    -------
-    nodes, weights : ndarray (n,)
-        Times from −1 (start of the exposure) to 1 (its end), and weights that sum to 1. A path below a
-        thousandth of the spot width gets one node. Otherwise nodes are closer than the sigma of the spot;
-        Gauss–Legendre quadrature of a Gaussian is then accurate to about 1e-5 of its peak.
+    It has nodes (n,), times from −1 (start of the exposure) to 1 (its end), and weights (n,) that sum to 1. A path
+    below a thousandth of the spot width gets one node. Otherwise nodes are closer than the sigma of the spot;
+    Gauss–Legendre quadrature of a Gaussian is then accurate to about 1e-5 of its peak.
     """
     lengths = longest_px / sigma_px
     if lengths < _STILL_SIGMA:
@@ -77,21 +67,12 @@ def add_spots(
     nodes: npt.NDArray[np.float64],
     weights: npt.NDArray[np.float64],
 ) -> None:
-    """Add the light of stars to an image of mean electrons, in place.
+    """Add the light of stars to an image (h, w) of mean electrons, in place.
 
-    Parameters
-    ----------
-    image, sensitivity : ndarray (h, w), float32
-        Mean electrons, to which the light is added, and relative signal of each pixel.
-    path : ndarray (n, 6)
-        x0, y0, x1, y1, x2, y2, pixels: at time t, −1…1 over the exposure, x = x0 + x1·t + x2·t², and the same
-        for y.
-    electrons : ndarray (n,)
-        Mean electrons of each star in the whole exposure.
-    sigma : ndarray (n, 2)
-        Standard deviation of each star's spot along x and y, pixels.
-    nodes, weights : ndarray (m,)
-        From `path_rule`.
+    A path (n, 6) is x0, y0, x1, y1, x2, y2, pixels: at time t, −1…1 over the exposure, x = x0 + x1·t + x2·t², and the
+    same for y. `electrons` (n,) is the mean of each star in the whole exposure, `sigma` (n, 2) the standard deviation
+    of its spot along x and y, pixels. Sensitivity (h, w) is the relative signal of each pixel; nodes and weights are
+    from `path_rule`.
     """
     height, width = image.shape
     across = np.empty(width)

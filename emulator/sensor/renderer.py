@@ -111,21 +111,9 @@ def frame_without_truth(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], f
 class Renderer:
     """Renders exposures for one camera, catalogue and sensor, and caches what they share.
 
-    An image depends only on the arguments and on (seed, frame_index), not on earlier images.
-
-    Parameters
-    ----------
-    camera : Camera
-        Projection and image size.
-    catalog : StarCatalog
-        The stars. Those fainter than the sensor's limiting magnitude are omitted, except unresolved companions
-        of brighter stars.
-    sensor : SensorModel
-        Optics and detector.
-    seed : int
-        Seed of the run, not negative.
-    objects : SkyObjects, optional
-        Default sky objects of all exposures.
+    An image depends only on the arguments and on (seed, frame_index), not on earlier images. Stars fainter than the
+    sensor's limiting magnitude are omitted, except unresolved companions of brighter stars. `objects` are the default
+    of all exposures.
     """
 
     def __init__(
@@ -195,24 +183,11 @@ class Renderer:
         objects: SkyObjects | None = None,
         observer: Observer | None = None,
     ) -> Frame:
-        """Render one exposure.
+        """Render one exposure at the attitude of its middle and a constant body rate (3,), sensor frame, rad/s.
 
-        Parameters
-        ----------
-        attitude : Attitude
-            Attitude at mid-exposure.
-        rate_rad_s : array (3,)
-            Body rate, sensor frame, rad/s; constant over the exposure.
-        frame_index : int
-            Number of the frame in the run; determines the noise together with the seed.
-        exposure_s : float, optional
-            Exposure instead of the sensor's, seconds.
-        temperature_c : float, optional
-            Temperature of detector and lens instead of the sensor's, °C.
-        objects : SkyObjects, optional
-            Sky objects instead of the renderer's default.
-        observer : Observer, optional
-            Whose place and motion give the stars parallax and aberration; by default they have neither.
+        The number of the frame determines the noise, together with the seed. Exposure, seconds, temperature of
+        detector and lens, °C, and sky objects are by default those of the sensor and the renderer. The place and
+        motion of an observer give the stars parallax and aberration.
         """
         given = {"exposure_s": exposure_s, "temperature_c": temperature_c}
         sensor = self.sensor.with_(**{name: value for name, value in given.items() if value is not None})

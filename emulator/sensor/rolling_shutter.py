@@ -20,23 +20,10 @@ def at_row_times(
     rate_rad_s: npt.NDArray[np.float64],
     row_time_s: float,
 ) -> npt.NDArray[np.float64]:
-    """Return directions at the exposure times of the rows on which they fall.
+    """Return directions (n, 3) in the sensor frame at the times of the rows on which they fall.
 
-    Parameters
-    ----------
-    vectors : ndarray (n, 3)
-        Directions in the sensor frame at the time of the middle row.
-    camera : Camera
-        The camera.
-    rate_rad_s : ndarray (3,)
-        Body rate, sensor frame.
-    row_time_s : float
-        Time from row to row, seconds.
-
-    Returns
-    -------
-    ndarray (n, 3)
-        The same directions in the sensor frame at the time of their rows.
+    They are given at the time of the middle row; the body rate (3,) is in the sensor frame, and rows are `row_time_s`
+    seconds apart.
     """
     if row_time_s == 0.0 or not np.any(rate_rad_s):
         return vectors
@@ -52,21 +39,9 @@ def at_row_times(
 def turned(
     vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Return directions in the frame of a rotating sensor, each at its own time.
+    """Return directions (n, 3) in the frame of a rotating sensor, each at its own time (n,), seconds, from those at time 0.
 
-    Parameters
-    ----------
-    vectors : ndarray (n, 3)
-        Directions in the sensor frame at time 0.
-    rate_rad_s : ndarray (3,)
-        Body rate, sensor frame.
-    times_s : ndarray (n,)
-        Time of each direction, seconds; may be negative.
-
-    Returns
-    -------
-    ndarray (n, 3)
-        The directions, rotated as by ``Attitude.rotated(rate * time)``.
+    They are rotated as by ``Attitude.rotated(rate * time)``; the body rate (3,) is in the sensor frame.
     """
     speed = math.sqrt(float(rate_rad_s @ rate_rad_s))
     axis = rate_rad_s / speed

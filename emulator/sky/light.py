@@ -179,14 +179,8 @@ def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
 class AreaPainter:
     """Paints the extended objects of a sky for one camera; caches the directions of its pixels.
 
-    Parameters
-    ----------
-    camera : Camera
-        Directions of the pixels.
-    zero_magnitude_e_s : float
-        Electrons/s from a source of magnitude 0.
-    psf_sigma_px : float
-        Standard deviation of the spot that blurs edges, pixels.
+    A source of magnitude 0 has `zero_magnitude_e_s` electrons/s. A spot of standard deviation `psf_sigma_px` blurs
+    edges.
     """
 
     def __init__(self, camera: Camera, zero_magnitude_e_s: float, psf_sigma_px: float) -> None:

@@ -194,20 +194,12 @@ def add_earth(
     angles: tuple[float, float],
     brightness: float,
 ) -> None:
-    """Put the Earth in front of light and sky, in place.
+    """Put the Earth in front of light and sky, `light` and `passed` (h, w) of a `Patch`, in place.
 
-    Parameters
-    ----------
-    electrons_s, transmission : ndarray (h, w), float32
-        `light` and `passed` of a `Patch`.
-    directions : ndarray (3, h, w), float32
-        Of the pixels, sensor frame.
-    nadir, sun : ndarray (3,)
-        To the Earth's centre and to the Sun, sensor frame; zeros instead of the Sun light all of the disc.
-    angles : (float, float)
-        Angular radius of the disc, and height over which its limb fades, radians.
-    brightness : float
-        Electrons/s per pixel where the Sun is in the zenith.
+    `directions` (3, h, w) are those of the pixels, `nadir` and `sun` (3,) those to the Earth's centre and to the Sun,
+    all in the sensor frame; zeros instead of the Sun light all of the disc. `angles` are the angular radius of the
+    disc, and the height over which its limb fades, radians. `brightness` is electrons/s per pixel where the Sun is in
+    the zenith.
     """
     radius, atmosphere = angles
     distance = 1.0 / math.sin(radius)

@@ -39,10 +39,7 @@ class _Datagrams(asyncio.DatagramProtocol):
 class LiveFeed:
     """The socket between a dynamics simulator and a `LiveTruth`.
 
-    Parameters
-    ----------
-    step
-        Advances the simulation clock, for lock-step; None if time passes by itself.
+    `step` advances the simulation clock, for lock-step; None if time passes by itself.
     """
 
     def __init__(

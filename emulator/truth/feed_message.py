@@ -72,13 +72,7 @@ class FeedFormat(Protocol):
         """Longest accepted message, bytes."""
 
     def decode(self, data: bytes | str) -> FeedMessage:
-        """Decode one message.
-
-        Raises
-        ------
-        FeedError
-            The message is invalid; the text names the key.
-        """
+        """Decode one message; FeedError names the key that is invalid."""
 
     def answer(self, run_time_s: float, fault: str) -> bytes:
         """Return the answer to a message; `fault` is empty if it was accepted."""
@@ -136,13 +130,7 @@ class JsonFormat:
 
 
 def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) -> Attitude:
-    """Return the attitude of a scalar-last quaternion (4,).
-
-    Raises
-    ------
-    FeedError
-        The quaternion is not of length 1.
-    """
+    """Return the attitude of a scalar-last quaternion (4,); FeedError if it is not of length 1."""
     if not abs(float(np.linalg.norm(quaternion_xyzw)) - 1.0) <= NORM_TOLERANCE:
         raise FeedError(f"{key} is not of length 1")
     if convention == "attitude":
@@ -151,13 +139,7 @@ def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) 
 
 
 def checked_rate(key: str, rate_rad_s: Vector | None) -> Vector | None:
-    """Return a body rate in rad/s.
-
-    Raises
-    ------
-    FeedError
-        The rate is above `MAX_RATE_DEG_S`.
-    """
+    """Return a body rate in rad/s; FeedError if it is above `MAX_RATE_DEG_S`."""
     if rate_rad_s is not None and not np.degrees(np.abs(rate_rad_s).max()) <= MAX_RATE_DEG_S * (1.0 + 1e-12):
         raise FeedError(f"{key} exceeds {MAX_RATE_DEG_S:g} degrees per second")
     return rate_rad_s

@@ -48,17 +48,11 @@ RESTART_S: Final = 1.0
 
 
 class LiveTruth:
-    """Truth from the messages of a live feed.
+    """Truth from the messages of a live feed, by default JSON lines.
 
-    Parameters
-    ----------
-    stale_s
-        Silence, in seconds of simulation time, after which the attitude is held and flagged stale.
-    timeline
-        `anchor`: the first message sets the offset of the sender's clock; `run`: the sender uses simulation
-        time.
-    message_format
-        Format of messages; default: JSON lines.
+    After `stale_s` seconds of silence in simulation time the attitude is held and flagged stale. `timeline` is as in
+    the profile: with `anchor` the first message sets the offset of the sender's clock, with `run` it uses simulation
+    time.
     """
 
     def __init__(

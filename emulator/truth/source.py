@@ -194,15 +194,9 @@ def _slew_angle_and_rate(
 
 
 class SlewTruth:
-    """A sequence of holds, constant rates and slews.
+    """A sequence of holds, constant rates and slews, at rest before the simulation time `start_s`.
 
-    Parameters
-    ----------
-    start_s
-        Simulation time at which the first segment begins; at rest before this.
-    repeat
-        Whether to restart from the initial attitude after the last segment; otherwise the final attitude is
-        held.
+    After the last segment it restarts from the initial attitude (`repeat`), or the final attitude is held.
     """
 
     kind: Final = "slew"

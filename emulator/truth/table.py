@@ -85,15 +85,7 @@ class FileTruth:
 
 
 class OrbitTable:
-    """Positions and velocities, interpolated between dates.
-
-    Parameters
-    ----------
-    source
-        File of the rows, for messages.
-    times_unix_s
-        Unix times (n,) of the rows, increasing.
-    """
+    """Positions and velocities of a file, interpolated between the increasing Unix times (n,) of its rows."""
 
     def __init__(
         self, source: object, times_unix_s: NDArray[np.float64], states: Sequence[OrbitState]

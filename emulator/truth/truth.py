@@ -50,14 +50,9 @@ class TruthHost:
 
 
 class Truth:
-    """The truth of the body on which the heads of a run are mounted.
+    """The truth of the body on which the heads of a run are mounted, which `open` builds from its configuration.
 
-    Parameters
-    ----------
-    config
-        The configured truth; `open` builds it.
-    folder
-        Folder to which relative paths of truth files refer.
+    Relative paths of truth files refer to `folder`.
     """
 
     def __init__(self, config: TruthConfig, folder: Path, host: TruthHost) -> None:
@@ -81,13 +76,7 @@ class Truth:
         self.put(*await self._load(self.configured, None))
 
     async def set(self, config: TruthConfig, at_s: float | None = None) -> None:
-        """Replace the truth.
-
-        Parameters
-        ----------
-        at_s
-            Simulation time at which its motion begins, as in a recorded run; by default now.
-        """
+        """Replace the truth; its motion begins now, or at a simulation time, as in a recorded run."""
         loaded = await self._load(config, at_s)
         start_s = getattr(loaded[0], "start_s", self._host.now_s())
         self._host.record("truth", config=config.model_dump(mode="json"), start_s=start_s)
@@ -160,10 +149,7 @@ class Truth:
 class SensorTruth:
     """The truth of a sensor that is mounted on the body.
 
-    Parameters
-    ----------
-    mount
-        Rotation body→sensor, unless the truth's configuration has one; None: the frames are the same.
+    `mount` is the rotation body→sensor, unless the truth's configuration has one; None: the frames are the same.
     """
 
     def __init__(self, body: Truth, mount: Attitude | None) -> None:
