@@ -22,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
+from starid.arrays import Array
 from starid.attitude import Attitude, random_attitude
 from starid.result_store import Results, ResultStore
 
@@ -326,7 +327,7 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     def of_valid(name: str, percent: float) -> float | None:
         return float(np.percentile(valid[name], percent)) if len(valid) else None
 
-    def median(values: npt.NDArray[np.float64]) -> float:
+    def median(values: Array) -> float:
         return float(np.median(values))
 
     figures: dict[str, Any] = {

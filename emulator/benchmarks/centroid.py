@@ -16,18 +16,16 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Frame, Renderer, SensorModel
+from starid.arrays import Array
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.files import write_atomically
 from starid.imaging.centroid import star_model
 from starid.imaging.detection import Detections, detect
-
-Array = npt.NDArray[np.float64]
 
 EDGES_V: Final = (-2.0, 2.0, 3.0, 4.0, 4.5, 5.0, 5.5, 6.0)
 """Limits of the magnitude bins."""

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
+from starid.arrays import Array, Indices
 
 SIGNIFICANCE: Final = 1e-3
 """Probability of reporting an influence that is not present."""
@@ -31,8 +31,8 @@ BIAS: Final = "bias"
 THERMO_ELASTIC: Final = "thermo-elastic error"
 ABERRATION: Final = "aberration residual"
 
-Vectors = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
+Vectors = Array
+Labels = Indices
 
 
 @dataclass(frozen=True)

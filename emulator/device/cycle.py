@@ -17,7 +17,6 @@ from functools import partial
 from typing import Any, Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.measurement import Measurement
@@ -41,6 +40,7 @@ from starhil.emulator.pipeline.messages import (
 )
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import TruthState
+from starid.arrays import Array
 from starid.attitude import Attitude, propagate
 
 log = logging.getLogger("starhil.device")
@@ -230,7 +230,7 @@ class FrameCycle:
         self._scheduler.at(ready_ns, self._until_stopped(partial(self._schedule_publication, frame)))
         self._signals.exposed.emit(frame.index)
 
-    def _assumed_velocity(self, mid_ns: int) -> NDArray[np.float64] | None:
+    def _assumed_velocity(self, mid_ns: int) -> Array | None:
         """Return the velocity with which the device corrects aberration; None if the sky has none."""
         velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
         if velocity is None or self._surroundings.has_aberration:
@@ -251,7 +251,7 @@ class FrameCycle:
         truth: TruthState,
         exposure_s: float,
         predicted: Attitude | None,
-        velocity: NDArray[np.float64] | None,
+        velocity: Array | None,
         *,
         solve: bool = True,
     ) -> FrameRequest:

@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
 from starhil.emulator.truth.orbit import EARTH_RADIUS_M, KeplerOrbit
+from starid.arrays import Array
 from starid.earth import earth_velocity
 
 ParameterValue = bool | int | float | str
 
 
-def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> NDArray[np.float64] | None:
+def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> Array | None:
     """Return the velocity (3,) that the device assumes, relative to the barycentre, ICRS, m/s.
 
     It is None if the device does not correct aberration.

@@ -6,10 +6,8 @@ import struct
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from starhil.emulator.truth.source import TruthState
+from starid.arrays import Array
 from starid.attitude import Attitude
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -25,7 +23,7 @@ def as_quaternion(attitude: Attitude) -> Quaternion:
     return (x, y, z, w)
 
 
-def as_triple(vector: NDArray[np.float64]) -> Triple:
+def as_triple(vector: Array) -> Triple:
     """Return a vector (3,) as Python floats."""
     x, y, z = vector.tolist()
     return (x, y, z)
@@ -131,7 +129,7 @@ class FrameRequest:
     """Particles per second that hit the detector, in addition to the sky's particles."""
     upsets: tuple[CatalogUpset, ...] = ()
     """Bits flipped by radiation in the unit's star catalogue."""
-    observer_velocity: NDArray[np.float64] | None = None
+    observer_velocity: Array | None = None
     """Velocity (3,) of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct aberration;
     None: no correction."""
     preview: bool = False

@@ -41,6 +41,7 @@ from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.aberration import aberrated
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
@@ -304,7 +305,7 @@ class Pipeline:
         sensor: SensorModel,
         found: Detections,
         solution: Solution,
-        modelled: NDArray[np.float64],
+        modelled: Array,
         times: tuple[float, float, float, float],
     ) -> FrameResult:
         begin, rendered, detected, solved = times
@@ -362,9 +363,7 @@ class Pipeline:
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
 
 
-def _within_margin(
-    identifier: StarIdentifier, solution: Solution, xy: NDArray[np.float64], request: FrameRequest
-) -> int:
+def _within_margin(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> int:
     """Count the matched stars within the validation margin of their expected position."""
     icrs = identifier.catalog.vectors[solution.catalog_index]
     if request.observer_velocity is not None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import Preview
@@ -16,6 +15,7 @@ from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame
 from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.objects import Obstruction, SkyObjects
+from starid.arrays import GreyImage
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.imaging.detection import Detections
@@ -115,9 +115,7 @@ def make_overlay(
     )
 
 
-def compress(
-    image: NDArray[np.uint8] | NDArray[np.uint16], background: float, noise: float, bits: int
-) -> bytes:
+def compress(image: GreyImage, background: float, noise: float, bits: int) -> bytes:
     """Compress an image (h, w) as JPEG, on a scale linear for faint and logarithmic for bright pixels."""
     import cv2
 

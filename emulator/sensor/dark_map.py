@@ -11,6 +11,7 @@ import numpy.typing as npt
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.noise import digitize
+from starid.arrays import Array32
 from starid.imaging.dark_frame import dark_excess, without_dark
 
 _HEADROOM: Final = 0.5
@@ -23,7 +24,7 @@ class DarkMap:
 
     sensor: SensorModel
     """The sensor."""
-    rate_dn_s: npt.NDArray[np.float32]
+    rate_dn_s: Array32
     """Counts/s at gain 1 and the sensor's `reference_c`, (h, w), float32."""
 
     def subtracted(

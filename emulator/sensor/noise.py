@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array32, GreyImage
 from starid.jit import compiled_ieee, inner
 
 LANES: Final = 512
@@ -85,8 +86,8 @@ def fill_normal(
     state: npt.NDArray[np.uint32],
     bits_a: npt.NDArray[np.uint32],
     bits_b: npt.NDArray[np.uint32],
-    uniform: npt.NDArray[np.float32],
-    normal: npt.NDArray[np.float32],
+    uniform: Array32,
+    normal: Array32,
 ) -> None:
     """Fill `normal` (2·LANES,) with standard normal deviates.
 
@@ -151,11 +152,11 @@ def fill_normal(
 
 @compiled_ieee
 def _digitize_kernel(
-    expected: npt.NDArray[np.float32],
+    expected: Array32,
     state: npt.NDArray[np.uint32],
     generator: np.random.Generator,
     levels: tuple[float, float, float, float, float, float, float],
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    counts: GreyImage,
 ) -> None:
     """Convert mean electrons (n,) to counts (n,); `levels` as in `digitize`."""
     read_noise, full_well, gain_e_per_dn, offset_dn, max_dn, few, near_full = levels
@@ -201,9 +202,7 @@ def _digitize_kernel(
             out[i] = np.int32(min(max(value, zero), top))
 
 
-def digitize(
-    expected_e: npt.NDArray[np.float32], digitizer: Digitizer, seed: int, frame_index: int
-) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
+def digitize(expected_e: Array32, digitizer: Digitizer, seed: int, frame_index: int) -> GreyImage:
     """Convert mean electrons (h, w), float32, not negative, to the counts (h, w) of an image, with noise.
 
     The counts are uint8 for converters of up to 8 bits, else uint16. Seed and index determine the noise; the same

@@ -22,6 +22,7 @@ from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.light_grid import Backdrop
 from starhil.emulator.sky.objects import PointSource, SkyObjects
+from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, companions
@@ -50,17 +51,17 @@ _CONE_MARGIN_RAD: Final = math.radians(1.0)
 class StarTruth:
     """Catalogue stars in an image, including companions beyond the limiting magnitude, brightest first."""
 
-    hip: npt.NDArray[np.int32]
+    hip: Indices32
     """Hipparcos numbers, (n,), int32."""
-    catalog_index: npt.NDArray[np.int64]
+    catalog_index: Indices
     """Rows of the renderer's catalogue, (n,), int64."""
-    xy_px: npt.NDArray[np.float64]
+    xy_px: Array
     """Position at mid-exposure, pixels, (n, 2)."""
-    electrons: npt.NDArray[np.float64]
+    electrons: Array
     """Mean electrons of the star in the exposure, (n,)."""
-    magnitude: npt.NDArray[np.float64]
+    magnitude: Array
     """V magnitude, (n,)."""
-    visible: npt.NDArray[np.bool_]
+    visible: Mask
     """False for hidden or omitted stars, (n,) of bool."""
 
 
@@ -68,11 +69,11 @@ class StarTruth:
 class ObjectTruth:
     """Other objects in an image."""
 
-    false_xy_px: npt.NDArray[np.float64]
+    false_xy_px: Array
     """Positions of the false stars, the fixed ones first, (n, 2)."""
-    planet_xy_px: npt.NDArray[np.float64]
+    planet_xy_px: Array
     """Positions of the planets in the order of `SkyObjects.planets`, (m, 2); NaN outside the image."""
-    cosmic_rays_px: npt.NDArray[np.float64]
+    cosmic_rays_px: Array
     """x, y of both ends of each streak, (k, 4)."""
     covered_share: float
     """Fraction of the image that receives less than half of the sky's light."""
@@ -82,7 +83,7 @@ class ObjectTruth:
 class Frame:
     """One exposure and its truth."""
 
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    image: GreyImage
     """Counts, (h, w), uint8 or uint16."""
     stars: StarTruth
     """Catalogue stars in the image."""
@@ -99,7 +100,7 @@ class Frame:
     """Other objects in the image, if the sky has any."""
 
 
-def frame_without_truth(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], frame_index: int) -> Frame:
+def frame_without_truth(image: GreyImage, frame_index: int) -> Frame:
     """Return the frame of an image (h, w) that was not rendered: it has no stars, and its attitude is the identity."""
     none = np.zeros(0)
     stars = StarTruth(
@@ -161,7 +162,7 @@ class Renderer:
         roots = np.sqrt(np.maximum(self._pattern.dark_e_s, 0.0)) / np.float32(step)
         return np.rint(roots).astype(np.uint16), step**2
 
-    def sensor_magnitudes(self) -> npt.NDArray[np.float64]:
+    def sensor_magnitudes(self) -> Array:
         """Magnitudes (n,) of all catalogue stars in the sensor's band."""
         colour = np.nan_to_num(self.catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
         return np.asarray(self.catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
@@ -234,9 +235,9 @@ class Renderer:
 
     def _add_objects(
         self,
-        mean: npt.NDArray[np.float32],
+        mean: Array32,
         objects: SkyObjects,
-        planet_xy: npt.NDArray[np.float64],
+        planet_xy: Array,
         exposure_s: float,
         index: int,
         area: AreaLight | None,
@@ -249,11 +250,11 @@ class Renderer:
 
     def _add_false_stars(
         self,
-        mean: npt.NDArray[np.float32],
+        mean: Array32,
         objects: SkyObjects,
         rng: np.random.Generator,
         exposure_s: float,
-    ) -> npt.NDArray[np.float64]:
+    ) -> Array:
         """Add false stars at random positions; return the positions (n, 2)."""
         if not objects.false_stars + objects.fixed_false_stars:
             return np.zeros((0, 2))
@@ -268,7 +269,7 @@ class Renderer:
         self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * 10.0 ** (-0.4 * magnitudes))
         return xy
 
-    def trails(self, frame: Frame) -> npt.NDArray[np.float64]:
+    def trails(self, frame: Frame) -> Array:
         """Return the displacements (n, 2) of a frame's stars during its exposure, pixels."""
         icrs = self.catalog.vectors[frame.stars.catalog_index]
         half = 0.5 * frame.exposure_s * np.array(frame.rate_rad_s)
@@ -281,9 +282,7 @@ class Renderer:
         drift = boresight_drift_rad(self.sensor, temperature_c)
         return attitude.rotated(drift) if np.any(drift) else attitude
 
-    def _mean_without_stars(
-        self, exposure_s: float, temperature_c: float, area: AreaLight | None
-    ) -> npt.NDArray[np.float32]:
+    def _mean_without_stars(self, exposure_s: float, temperature_c: float, area: AreaLight | None) -> Array32:
         """Return the mean electrons (h, w) of sky, dark current and extended objects, in a buffer that is reused."""
         if self._still_conditions != (exposure_s, temperature_c):
             factor = np.float32(self.sensor.dark_factor(temperature_c))
@@ -312,11 +311,11 @@ class Renderer:
     def _paths(
         self,
         attitude: Attitude,
-        rate: npt.NDArray[np.float64],
+        rate: Array,
         exposure_s: float,
         observer: Observer | None,
         planets: tuple[PointSource, ...],
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    ) -> tuple[Array, Indices, Mask]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars and planets whose light may reach the image.
 
         A path is the parabola through the projections at the start, middle and end of the exposure. The numbers of planets
@@ -335,11 +334,11 @@ class Renderer:
 
     def _near(
         self,
-        vectors: npt.NDArray[np.float64],
+        vectors: Array,
         attitude: Attitude,
-        rate: npt.NDArray[np.float64],
+        rate: Array,
         exposure_s: float,
-    ) -> npt.NDArray[np.int64]:
+    ) -> Indices:
         """Return the numbers of the directions (n, 3) in the cone around the field that the exposure sweeps."""
         readout_s = self.camera.height * self.sensor.row_time_s
         sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
@@ -348,15 +347,15 @@ class Renderer:
 
     def _path_of(
         self,
-        icrs: npt.NDArray[np.float64],
+        icrs: Array,
         attitude: Attitude,
-        rate: npt.NDArray[np.float64],
+        rate: Array,
         exposure_s: float,
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    ) -> tuple[Array, Mask, Mask]:
         """Return paths (n, 6) of directions (n, 3), and masks of those centred inside and touching the image."""
         camera, row_time_s = self._optics, self.sensor.row_time_s
 
-        def positions(turn: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        def positions(turn: Array) -> tuple[Array, Mask]:
             seen = (attitude.rotated(turn) if np.any(turn) else attitude).to_sensor(icrs)
             return camera.project(at_row_times(seen, camera, rate, row_time_s))
 
@@ -378,9 +377,9 @@ class Renderer:
 
     def _add_light(
         self,
-        mean: npt.NDArray[np.float32],
-        path: npt.NDArray[np.float64],
-        electrons: npt.NDArray[np.float64],
+        mean: Array32,
+        path: Array,
+        electrons: Array,
     ) -> None:
         """Add stars to the mean electrons, each with the spot width of its position."""
         base = self.sensor.psf_sigma_px
@@ -414,7 +413,7 @@ def _whole_number(name: str, value: int) -> int:
     return int(value)
 
 
-def _rate(value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def _rate(value: npt.ArrayLike) -> Array:
     """Check a body rate."""
     rate = np.asarray(value, dtype=np.float64)
     if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MAX_RATE_RAD_S:

@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array
 from starid.camera import Camera
 
 _ROUNDS: Final = 3
@@ -15,11 +15,11 @@ _ROUNDS: Final = 3
 
 
 def at_row_times(
-    vectors: npt.NDArray[np.float64],
+    vectors: Array,
     camera: Camera,
-    rate_rad_s: npt.NDArray[np.float64],
+    rate_rad_s: Array,
     row_time_s: float,
-) -> npt.NDArray[np.float64]:
+) -> Array:
     """Return directions (n, 3) in the sensor frame at the times of the rows on which they fall.
 
     They are given at the time of the middle row; the body rate (3,) is in the sensor frame, and rows are `row_time_s`
@@ -36,9 +36,7 @@ def at_row_times(
     return seen
 
 
-def turned(
-    vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+def turned(vectors: Array, rate_rad_s: Array, times_s: Array) -> Array:
     """Return directions (n, 3) in the frame of a rotating sensor, each at its own time (n,), seconds, from those at time 0.
 
     They are rotated as by ``Attitude.rotated(rate * time)``; the body rate (3,) is in the sensor frame.
@@ -48,7 +46,5 @@ def turned(
     angles = -speed * times_s[:, None]  # the sky turns in the opposite direction to the sensor
     along = (vectors @ axis)[:, None] * axis
     across = vectors - along
-    result: npt.NDArray[np.float64] = (
-        along + np.cos(angles) * across + np.sin(angles) * np.cross(axis, vectors)
-    )
+    result: Array = along + np.cos(angles) * across + np.sin(angles) * np.cross(axis, vectors)
     return result

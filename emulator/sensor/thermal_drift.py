@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.sensor.model import SensorModel
+from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
 
@@ -26,7 +26,7 @@ def drifted_camera(camera: Camera, sensor: SensorModel, temperature_c: float) ->
     )
 
 
-def boresight_drift_rad(sensor: SensorModel, temperature_c: float) -> npt.NDArray[np.float64]:
+def boresight_drift_rad(sensor: SensorModel, temperature_c: float) -> Array:
     """Return the rotation vector (3,) of the optics relative to the mounting, radians, sensor frame."""
     drift = np.array([sensor.boresight_drift_x, sensor.boresight_drift_y, sensor.boresight_drift_z])
     return np.asarray(drift * ((temperature_c - sensor.reference_c) / ARCSEC_PER_RAD))

@@ -7,14 +7,14 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array
 from starid.camera import Camera
 
 _BORDER_SAMPLES: Final = 33
 
 
-def disc_in_field(centre: npt.NDArray[np.float64], radius_rad: float, camera: Camera) -> bool:
+def disc_in_field(centre: Array, radius_rad: float, camera: Camera) -> bool:
     """Return whether any part of a disc around a direction (3,) of the sensor frame is in the field."""
     if math.acos(max(min(float(centre[2]), 1.0), -1.0)) > camera.field_radius_rad + radius_rad:
         return False
@@ -25,7 +25,7 @@ def disc_in_field(centre: npt.NDArray[np.float64], radius_rad: float, camera: Ca
 
 
 @lru_cache(maxsize=4)
-def _border_of(camera: Camera) -> npt.NDArray[np.float64]:
+def _border_of(camera: Camera) -> Array:
     """Directions (n, 3) of the outer edge of the pixel array, where it sees any."""
     border = camera.back_project(camera.border(_BORDER_SAMPLES))
     return border[~np.isnan(border).any(axis=1)]

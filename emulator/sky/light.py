@@ -9,7 +9,6 @@ from functools import cached_property
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Line, fill
@@ -28,6 +27,7 @@ from starhil.emulator.sky.light_kernels import (
 )
 from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import Camera
 
@@ -65,7 +65,7 @@ class Patch:
     hides_glare: bool = True
     """Whether it is in front of the light scattered in the lens too."""
 
-    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
         return transmission_at(self.passed, self.box, xy_px)
 
@@ -94,7 +94,7 @@ class AreaLight:
     flooded: bool = False
     """Light passes the baffle and saturates the image; the rest is then empty."""
 
-    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) at positions (n, 2); outside the image that of its edge."""
         seen = np.full(len(xy_px), 0.0 if self.flooded else 1.0)
         if self._layers:
@@ -155,7 +155,7 @@ def through_baffle(objects: SkyObjects, attitude: Attitude) -> tuple[str, ...]:
     return tuple(passing)
 
 
-def _is_lit(earth: EarthLimb, towards: npt.NDArray[np.float64], off_nadir_deg: float) -> bool:
+def _is_lit(earth: EarthLimb, towards: Array, off_nadir_deg: float) -> bool:
     """Whether the Sun shines on the point of the Earth seen at an angle from its centre towards a direction."""
     sun = earth.sun_direction
     if sun is None:
@@ -210,7 +210,7 @@ class AreaPainter:
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
 
-    def _directions_of(self, columns: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]) -> Image:
+    def _directions_of(self, columns: Indices, rows: Indices) -> Image:
         x, y = np.meshgrid(columns, rows)
         vectors = self._camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
         vectors[np.isnan(vectors).any(axis=1)] = (0.0, 0.0, -1.0)
@@ -299,7 +299,7 @@ class AreaPainter:
         draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
         return (Patch(box, blurred(disc, self._spot_taps), passed, hides_glare=False),)
 
-    def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
+    def _box_around(self, direction: Array, radius_rad: float) -> Box | None:
         """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""
         reach_rad = radius_rad + 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
         if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
@@ -338,9 +338,7 @@ class AreaPainter:
         step_rad = GLARE_STEP * self._camera.pixel_scale_rad
         return WideEarth(grid, distance, behind, earth.electrons_s, step_rad)
 
-    def _earth_and_sun(
-        self, earth: EarthLimb, attitude: Attitude
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def _earth_and_sun(self, earth: EarthLimb, attitude: Attitude) -> tuple[Array, Array]:
         """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""
         sun = earth.sun_direction
         nadir = attitude.to_sensor(earth.direction)

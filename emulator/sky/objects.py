@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Self
 
-import numpy as np
-import numpy.typing as npt
-
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sky.directions import icrs_vector
+from starid.arrays import Array
 
 _ANGLE: Final = (-360.0, 360.0)
 _MAX_OBJECTS: Final = 100_000
@@ -30,7 +28,7 @@ class CelestialBody:
     dec_deg: float
 
     @cached_property
-    def direction(self) -> npt.NDArray[np.float64]:
+    def direction(self) -> Array:
         """Direction (3,) of its centre, ICRS."""
         return icrs_vector(self.ra_deg, self.dec_deg)
 
@@ -112,7 +110,7 @@ class EarthLimb(CelestialBody):
     """Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit."""
 
     @cached_property
-    def sun_direction(self) -> npt.NDArray[np.float64] | None:
+    def sun_direction(self) -> Array | None:
         """Direction (3,) of the Sun that lights it, ICRS; None if all of the disc is lit."""
         if self.sun_ra_deg is None or self.sun_dec_deg is None:
             return None

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
+from starid.arrays import Array
 from starid.earth import DAY_S, UNIX_EPOCH_JD, terrestrial_time
 
-Vector: TypeAlias = NDArray[np.float64]
+Vector: TypeAlias = Array
 
 EARTH_GM_M3_S2: Final = 3.986_004_418e14
 EARTH_RADIUS_M: Final = 6_378_137.0

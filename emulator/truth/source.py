@@ -14,13 +14,13 @@ from enum import StrEnum
 from typing import Final, Literal, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import Orbit, OrbitState
+from starid.arrays import Array
 from starid.attitude import Attitude, propagate
 
-Vector: TypeAlias = NDArray[np.float64]
+Vector: TypeAlias = Array
 
 ZERO_RATE: Final[Vector] = np.zeros(3)
 ZERO_RATE.flags.writeable = False
