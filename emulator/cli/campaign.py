@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import names_of
+from starhil.emulator.cli.options import Jobs, Seed, Settings, names_of
 from starid.cli.options import AsJson
 
 if TYPE_CHECKING:
@@ -25,9 +25,31 @@ group = typer.Typer(
 )
 
 
+@dataclass(frozen=True)
+class EcssOptions:
+    """The device and the images of a campaign per ECSS-E-ST-60-20C."""
+
+    profile: Annotated[
+        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
+    ] = "cubestar"
+    setting: Settings = None
+    confidence: Annotated[float, typer.Option(help="Confidence level of the errors, 0.5 to below 1.")] = 0.997
+    rest_frames: Annotated[int, typer.Option(min=10, help="Images at random attitudes, at rest.")] = 2000
+    frames: Annotated[
+        int, typer.Option(min=5, help="Images at each value of an influence (rate, Sun …).")
+    ] = 100
+    fields: Annotated[
+        int, typer.Option(min=3, help="Number of directions in the sky, to separate the kinds of error.")
+    ] = 80
+    seed: Seed = 1
+    jobs: Jobs = 1
+
+
 @group.callback()
+@with_option_groups
 def campaigns(
     context: typer.Context,
+    *,
     ecss: Annotated[
         bool,
         typer.Option(
@@ -35,25 +57,7 @@ def campaigns(
             help="Measure the performance of a device per ECSS-E-ST-60-20C and write a report to -o.",
         ),
     ] = False,
-    profile: Annotated[
-        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
-    ] = "cubestar",
-    setting: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the profile. Repeatable."),
-    ] = None,
-    confidence: Annotated[
-        float, typer.Option(help="Confidence level of the errors, 0.5 to below 1.")
-    ] = 0.997,
-    rest_frames: Annotated[int, typer.Option(min=10, help="Images at random attitudes, at rest.")] = 2000,
-    frames: Annotated[
-        int, typer.Option(min=5, help="Images at each value of an influence (rate, Sun …).")
-    ] = 100,
-    fields: Annotated[
-        int, typer.Option(min=3, help="Number of directions in the sky, to separate the kinds of error.")
-    ] = 80,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    images: EcssOptions,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -81,15 +85,20 @@ def campaigns(
     from starhil.emulator.benchmarks.ecss_errors import coverage_factor
     from starhil.emulator.benchmarks.ecss_report import as_markdown, make_report, write_report
 
-    coverage_factor(confidence)  # before hours of work
+    coverage_factor(images.confidence)  # before hours of work
     if output is not None:
         import_module("matplotlib")
     plan = EcssPlan(
-        profile, tuple(setting or ()), seed, fields=fields, rest_frames=rest_frames, frames=frames
+        images.profile,
+        tuple(images.setting or ()),
+        images.seed,
+        fields=images.fields,
+        rest_frames=images.rest_frames,
+        frames=images.frames,
     )
     folder = None if output is None else output / "parts"
-    finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=jobs), len(parts(plan))))
-    report = make_report(plan, finished, confidence)
+    finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=images.jobs), len(parts(plan))))
+    report = make_report(plan, finished, images.confidence)
     files = () if output is None else write_report(report, output)
     if as_json:
         print(json.dumps({**report.figures(), "files": [str(file) for file in files]}))
@@ -106,7 +115,7 @@ class PlanOptions:
     """The images of a campaign."""
 
     frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 1000
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1
+    seed: Seed = 1
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
     unknown_field: Annotated[
         bool,

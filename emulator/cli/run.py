@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import DIALECTS, UnitChoice, list_option, names_of
+from starhil.emulator.cli.options import (
+    ProfileArgument,
+    Settings,
+    UnitChoice,
+    checked_dialect,
+    list_option,
+    names_of,
+)
 from starhil.emulator.cli.output import report_slow_start
 from starhil.emulator.errors import EmulatorError
-from starid.cli.options import one_of
 from starid.cli.output import output_help, prepare_output
 
 if TYPE_CHECKING:
@@ -67,10 +73,7 @@ class DeviceOptions:
         ),
     ] = None
     symlink: Annotated[Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")] = None
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
-    ] = None
+    settings: Settings = None
 
     def profile(self, name: str, number: int) -> Profile:
         """Load the profile of the nth head, with the options in place of its keys; folders and links differ by head."""
@@ -168,14 +171,7 @@ class AroundOptions:
 
 @with_option_groups
 def command(
-    profile: Annotated[
-        str | None,
-        typer.Argument(
-            help="Device profile: a name or a TOML file.",
-            show_default="cubestar",
-            autocompletion=names_of("profile"),
-        ),
-    ] = None,
+    profile: ProfileArgument = None,
     head: Annotated[
         list[str] | None,
         typer.Option(
@@ -210,8 +206,7 @@ def command(
     if log not in levels:
         raise EmulatorError(f"--log {log}: must be one of {', '.join(levels)}")
     logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
-    if device.dialect is not None:
-        one_of("--dialect", device.dialect, DIALECTS)
+    checked_dialect(device.dialect)
     if head and profile is not None:
         raise EmulatorError(
             f"{profile}: a profile and --head exclude each other; give it as --head {profile}"
