@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from starhil.emulator.pipeline.imager import PipelineImager, ProcessImager, ThreadImager
+from starhil.emulator.pipeline.imager import PipelineImager, WorkerImager
 from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
-from starhil.emulator.pipeline.worker_process import WorkerProcess
+from starhil.emulator.pipeline.worker_process import WorkerProcess, WorkerThread
 from starhil.emulator.profile import Profile
 from starhil.protocol.values import Value
 
@@ -17,14 +17,14 @@ def make_imager(
     """Return the pipeline of a profile; a worker that was started earlier is used, or ended."""
     setup = pipeline_setup(profile, repeatable=repeatable, previews=previews)
     if profile.run.worker == "process":
-        return ProcessImager(setup, worker or WorkerProcess())
+        return WorkerImager(setup, worker or WorkerProcess())
     if worker is not None:
         worker.end()
     if profile.run.worker == "error_model":
         from starhil.emulator.pipeline.error_model import ErrorModelImager
 
         return ErrorModelImager(setup)
-    return ThreadImager(setup)
+    return WorkerImager(setup, WorkerThread())
 
 
 def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool = False) -> PipelineSetup:

@@ -57,7 +57,7 @@ def warm(
     """
     from dataclasses import replace
 
-    from starhil.emulator.pipeline.imager import ProcessImager
+    from starhil.emulator.pipeline.imager import WorkerImager
     from starhil.emulator.pipeline.worker_process import WorkerProcess
     from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
@@ -68,7 +68,7 @@ def warm(
     setup = replace(setup, previews=True, sky={"bodies": "ephemeris"})  # these have kernels of their own
 
     async def start() -> None:
-        imager = ProcessImager(setup, WorkerProcess())
+        imager = WorkerImager(setup, WorkerProcess())
         progress = asyncio.create_task(report_slow_start())
         try:
             await imager.start()

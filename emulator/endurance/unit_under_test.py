@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import resource
 import shutil
-import signal
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -22,7 +20,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
 from starhil.emulator.pipeline.error_model import ErrorModelImager
-from starhil.emulator.pipeline.imager import ProcessImager
+from starhil.emulator.pipeline.imager import WorkerImager
+from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import MAX_STEP_S, StepPump
 from starhil.emulator.replay import prepare_recording
@@ -287,9 +286,9 @@ class UnitUnderTest:
         if isinstance(imager, ErrorModelImager):
             imager.end("pipeline: ended by an endurance run")
             return
-        if not isinstance(imager, ProcessImager):
+        if not isinstance(imager, WorkerImager) or not isinstance(imager.worker, WorkerProcess):
             raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
-        os.kill(imager.pid, signal.SIGKILL)
+        imager.worker.process.kill()
         for ready in (False, True):
             until_s = time.monotonic() + LONGEST_START_S
             while device.warm is not ready:

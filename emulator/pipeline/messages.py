@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import struct
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
@@ -30,7 +31,14 @@ def as_triple(vector: Array) -> Triple:
 
 
 LENGTH: Final = struct.Struct("<I")
-"""Length prefix of each pickled message between the emulator and its worker process."""
+"""Length prefix of each pickled message between the emulator and its worker."""
+
+
+def with_length(message: object) -> bytes:
+    """Return a message between the emulator and its worker; a text is the last one, why the worker ends."""
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return LENGTH.pack(len(data)) + data
+
 
 IMAGE_EDGES: Final = (1024, 512, 256, 128, 64)
 """Edges of the square images for download, pixels, indexed by the published enumeration."""
