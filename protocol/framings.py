@@ -11,7 +11,6 @@ import binascii
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from enum import Enum, auto
 from typing import Final, Generic, TypeVar, assert_never
 
 from starhil.protocol.errors import ProtocolError
@@ -266,19 +265,6 @@ class Escaped(Framing):
         return EscapedDeframer(receiving, self)
 
 
-class _State(Enum):
-    IDLE = auto()
-    """Outside a message."""
-    IDLE_ESCAPED = auto()
-    """Outside a message, after an escape byte."""
-    FIRST = auto()
-    """At the first byte after the start: the ID, if the message has one."""
-    FIRST_ESCAPED = auto()
-    """After an escape byte at the position of the ID."""
-    BODY = auto()
-    BODY_ESCAPED = auto()
-
-
 class EscapedDeframer(_Collector[_Message]):
     """Finds bodies between starts and ends; each run of junk yields one fault.
 
@@ -289,10 +275,12 @@ class EscapedDeframer(_Collector[_Message]):
         super().__init__(receiving)
         self._several = bool(framing.starts)
         self._starts = framing.starts or frozenset(framing.start[1:])
-        self._escape = framing.escape[0]
+        self._escape = framing.escape
         self._end = framing.end[1]
         self._first_is_id = framing.first_is_id
-        self._state = _State.IDLE
+        self._in_message = False
+        self._escaped = False
+        """Whether the last byte was an escape byte."""
         self._start = 0
         self._body = bytearray()
         self._in_junk = False
@@ -300,80 +288,61 @@ class EscapedDeframer(_Collector[_Message]):
     @property
     def busy(self) -> bool:
         """Whether a message is incomplete."""
-        return self._state not in (_State.IDLE, _State.IDLE_ESCAPED)
+        return self._in_message
 
     def _consume(self, data: bytes) -> None:
-        position = 0
-        while position < len(data):
-            position = self._advance(data, position)
+        position, size = 0, len(data)
+        while position < size:
+            if self._escaped:
+                self._escaped = False
+                self._after_escape(data[position])
+                position += 1
+                continue
+            found = data.find(self._escape, position)
+            end = size if found < 0 else found
+            if end > position:
+                self._add_plain_bytes(data[position:end])
+            self._escaped = found >= 0
+            position = end + 1
 
     def _abandon(self) -> LinkFault | None:
-        state, in_junk, size = self._state, self._in_junk, len(self._body)
+        in_message, size = self._in_message, len(self._body)
+        lone_escape = self._escaped and not in_message and not self._in_junk
         self._reset(in_junk=False)
-        if state is _State.IDLE_ESCAPED and not in_junk:
-            return LinkFault(FaultKind.UART_PROTOCOL, f"escape byte {self._escape:02X} outside a message")
-        return None if state in (_State.IDLE, _State.IDLE_ESCAPED) else self._incomplete(size)
-
-    def _advance(self, data: bytes, position: int) -> int:
-        """Process one byte, or all up to the next escape byte; return the position after it."""
-        match self._state:
-            case _State.IDLE | _State.BODY:
-                escape = data.find(self._escape, position)
-                end = len(data) if escape < 0 else escape
-                if end > position:
-                    self._add_plain_bytes(data[position:end])
-                    return end
-                self._state = _State.BODY_ESCAPED if self.busy else _State.IDLE_ESCAPED
-            case _State.FIRST:
-                if data[position] == self._escape:
-                    self._state = _State.FIRST_ESCAPED if self._first_is_id else _State.BODY_ESCAPED
-                else:
-                    self._state = _State.BODY
-                    self._add_plain_bytes(data[position : position + 1])
-            case _State.IDLE_ESCAPED:
-                self._after_idle_escape(data[position])
-            case _State.FIRST_ESCAPED:
-                self._after_first_escape(data[position])
-            case _State.BODY_ESCAPED:
-                self._after_body_escape(data[position])
-        return position + 1
+        if lone_escape:
+            return LinkFault(
+                FaultKind.UART_PROTOCOL, f"escape byte {self._escape.hex().upper()} outside a message"
+            )
+        return self._incomplete(size) if in_message else None
 
     def _add_plain_bytes(self, run: bytes) -> None:
         """Add bytes that are neither escape bytes nor escaped."""
-        if self.busy:
+        if self._in_message:
             self._body += run
             if len(self._body) > self._max_size:
                 self._drop_message(self._overlong())
         else:
             self._report_junk(run[0])
 
-    def _after_idle_escape(self, byte: int) -> None:
+    def _after_escape(self, byte: int) -> None:
         if byte in self._starts:
-            self._start_message(byte)
-            return
-        self._report_junk(self._escape)
-        if byte != self._escape:
-            self._state = _State.IDLE
-
-    def _after_first_escape(self, byte: int) -> None:
-        if byte == self._end or byte in self._starts:
-            self._after_body_escape(byte)
-            return
-        self._state = _State.BODY
-        self._add_plain_bytes(bytes((self._escape,) if byte == self._escape else (self._escape, byte)))
-
-    def _after_body_escape(self, byte: int) -> None:
-        self._state = _State.BODY
-        if byte == self._escape:
-            self._add_plain_bytes(bytes((self._escape,)))
+            if self._in_message:
+                text = f"message of {len(self._body)} bytes interrupted by the start of another"
+                self._fault(FaultKind.UART_INCOMPLETE, text)
+            self._reset(in_junk=False)
+            self._in_message = True
+            self._start = byte
+        elif not self._in_message:
+            self._report_junk(self._escape[0])
+            self._escaped = byte == self._escape[0]
         elif byte == self._end:
             body = bytes(self._body)
             self._reset(in_junk=False)
             self._deliver(body)
-        elif byte in self._starts:
-            text = f"message of {len(self._body)} bytes interrupted by the start of another"
-            self._fault(FaultKind.UART_INCOMPLETE, text)
-            self._start_message(byte)
+        elif byte == self._escape[0]:
+            self._add_plain_bytes(self._escape)
+        elif self._first_is_id and not self._body:
+            self._add_plain_bytes(self._escape + bytes((byte,)))
         else:
             text = f"byte {byte:02X} after an escape byte within a message"
             self._drop_message(LinkFault(FaultKind.UART_PROTOCOL, text))
@@ -384,13 +353,8 @@ class EscapedDeframer(_Collector[_Message]):
         else:
             self._add(self._interpret(bytes((self._start,)) + body if self._several else body))
 
-    def _start_message(self, start: int) -> None:
-        self._reset(in_junk=False)
-        self._state = _State.FIRST
-        self._start = start
-
     def _reset(self, *, in_junk: bool) -> None:
-        self._state = _State.IDLE
+        self._in_message = self._escaped = False
         self._in_junk = in_junk
         self._body.clear()
 

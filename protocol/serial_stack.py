@@ -305,20 +305,20 @@ class SerialStack:
         Raises ProtocolError for a kind of reply that the dialect does not have.
         """
         form = self.format(dialect)
-        if self.dialects:
-            if reply.kind not in form.headers:
+        header = form.headers.get(reply.kind)
+        if header is None:
+            if self.dialects:
                 chosen = dialect if dialect in self.dialects else default_dialect(self.dialects)
                 raise ProtocolError(_no_such_reply(reply.kind, chosen))
-            if reply.kind in (ReplyKind.ACK, ReplyKind.NACK) and reply.id in self._silent:
-                return b""
-        elif reply.kind is ReplyKind.ECHO:
             echo = Request(
                 RequestKind.TELECOMMAND, reply.id or 0, reply.data, reply.destination, reply.klass, reply.sequence,
                 reply.flags,
             )  # fmt: skip
             return self.encode_request(echo)
         refused = reply.kind is ReplyKind.NACK
-        header = form.headers[reply.kind]
+        accepted = reply.kind is ReplyKind.ACK
+        if self.dialects and (refused or accepted) and reply.id in self._silent:
+            return b""
         if refused and not header.roles_in(reply.klass) & {"status", "ack"}:
             return b""
         values = {
@@ -331,14 +331,15 @@ class SerialStack:
         }
         if reply.flags:
             values["flags"] = reply.flags
-        for role, nanoseconds in (("ticks", reply.uptime_ns), ("time", reply.time_ns)):
-            if role in header.roles:
-                values[role] = nanoseconds // header.count_ns(role)
+        if "ticks" in header.roles:
+            values["ticks"] = reply.uptime_ns // header.count_ns("ticks")
+        if "time" in header.roles:
+            values["time"] = reply.time_ns // header.count_ns("time")
         if "class" in header.roles:
             values["class"] = self.classes.reply_code(
                 reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
             )
-        data = b"" if refused or (self.dialects and reply.kind is ReplyKind.ACK) else reply.data
+        data = b"" if refused or (self.dialects and accepted) else reply.data
         return form.framing.encode(self.close(header.pack(values, reply.klass, len(data)), data))
 
     def close(self, header: bytes, data: bytes) -> bytes:

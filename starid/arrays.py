@@ -20,5 +20,13 @@ Array32 = NDArray[np.float32]
 Indices32 = NDArray[np.int32]
 """32-bit integers."""
 
+Records = NDArray[np.void]
+"""A table (n,) of records, each with named fields (`record_type`)."""
+
 GreyImage = NDArray[np.uint8] | NDArray[np.uint16]
 """Pixel values (h, w) of a grey image."""
+
+
+def record_type(form: type) -> np.dtype[np.void]:
+    """Return the type of a table's records, whose fields (float or int, 64 bits each) are those of a protocol class."""
+    return np.dtype([(name, str(kind)) for name, kind in form.__annotations__.items()], align=True)

@@ -20,7 +20,7 @@ import os
 import pickle
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar, cast
@@ -284,6 +284,8 @@ def _type_name(value: Any) -> str:
     if isinstance(value, np.ndarray):
         flags, dtype = value.flags, value.dtype
         name = dtype.name if dtype.isnative and dtype.kind in "biufc" else repr(dtype)
+        if dtype.names:
+            name = record_name((field, dtype[field].name) for field in dtype.names)
         layout = "C" if flags.c_contiguous else "F" if flags.f_contiguous else "A"
         return f"{'' if flags.writeable else 'readonly '}array({name}, {value.ndim}d, {layout})"
     if isinstance(value, tuple):
@@ -293,6 +295,11 @@ def _type_name(value: Any) -> str:
     if value is None:
         return "none"
     return "NumPyRandomGeneratorType" if isinstance(value, np.random.Generator) else type(value).__name__
+
+
+def record_name(fields: Iterable[tuple[str, str]]) -> str:
+    """Return the name of a type of record with fields of these names and types."""
+    return f"record({', '.join(' '.join(each) for each in fields)})"
 
 
 @cache

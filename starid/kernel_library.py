@@ -19,7 +19,7 @@ from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.typed_passes import NativeLowering
 
-from starid.jit import KernelFunction, StoredKernel
+from starid.jit import KernelFunction, StoredKernel, record_name
 
 _njit: Any = njit
 _codegen: Any = codegen
@@ -229,6 +229,9 @@ def names_of_types(signature: Iterable[Any]) -> str:
 
 
 def _name_of_type(each: Any) -> str:
+    if isinstance(each, _types.Array) and isinstance(each.dtype, _types.Record):
+        name = record_name((field, str(kind)) for field, kind in each.dtype.members)
+        return f"{'' if each.mutable else 'readonly '}array({name}, {each.ndim}d, {each.layout})"
     if not isinstance(each, _types.BaseTuple):
         return str(each)
     name = each.instance_class.__name__ if isinstance(each, _types.BaseNamedTuple) else "tuple"

@@ -133,7 +133,9 @@ class DeviceLink(ABC, Generic[Item, Style]):
     def _answer(self, reply: Reply, style: Style) -> None:
         """Send an answer, with the unit's code for an error."""
         if isinstance(reply.code, ErrorCode):
-            reply = replace(reply, code=self._device.icd.error_number(reply.code))
+            number = self._device.icd.error_number(reply.code)
+            if number != reply.code:
+                reply = replace(reply, code=number)
         self._send(reply, style)
 
     def _schedule_flush(self) -> None:

@@ -21,13 +21,7 @@ from starid.geometric.refinement import (
     refine,
     solve_symmetric,
 )
-from starid.geometric.settings import (
-    LARGEST_SIGMA,
-    MAGNITUDE_GATE,
-    NOTHING,
-    SCALE_TOLERANCE,
-    SIGMAS_KNOWN,
-)
+from starid.geometric.settings import NOTHING, Settings
 from starid.geometric.verification import log_false_probability, worth_refining
 from starid.jit import inner
 
@@ -92,7 +86,7 @@ def test_and_refine(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: Array,
+    settings: Settings,
     candidate: Candidate,
     tests: tuple[Array, Indices],
     used: tuple[int, int, int],
@@ -122,7 +116,7 @@ def test_and_refine(
         Log of the bound on the probability of a false answer.
     """
     rotation, numbers = candidate.frames[2], candidate.numbers
-    faintest = numbers[ZERO_POINT] + settings[MAGNITUDE_GATE]
+    faintest = numbers[ZERO_POINT] + settings.magnitude_gate
     odds, order = tests
     few = min_matched < MIN_MATCHED and observed.shape[0] < min_matched + MIN_TESTED
     if not few and not worth_refining(
@@ -142,9 +136,9 @@ def test_and_refine(
         candidate.normal,
         numbers,
     )
-    if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings[LARGEST_SIGMA]:
+    if matched == 0 or numbers[RMS] > math.sqrt(2.0) * settings.largest_sigma:
         return 0, 0.0
-    if abs(math.log(numbers[SCALE])) > 1.5 * settings[SCALE_TOLERANCE]:
+    if abs(math.log(numbers[SCALE])) > 1.5 * settings.scale_tolerance:
         return 0, 0.0
     bound = log_false_probability(
         index, seen, rotation, candidate.stars, matched, candidate.normal, numbers, settings, prior
@@ -182,7 +176,7 @@ def make_answer(
     status: int,
     observed: Table,
     candidate: Candidate,
-    settings: Array,
+    settings: Settings,
     bound: float,
     triangles: int,
     candidates: int,
@@ -211,9 +205,9 @@ def make_answer(
             pairs[1, filled] = candidate.stars[i]
             mean_sigma2 += 0.5 * (observed[i, SIGMA_U] ** 2 + observed[i, SIGMA_V] ** 2) / m
             filled += 1
-    freedom = float(max(2 * m - (4 if settings[SCALE_TOLERANCE] > 0.0 else 3), 1))
+    freedom = float(max(2 * m - (4 if settings.scale_tolerance > 0.0 else 3), 1))
     variance = numbers[VARIANCE]
-    if settings[SIGMAS_KNOWN] > 0.0:
+    if settings.sigmas_known:
         variance = (PRIOR_FREEDOM + variance * freedom) / (PRIOR_FREEDOM + freedom)
         freedom += PRIOR_FREEDOM
     facts[0], facts[1], facts[3] = numbers[RMS], math.sqrt(variance * mean_sigma2), numbers[SCALE]

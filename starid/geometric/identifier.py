@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from starid.aberration import checked_beta
-from starid.arrays import Array
+from starid.arrays import Array, Records
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog
@@ -33,26 +33,7 @@ from starid.geometric.index_choice import (
 )
 from starid.geometric.pattern_index import IndexArrays, field_solid_angle
 from starid.geometric.search import identify_kernel
-from starid.geometric.settings import (
-    ACCEPTED,
-    BETA_X,
-    BETA_Z,
-    FIELD_PX,
-    LARGEST_SIGMA,
-    LOG_CHANCE,
-    LOG_CHANCE_TRACKING,
-    MAGNITUDE_GATE,
-    MAX_TRIANGLES,
-    PART_STARS,
-    PX_PER_RAD,
-    SCALE_TOLERANCE,
-    SEARCH_TOLERANCE,
-    SETTING_COUNT,
-    SIGMAS_KNOWN,
-    TEST_WINDOW,
-    TOO_FEW,
-    WINDOW,
-)
+from starid.geometric.settings import ACCEPTED, SETTINGS, TOO_FEW
 from starid.geometric.tracking import MIN_TRACKED, MIN_TRACKED_KNOWN, track_kernel
 from starid.geometric.verification import WHOLE_SKY
 from starid.jit import BoundKernel
@@ -111,20 +92,20 @@ class Effort:
             elif not 0.0 < value < math.inf:
                 raise StaridError(f"identifier {field.name}: must be a positive number, not {value}")
 
-    def numbers(self, camera: Camera, px_per_rad: float) -> Array:
-        """Kernel settings (`starid.geometric.settings`) for a camera of known focal length."""
-        numbers = np.zeros(SETTING_COUNT)
-        numbers[SEARCH_TOLERANCE] = self.tolerance_px / px_per_rad
-        numbers[MAGNITUDE_GATE] = self.magnitude_gate
-        numbers[MAX_TRIANGLES] = self.max_triangles
-        numbers[PART_STARS] = self.part_stars
-        numbers[WINDOW] = self.window_px
-        numbers[TEST_WINDOW] = self.test_window_px / px_per_rad
-        numbers[LARGEST_SIGMA] = self.window_px / 3.0
-        numbers[LOG_CHANCE] = math.log(self.max_false_probability)
-        numbers[LOG_CHANCE_TRACKING] = math.log(self.max_false_probability_tracking)
-        numbers[PX_PER_RAD] = px_per_rad
-        numbers[FIELD_PX] = camera.width * camera.height
+    def numbers(self, camera: Camera, px_per_rad: float) -> Records:
+        """Kernel settings (1,) for a camera of known focal length."""
+        numbers = np.zeros(1, SETTINGS)
+        numbers["search_tolerance"] = self.tolerance_px / px_per_rad
+        numbers["magnitude_gate"] = self.magnitude_gate
+        numbers["max_triangles"] = self.max_triangles
+        numbers["part_stars"] = self.part_stars
+        numbers["window"] = self.window_px
+        numbers["test_window"] = self.test_window_px / px_per_rad
+        numbers["largest_sigma"] = self.window_px / 3.0
+        numbers["log_chance"] = math.log(self.max_false_probability)
+        numbers["log_chance_tracking"] = math.log(self.max_false_probability_tracking)
+        numbers["px_per_rad"] = px_per_rad
+        numbers["field_px"] = camera.width * camera.height
         return numbers
 
 
@@ -201,7 +182,7 @@ class Identifier(SingleCameraIdentifier):
         self._px_per_rad = pixels_per_radian(camera)
         self._numbers = effort.numbers(camera, self._px_per_rad)
         self._numbers_with_errors = self._numbers.copy()
-        self._numbers_with_errors[SIGMAS_KNOWN] = 1.0
+        self._numbers_with_errors["sigmas_known"] = 1
 
     @property
     def stars(self) -> StarCatalog:
@@ -219,18 +200,18 @@ class Identifier(SingleCameraIdentifier):
         answer = self._search(self._camera, measured, self._numbers_for(measured))
         return self._solution(answer, "lost_in_space")
 
-    def _search(self, camera: Camera, measured: CheckedDetections, numbers: Array) -> Answer:
+    def _search(self, camera: Camera, measured: CheckedDetections, numbers: Records) -> Answer:
         """Search the whole sky with a given camera and kernel settings."""
         detections = measured.xy, measured.flux, measured.sigmas
         return self._identify_kernel(camera.params, *detections, numbers)
 
-    def _numbers_for(self, measured: CheckedDetections) -> Array:
+    def _numbers_for(self, measured: CheckedDetections) -> Records:
         """Kernel settings for one call."""
         numbers = self._numbers_with_errors if measured.sigmas_known else self._numbers
         if measured.observer_velocity is None:
             return numbers
         numbers = numbers.copy()
-        numbers[BETA_X : BETA_Z + 1] = checked_beta(measured.observer_velocity)
+        numbers["beta_x"], numbers["beta_y"], numbers["beta_z"] = checked_beta(measured.observer_velocity)
         return numbers
 
     def _identify_any_scale(self, measured: CheckedDetections) -> Solution:
@@ -242,18 +223,18 @@ class Identifier(SingleCameraIdentifier):
         steps = math.ceil(self._fov_tolerance * _scale_variation(self._camera) / _SCALE_ERROR)
         share = self._fov_tolerance / (2 * steps - 1)
         numbers = self._numbers_for(measured).copy()
-        numbers[SCALE_TOLERANCE] = share
+        numbers["scale_tolerance"] = share
         cameras = [
             scaled_camera(self._camera, 1.0 + 2.0 * share * step)
             for step in sorted(range(1 - steps, steps), key=abs)
         ]
-        numbers[LOG_CHANCE] -= math.log(len(cameras))
+        numbers["log_chance"] -= math.log(len(cameras))
         solution = Solution.invalid(Reason.NO_MATCH)
         for triangles, part_stars in (
             (_QUICK_TRIANGLES, 0),
             (self._effort.max_triangles, self._effort.part_stars),
         ):
-            numbers[MAX_TRIANGLES], numbers[PART_STARS] = triangles, part_stars
+            numbers["max_triangles"], numbers["part_stars"] = triangles, part_stars
             for camera in cameras:
                 answer = self._search(camera, measured, numbers)
                 solution = self._solution(answer, "lost_in_space")
@@ -294,7 +275,7 @@ class Identifier(SingleCameraIdentifier):
         prior, least = self._prior(window), MIN_TRACKED_KNOWN if measured.sigmas_known else MIN_TRACKED
         if anywhere:
             prior, least, numbers = WHOLE_SKY, MIN_MATCHED, numbers.copy()
-            numbers[LOG_CHANCE_TRACKING] = numbers[LOG_CHANCE]
+            numbers["log_chance_tracking"] = numbers["log_chance"]
         answer = self._track_kernel(
             self._camera.params, measured.xy, measured.flux, measured.sigmas, numbers,
             predicted.matrix, window, least, prior,

@@ -39,16 +39,7 @@ from starid.geometric.observation import (
     without_aberration,
 )
 from starid.geometric.pattern_index import STAR_MAGNITUDE, IndexArrays
-from starid.geometric.settings import (
-    BETA_X,
-    BETA_Y,
-    BETA_Z,
-    MAGNITUDE_GATE,
-    PX_PER_RAD,
-    SCALE_TOLERANCE,
-    SIGMAS_KNOWN,
-    WINDOW,
-)
+from starid.geometric.settings import Settings
 from starid.jit import inner
 from starid.small_arrays import lower_median
 
@@ -155,7 +146,7 @@ def _outlier(
     normal: Array,
     chi2: float,
     freedom: int,
-    settings: Array,
+    settings: Settings,
 ) -> int:
     """Find the match most inconsistent with the others; −1 if that may be chance.
 
@@ -163,10 +154,10 @@ def _outlier(
     this drop to the remaining χ² is F(2, ν − 2)-distributed, with the tail ``(1 + 2F/(ν − 2))^(1 − ν/2)``.
     """
     rest = float(freedom - 2)
-    known = PRIOR_FREEDOM if settings[SIGMAS_KNOWN] > 0.0 else 0.0
+    known = PRIOR_FREEDOM if settings.sigmas_known else 0.0
     if rest + known < 1.0:
         return -1
-    unknowns = 4 if settings[SCALE_TOLERANCE] > 0.0 else 3
+    unknowns = 4 if settings.scale_tolerance > 0.0 else 3
     slopes, unit, column = np.empty((2, 4)), np.empty(4), np.empty(4)
     worst, least = -1, OUTLIER_CHANCE
     for i in range(stars.shape[0]):
@@ -296,32 +287,32 @@ def _marginalise(normal: Array, scratch: Array) -> float:
 
 
 @inner
-def directions_depend_on_solution(settings: Array) -> bool:
+def directions_depend_on_solution(settings: Settings) -> bool:
     """Whether the directions of the detections change with the solution: with its scale or by aberration."""
-    return bool(settings[SCALE_TOLERANCE] > 0.0) or _observer_moves(settings)
+    return bool(settings.scale_tolerance > 0.0) or _observer_moves(settings)
 
 
 @inner
-def _observer_moves(settings: Array) -> bool:
-    return bool(settings[BETA_X] != 0.0 or settings[BETA_Y] != 0.0 or settings[BETA_Z] != 0.0)
+def _observer_moves(settings: Settings) -> bool:
+    return bool(settings.beta_x != 0.0 or settings.beta_y != 0.0 or settings.beta_z != 0.0)
 
 
 @inner
 def _observe_with(
-    raw: Raw, observed: Table, settings: Array, rotation: Array, scale: float, seen: Table
+    raw: Raw, observed: Table, settings: Settings, rotation: Array, scale: float, seen: Table
 ) -> None:
     """Fill `seen` with the detections for the refined scale, corrected for aberration."""
-    if settings[SCALE_TOLERANCE] > 0.0:
+    if settings.scale_tolerance > 0.0:
         observe_scaled(raw, observed, scale, seen)
     if _observer_moves(settings):
-        beta = (settings[BETA_X], settings[BETA_Y], settings[BETA_Z])
-        remove_aberration(seen if settings[SCALE_TOLERANCE] > 0.0 else observed, beta, rotation, seen)
+        beta = (settings.beta_x, settings.beta_y, settings.beta_z)
+        remove_aberration(seen if settings.scale_tolerance > 0.0 else observed, beta, rotation, seen)
 
 
 @inner
-def _rotate_by_aberration(settings: Array, rotation: Array) -> None:
+def _rotate_by_aberration(settings: Settings, rotation: Array) -> None:
     """Rotate an attitude derived from aberrated directions by the aberration at the boresight, in place."""
-    bx, by, bz = settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
+    bx, by, bz = settings.beta_x, settings.beta_y, settings.beta_z
     x, y, _ = without_aberration(
         0.0,
         0.0,
@@ -338,7 +329,7 @@ def refine(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: Array,
+    settings: Settings,
     min_matched: int,
     seen: Table,
     rotation: Array,
@@ -379,17 +370,17 @@ def refine(
         size *= 2
     owners, excluded = np.empty(size, dtype=np.int64), np.zeros(n, dtype=np.bool_)
     right, step = np.empty(4), np.zeros(4)
-    free_scale = settings[SCALE_TOLERANCE] > 0.0
+    free_scale = settings.scale_tolerance > 0.0
     unknowns = 4 if free_scale else 3
     if _observer_moves(settings):
         _rotate_by_aberration(settings, rotation)
     _observe_with(raw, observed, settings, rotation, numbers[SCALE], seen)
-    gate, numbers[SCATTER] = settings[MAGNITUDE_GATE], settings[MAGNITUDE_GATE]
-    reach, sigma = settings[WINDOW], 1.0
+    gate, numbers[SCATTER] = settings.magnitude_gate, settings.magnitude_gate
+    reach, sigma = settings.window, 1.0
     matched = 0
     for number in range(MAX_ROUNDS):
         matched = match_detections(
-            index, seen, rotation, excluded, (reach, sigma, gate, settings[PX_PER_RAD]),
+            index, seen, rotation, excluded, (reach, sigma, gate, settings.px_per_rad),
             numbers[ZERO_POINT], numbers[SCATTER], stars, costs, owners,
         )  # fmt: skip
         if matched < min_matched:

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, Records
 from starid.geometric.answer import (
     MIN_MATCHED,
     Answer,
@@ -36,18 +36,7 @@ from starid.geometric.pattern_index import (
     sorted_triangle,
 )
 from starid.geometric.refinement import SCALE, ZERO_POINT
-from starid.geometric.settings import (
-    ACCEPTED,
-    LOG_CHANCE,
-    MAGNITUDE_GATE,
-    MAX_TRIANGLES,
-    NOTHING,
-    PART_STARS,
-    SCALE_TOLERANCE,
-    SEARCH_TOLERANCE,
-    TEST_WINDOW,
-    TOO_FEW,
-)
+from starid.geometric.settings import ACCEPTED, NOTHING, TOO_FEW, Settings
 from starid.geometric.verification import WHOLE_SKY, hit_odds, test_order
 from starid.jit import compiled_ieee, inner
 from starid.projection import HEIGHT, MODEL, WIDTH
@@ -140,7 +129,7 @@ def _try_patterns(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: Array,
+    settings: Settings,
     candidate: Candidate,
     tests: tuple[Array, Indices],
     corners: tuple[int, int, int],
@@ -156,7 +145,7 @@ def _try_patterns(
     stars, sides, corner_stars = index.stars, index.sides, index.corners
     frames, numbers = candidate.frames, candidate.numbers
     i, j, k = corners
-    spread = settings[SCALE_TOLERANCE]
+    spread = settings.scale_tolerance
     mi, mj, mk = observed[i, MAGNITUDE], observed[j, MAGNITUDE], observed[k, MAGNITUDE]
     numbers[SCALE] = 1.0
     framed = False
@@ -183,7 +172,7 @@ def _try_patterns(
         _, bound = test_and_refine(
             index, raw, observed, settings, candidate, tests, corners, MIN_MATCHED, WHOLE_SKY
         )
-        if bound < settings[LOG_CHANCE]:
+        if bound < settings.log_chance:
             return bound
     return 0.0
 
@@ -241,25 +230,26 @@ def _next_triangle(i: int, j: int, k: int) -> tuple[int, int, int]:
 
 @compiled_ieee
 def identify_kernel(
-    index: IndexArrays, params: Array, xy: Array, flux: Array, sigmas: Array, settings: Array
+    index: IndexArrays, params: Array, xy: Array, flux: Array, sigmas: Array, given: Records
 ) -> Answer:
     """Find the attitude of a set of detections without prior knowledge.
 
     Stage 0 tries the triangles of the brightest detections, stage 1 random triangles of more detections, and
     each further stage the triangles of the brightest detections in one part of the field. In that stage the
     sequential test uses only detections in the part, so that clutter elsewhere does not count; a candidate is
-    still refined and verified on the whole field.
+    still refined and verified on the whole field. `given` is one record of SETTINGS.
     """
     raw = Raw(params, xy, flux, sigmas)
+    settings: Settings = given[0]
     observed = observe(raw)
     n = observed.shape[0]
     candidate = new_candidate(n)
     if n < MIN_MATCHED:
         return make_answer(TOO_FEW, observed, candidate, settings, 0.0, 0, 0)
-    odds, order = hit_odds(index, settings[TEST_WINDOW]), test_order(n)
+    odds, order = hit_odds(index, settings.test_window), test_order(n)
     found = np.empty(MAX_FOUND, dtype=np.int64)
-    spread, limit, numbers = settings[SCALE_TOLERANCE], int(settings[MAX_TRIANGLES]), index.numbers
-    tolerance, gate = settings[SEARCH_TOLERANCE], settings[MAGNITUDE_GATE]
+    spread, limit, numbers = settings.scale_tolerance, settings.max_triangles, index.numbers
+    tolerance, gate = settings.search_tolerance, settings.magnitude_gate
     widest = numbers[SIDE_STEP] * SIDE_STEPS / (1.0 - spread)
     bounds = (numbers[SHORTEST_SIDE] / (1.0 + spread), widest, tolerance)
     members, draws, state = np.arange(min(n, SYSTEMATIC)), 0, np.uint64(_SEED)
@@ -284,12 +274,12 @@ def identify_kernel(
                     tolerance * STRICT_TOLERANCE,
                 )
                 gate *= STRICT_GATE
-            if n <= SYSTEMATIC or stage > 1 + PARTS or (stage > 1 and settings[PART_STARS] < 3.0):
+            if n <= SYSTEMATIC or stage > 1 + PARTS or (stage > 1 and settings.part_stars < 3):
                 break
             if stage > 1:
                 members = _detections_in_part(raw, observed, stage - 2)
                 order = members[test_order(members.shape[0])]
-                members = members[: int(settings[PART_STARS])]
+                members = members[: settings.part_stars]
             continue
         if a in (b, c) or b == c or not _worth_looking_up(observed, a, b, c, bounds):
             continue

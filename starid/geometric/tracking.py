@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices
+from starid.arrays import Array, Indices, Records
 from starid.geometric.answer import (
     MIN_MATCHED,
     Answer,
@@ -37,18 +37,7 @@ from starid.geometric.pattern_index import (
 )
 from starid.geometric.refinement import SCALE, ZERO_POINT
 from starid.geometric.search import set_rotation, set_sensor_triad
-from starid.geometric.settings import (
-    ACCEPTED,
-    BETA_X,
-    BETA_Y,
-    BETA_Z,
-    LOG_CHANCE_TRACKING,
-    MAGNITUDE_GATE,
-    NOTHING,
-    SEARCH_TOLERANCE,
-    TEST_WINDOW,
-    TOO_FEW,
-)
+from starid.geometric.settings import ACCEPTED, NOTHING, TOO_FEW, Settings
 from starid.geometric.sky_grid import cell_of
 from starid.geometric.verification import hit_odds, test_order
 from starid.jit import compiled_ieee, inner
@@ -122,7 +111,7 @@ def _try_pair(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: Array,
+    settings: Settings,
     candidate: Candidate,
     tests: tuple[Array, Indices],
     detections: tuple[int, int],
@@ -135,7 +124,7 @@ def _try_pair(
     a, b = stars
     da = index.stars[a, STAR_MAGNITUDE] - observed[i, MAGNITUDE]
     db = index.stars[b, STAR_MAGNITUDE] - observed[j, MAGNITUDE]
-    if abs(da - db) > 2.0 * settings[MAGNITUDE_GATE]:
+    if abs(da - db) > 2.0 * settings.magnitude_gate:
         return 0, 0.0
     candidate.numbers[ZERO_POINT], candidate.numbers[SCALE] = 0.5 * (da + db), 1.0
     set_sensor_triad(observed, (i, i, j), raw.params[MODEL], 1.0, candidate.frames)
@@ -148,7 +137,7 @@ def _try_detections(
     index: IndexArrays,
     raw: Raw,
     observed: Table,
-    settings: Array,
+    settings: Settings,
     candidate: Candidate,
     tests: tuple[Array, Indices],
     detections: tuple[int, int],
@@ -172,13 +161,13 @@ def _try_detections(
         for q in range(counts[j]):
             a, b = near[i, p], near[j, q]
             work[0] += 1
-            if a == b or abs(chord(index.stars, a, b) - separation) > settings[SEARCH_TOLERANCE]:
+            if a == b or abs(chord(index.stars, a, b) - separation) > settings.search_tolerance:
                 continue
             work[1] += 1
             matched, bound = _try_pair(
                 index, raw, observed, settings, candidate, tests, detections, (a, b), min_matched, prior
             )
-            if matched >= MIN_MATCHED and bound < settings[LOG_CHANCE_TRACKING]:
+            if matched >= MIN_MATCHED and bound < settings.log_chance_tracking:
                 return bound
             if matched > 0 and bound < 0.0:
                 _keep_better(candidate, bound, best, bounds)
@@ -192,7 +181,7 @@ def track_kernel(
     xy: Array,
     flux: Array,
     sigmas: Array,
-    settings: Array,
+    given: Records,
     predicted: Array,
     window_rad: float,
     min_matched: int,
@@ -202,6 +191,7 @@ def track_kernel(
 
     Parameters
     ----------
+    given : ndarray (1,) of SETTINGS
     predicted : ndarray (3, 3)
         ICRS→sensor.
     window_rad : float
@@ -212,17 +202,18 @@ def track_kernel(
         See `starid.geometric.verification.log_false_probability`.
     """
     raw = Raw(params, xy, flux, sigmas)
+    settings: Settings = given[0]
     observed = observe(raw)
     n = observed.shape[0]
     candidate, best, bounds = new_candidate(n), new_candidate(n), np.zeros(2)
     best.stars[:] = -1
-    tests = (hit_odds(index, settings[TEST_WINDOW]), test_order(n))
+    tests = (hit_odds(index, settings.test_window), test_order(n))
     near = np.empty((PAIRED, CANDIDATES), dtype=np.int64)
     counts = np.zeros(PAIRED, dtype=np.int64)
     status, bound, work = TOO_FEW if n < min_matched else NOTHING, 0.0, np.zeros(2, dtype=np.int64)
     for j in range(min(n, PAIRED) if status == NOTHING else 0):
         x, y, z = without_aberration(
-            *to_sky(predicted, observed, j), settings[BETA_X], settings[BETA_Y], settings[BETA_Z]
+            *to_sky(predicted, observed, j), settings.beta_x, settings.beta_y, settings.beta_z
         )
         counts[j] = _stars_near(index, x, y, z, window_rad, near, j)
         for i in range(j):
@@ -236,6 +227,6 @@ def track_kernel(
         if status == ACCEPTED:
             return make_answer(status, observed, candidate, settings, bound, work[0], work[1])
     bound = bounds[0] - bounds[1]
-    if bound < settings[LOG_CHANCE_TRACKING]:
+    if bound < settings.log_chance_tracking:
         status = ACCEPTED
     return make_answer(status, observed, best, settings, bound, work[0], work[1])

@@ -42,7 +42,7 @@ from starid.geometric.pattern_index import (
     magnitude_bin,
 )
 from starid.geometric.refinement import PRIOR_FREEDOM, SCALE_VARIANCE, SCATTER, VARIANCE, ZERO_POINT
-from starid.geometric.settings import FIELD_PX, PX_PER_RAD, SCALE_TOLERANCE, SIGMAS_KNOWN, TEST_WINDOW
+from starid.geometric.settings import Settings
 from starid.geometric.sky_grid import cell_of
 from starid.jit import inner
 from starid.projection import MODEL
@@ -114,7 +114,7 @@ def worth_refining(
     rotation: Array,
     scale: float,
     faintest_offset: float,
-    settings: Array,
+    settings: Settings,
     odds: Array,
     order: Indices,
     used: tuple[int, int, int],
@@ -138,7 +138,7 @@ def worth_refining(
     """
     stars, grid_start, grid_stars = index.stars, index.grid_start, index.grid_stars
     cells = int(index.numbers[GRID_CELLS])
-    limit2 = settings[TEST_WINDOW] * settings[TEST_WINDOW]
+    limit2 = settings.test_window * settings.test_window
     miss = math.log(1.0 - TRUE_SHARE)
     total = 0.0
     hits = 0
@@ -265,7 +265,7 @@ def log_false_probability(
     matched: int,
     normal: Array,
     numbers: Array,
-    settings: Array,
+    settings: Settings,
     prior: tuple[float, float],
 ) -> float:
     """Log of the bound on the probability that an agreement is chance; see the module.
@@ -279,7 +279,7 @@ def log_false_probability(
     prior : (float, float)
         Prior volume of rotations, rad³, and solid angle for one star, sr: `WHOLE_SKY` when lost in space.
     """
-    spread = settings[SCALE_TOLERANCE]
+    spread = settings.scale_tolerance
     freedom = 2 * matched - (4 if spread > 0.0 else 3)
     determinant = (
         normal[0, 0] * (normal[1, 1] * normal[2, 2] - normal[1, 2] * normal[2, 1])
@@ -288,14 +288,14 @@ def log_false_probability(
     )
     if freedom <= 0 or not (determinant > 0.0 and numbers[VARIANCE] > 0.0):
         return 0.0
-    variance, noise_factor = _noise(numbers, freedom, settings[SIGMAS_KNOWN] > 0.0)
+    variance, noise_factor = _noise(numbers, freedom, settings.sigmas_known != 0)
     log_factor, lone = _log_detections(
-        index, seen, rotation, stars, numbers, math.sqrt(variance), settings[FIELD_PX]
+        index, seen, rotation, stars, numbers, math.sqrt(variance), settings.field_px
     )
     log_factor += noise_factor
     half_volume = 1.5 * math.log(2.0 * math.pi * variance) - 0.5 * math.log(determinant)
     log_factor += min(half_volume - math.log(prior[0]), 0.0)
-    log_factor -= math.log(max(lone / (prior[1] * settings[PX_PER_RAD] ** 2), 1.0))
+    log_factor -= math.log(max(lone / (prior[1] * settings.px_per_rad**2), 1.0))
     scatter = max(numbers[SCATTER], SCATTER_FLOOR)
     log_factor += min(math.log(math.sqrt(2.0 * math.pi / matched) * scatter / ZERO_POINT_RANGE), 0.0)
     if spread > 0.0:

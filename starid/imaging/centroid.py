@@ -10,22 +10,50 @@ given noise. Saturated pixels have no weight.
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 
-from starid.arrays import Array, Array32
+from starid.arrays import Array, Array32, record_type
 from starid.imaging.normal_table import normal, quick_normal
 from starid.jit import compiled_ieee, compiled_sums
-
-FIT_COLUMNS: Final = 9
-X, Y, FLUX, VAR_X, VAR_Y, VAR_FLUX, CHI2, PIXELS, STATE = range(FIT_COLUMNS)
-"""Columns of a table of fits; STATE is one of the numbers below."""
 
 UNUSABLE: Final = 1e9
 """Least count at which a pixel of a window has no weight: saturated and masked pixels are set to infinity."""
 
 GOOD, NO_FIT, HOT_PIXEL, WANDERED, FAINT = range(5)
+"""States of a fit."""
+
+
+class Fit(Protocol):
+    """The fit of a spot, a record of `FIT`.
+
+    Attributes
+    ----------
+    x, y : float
+        Position, image pixels.
+    flux : float
+        Light, counts.
+    var_x, var_y, var_flux : float
+        Their variances, pixels² and counts².
+    chi2, pixels : float
+        Weighted sum of squares, and over how many pixels.
+    state : int
+        GOOD, or why there is no position.
+    """
+
+    x: float
+    y: float
+    flux: float
+    var_x: float
+    var_y: float
+    var_flux: float
+    chi2: float
+    pixels: float
+    state: int
+
+
+FIT: Final = record_type(Fit)
 
 _ITERATIONS: Final = 12
 _FAR_MORE: Final = 1.8
@@ -189,7 +217,7 @@ def fit_star(
     least_signal: float,
     model: Array,
     work: Array,
-    result: Array,
+    result: Fit,
 ) -> None:
     """Fit one star to a window.
 
@@ -213,18 +241,18 @@ def fit_star(
         Room for rows·columns pixels; on return, the model near the result.
     work : ndarray (5, side)
         Scratch; side at least that of the window, and 11.
-    result : ndarray (FIT_COLUMNS,)
-        Filled; CHI2 is the weighted sum of squares over PIXELS pixels.
+    result : Fit
+        Filled.
     """
     x, y = start
-    result[STATE] = NO_FIT
+    result.state = NO_FIT
     star_model(x, y, shape, window, model, work)
     flux, by_shape, by_pixel, _, _ = explained(pixels, model)
     if flux <= 0.0 or by_shape < least_signal * least_signal:
-        result[STATE] = FAINT
+        result.state = FAINT
         return
     if least_signal > 0.0 and shape[0] > SHARP_SIGMA_PX and by_pixel > _FAR_MORE * by_shape:
-        result[STATE] = HOT_PIXEL
+        result.state = HOT_PIXEL
         return
     sums = work[4]
     for iteration in range(_ITERATIONS + 1):
@@ -253,22 +281,22 @@ def fit_star(
         small_flux = max(_CONVERGED_FLUX * flux, _CONVERGED_SIGMA * math.sqrt(c_ff * scale))
         settled = longest <= small and abs(step_f) <= small_flux
         if settled or iteration == _ITERATIONS:
-            result[X] = x + step_x if settled else x
-            result[Y] = y + step_y if settled else y
-            result[FLUX] = flux + step_f
-            result[VAR_X] = c_xx * scale
-            result[VAR_Y] = c_yy * scale
-            result[VAR_FLUX] = c_ff * scale
-            result[CHI2] = sums[9]
-            result[PIXELS] = sums[10]
-            result[STATE] = GOOD if longest <= _SETTLED_PX else WANDERED
+            result.x = x + step_x if settled else x
+            result.y = y + step_y if settled else y
+            result.flux = flux + step_f
+            result.var_x = c_xx * scale
+            result.var_y = c_yy * scale
+            result.var_flux = c_ff * scale
+            result.chi2 = sums[9]
+            result.pixels = sums[10]
+            result.state = GOOD if longest <= _SETTLED_PX else WANDERED
             return
         shrink = min(1.0, _MAX_STEP_PX / longest)
         x += shrink * step_x
         y += shrink * step_y
         flux = max(flux + shrink * step_f, 0.2 * flux)
         if abs(x - start[0]) > window[2] or abs(y - start[1]) > window[3]:
-            result[STATE] = WANDERED
+            result.state = WANDERED
             return
 
 

@@ -10,23 +10,14 @@ from typing import Final, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, GreyImage, Indices32, Mask
+from starid.arrays import Array, Array32, GreyImage, Indices32, Mask, Records
 from starid.errors import StaridError
 from starid.imaging.background import Background, estimate_background
 from starid.imaging.centroid import (
-    CHI2,
     FAINT,
-    FIT_COLUMNS,
-    FLUX,
+    FIT,
     GOOD,
     NO_FIT,
-    PIXELS,
-    STATE,
-    VAR_FLUX,
-    VAR_X,
-    VAR_Y,
-    X,
-    Y,
 )
 from starid.imaging.matched_filter import (
     INTEGER_TAPS_SUM,
@@ -59,11 +50,9 @@ from starid.imaging.spot_shape import (
 from starid.imaging.spot_width import spot_widths
 from starid.imaging.trail_filter import sum_along_trails, trail_noise_factor, trail_steps
 from starid.imaging.windows import (
-    COLUMNS,
     MIN_SPREAD_PX,
     SEEN_BEFORE,
-    START_Y,
-    WINDOW_COLUMNS,
+    WINDOW,
     cut_windows,
     lay_windows,
     sky_under_lone_pixels,
@@ -233,14 +222,14 @@ class _Fits:
     `sensor`, `lit` and `size` are arguments of `starid.imaging.measurement.measure`.
     """
 
-    windows: Table
+    windows: Records
     pixels: Grid
     first: Indices32
     neighbours: Indices32
     sensor: tuple[float, float, float, float, float]
     lit: tuple[float, float, float]
     size: tuple[int, int]
-    stars: Table
+    stars: Records
     flags: npt.NDArray[np.uint8]
 
     def measure(self, todo: Mask, turns: tuple[int, int]) -> None:
@@ -262,8 +251,8 @@ class _Fits:
     @property
     def suspicious(self) -> bool:
         """Whether many candidates do not have the shape of a star."""
-        good = self.stars[self.stars[:, STATE] == GOOD]
-        misfits = np.count_nonzero(_misfits(good)[1]) + np.count_nonzero(self.stars[:, STATE] == NOT_A_STAR)
+        good = self.stars[self.stars["state"] == GOOD]
+        misfits = np.count_nonzero(_misfits(good)[1]) + np.count_nonzero(self.stars["state"] == NOT_A_STAR)
         return bool(misfits >= max(_MISFITS_FOR_TRAILS, _MISFIT_SHARE * len(good)))
 
 
@@ -315,7 +304,7 @@ def detect(image: npt.NDArray[np.generic], settings: DetectionSettings | None = 
         )
     fits = _fit_candidates(scene, peaks, heights, shape)
     if unsure and fits.suspicious:
-        shape = _trails_among_round(scene, peaks[: len(fits.stars)][fits.stars[:, STATE] != FAINT], shape)
+        shape = _trails_among_round(scene, peaks[: len(fits.stars)][fits.stars["state"] != FAINT], shape)
         if shape.trail_px > 0.0:
             fits = _fit_candidates(scene, *_trail_peaks(scene, shape, hot), shape)
     return _stars_of(scene, fits, shape, len(hot))
@@ -456,17 +445,17 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
     per_dn = 0.0 if settings.gain_e_per_dn is None else 1.0 / settings.gain_e_per_dn
     flux = heights / np.float32(noise_factor(spot_taps(shape.sigma_px)) ** 2)
     count = len(peaks)
-    windows = np.zeros((count, WINDOW_COLUMNS))
+    windows = np.zeros(count, WINDOW)
     spot = (shape.sigma_px, scene.saturation, background.median_noise)
     total = lay_windows(counts, peaks, flux, *scene.grids, spot, shape.flow, windows)
     pixels = np.empty(total, dtype=np.float32)
     cut_windows(counts, windows, *scene.level, scene.saturation, pixels)
     first = np.empty(count + 1, dtype=np.int32)
     neighbours = np.empty(_MAX_NEIGHBOURS * count, dtype=np.int32)
-    find_neighbours(windows, np.argsort(windows[:, START_Y]), first, neighbours)
+    find_neighbours(windows, np.argsort(windows["start_y"]), first, neighbours)
     ratio = _RELAX * settings.threshold_sigma
-    stars = np.zeros((count, FIT_COLUMNS))
-    stars[:, STATE] = NO_FIT
+    stars = np.zeros(count, FIT)
+    stars["state"] = NO_FIT
     fits = _Fits(
         windows,
         pixels,
@@ -485,11 +474,11 @@ def _fit_candidates(scene: _Scene, peaks: Indices32, heights: Grid, shape: SpotS
 def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     """Fit bad candidates as pairs and add their companions."""
     stars = fits.stars
-    bad = (stars[:, STATE] == GOOD) & (stars[:, CHI2] > BAD_FIT * (stars[:, PIXELS] - FIT_PARAMETERS))
+    bad = (stars["state"] == GOOD) & (stars["chi2"] > BAD_FIT * (stars["pixels"] - FIT_PARAMETERS))
     if not bad.any():
         return fits
     suspects = np.flatnonzero(bad & ((fits.flags & SATURATED) == 0))
-    partners, owners = np.empty((len(suspects), FIT_COLUMNS)), np.empty(len(suspects), dtype=np.int64)
+    partners, owners = np.empty(len(suspects), FIT), np.empty(len(suspects), dtype=np.int64)
     near = (fits.first, fits.neighbours)
     found = split_pairs(
         fits.windows, fits.pixels, *near, fits.sensor[:3], stars, suspects, blend_px, partners, owners, bad
@@ -504,10 +493,10 @@ def _with_companions(fits: _Fits, blend_px: float) -> _Fits:
     )
 
 
-def _misfits(fits: Table) -> tuple[Array, Mask]:
+def _misfits(fits: Records) -> tuple[Array, Mask]:
     """Reduced χ² (n,) of the fits, and which of them do not have the shape of a star."""
-    freedom = np.maximum(fits[:, PIXELS] - FIT_PARAMETERS, 1.0)
-    misfit = fits[:, CHI2] / freedom
+    freedom = np.maximum(fits["pixels"] - FIT_PARAMETERS, 1.0)
+    misfit = fits["chi2"] / freedom
     return misfit, misfit > 1.0 + _MISFIT_SIGMA * np.sqrt(2.0 / freedom)
 
 
@@ -515,23 +504,24 @@ def _stars_of(scene: _Scene, fits: _Fits, shape: SpotShape, hot: int) -> Detecti
     """Keep the candidates that are stars; `hot` others were rejected before."""
     background, settings = scene.background, scene.settings
     fits = _with_companions(fits, settings.blend_px)
-    states = fits.stars[:, STATE]
+    states = fits.stars["state"]
     good = np.flatnonzero(states == GOOD)
-    again = (states == TWICE) | (fits.windows[:, COLUMNS] == SEEN_BEFORE)
+    again = (states == TWICE) | (fits.windows["columns"] == SEEN_BEFORE)
     rejected = len(states) - good.size - int(np.count_nonzero(again)) + hot
     if good.size == 0:
         return _no_detections(background, "nothing on the image has the shape of a star", rejected)
-    good = good[np.argsort(-fits.stars[good, FLUX], kind="stable")][: settings.max_stars]
+    good = good[np.argsort(-fits.stars["flux"][good], kind="stable")][: settings.max_stars]
     stars, marks = fits.stars[good], fits.flags[good]
     misfit, is_bad = _misfits(stars)
-    stars[:, [VAR_X, VAR_Y, VAR_FLUX]] *= np.where(is_bad, misfit, 1.0)[:, None]
-    doubt_close_pairs(stars, np.argsort(-stars[:, Y], kind="stable"), settings.blend_px)
+    for variance in ("var_x", "var_y", "var_flux"):
+        stars[variance] *= np.where(is_bad, misfit, 1.0)
+    doubt_close_pairs(stars, np.argsort(-stars["y"], kind="stable"), settings.blend_px)
     unit = 1.0 if settings.gain_e_per_dn is None else settings.gain_e_per_dn
     return Detections(
-        stars[:, [X, Y]],
-        stars[:, FLUX] * unit,
-        np.sqrt(stars[:, VAR_FLUX]) * unit,
-        np.sqrt(stars[:, [VAR_X, VAR_Y]]),
+        np.column_stack([stars["x"], stars["y"]]),
+        stars["flux"] * unit,
+        np.sqrt(stars["var_flux"]) * unit,
+        np.sqrt(np.column_stack([stars["var_x"], stars["var_y"]])),
         (marks & SATURATED) != 0,
         (marks & AT_EDGE) != 0,
         background.median_level,

@@ -8,40 +8,21 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, Indices, Indices32, Mask
+from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
 from starid.imaging.centroid import (
-    CHI2,
     FAINT,
-    FLUX,
     GOOD,
     HOT_PIXEL,
-    PIXELS,
     SHARP_SIGMA_PX,
     SHORT_TRAIL_PX,
-    STATE,
     UNUSABLE,
     WANDERED,
-    X,
-    Y,
+    Fit,
     explained,
     fit_star,
     star_model,
 )
-from starid.imaging.windows import (
-    COLUMNS,
-    LEFT,
-    NOISE,
-    OFFSET,
-    PATCH,
-    RADIUS_X,
-    RADIUS_Y,
-    ROWS,
-    START_X,
-    START_Y,
-    TOP,
-    TRAIL_X,
-    TRAIL_Y,
-)
+from starid.imaging.windows import Window
 from starid.jit import compiled_ieee
 from starid.small_arrays import copy_values
 
@@ -73,15 +54,15 @@ _MIN_SIDE: Final = 11
 
 
 @compiled_ieee
-def find_neighbours(windows: Array, order: Indices, first: Indices32, neighbours: Indices32) -> int:
+def find_neighbours(windows: Records, order: Indices, first: Indices32, neighbours: Indices32) -> int:
     """List, for every window, the others whose stars may contribute light to it.
 
     Parameters
     ----------
-    windows : ndarray (n, WINDOW_COLUMNS)
+    windows : ndarray (n,) of WINDOW
         From `lay_windows`.
     order : ndarray (n,)
-        Indices of the windows, sorted by START_Y.
+        Indices of the windows, sorted by `start_y`.
     first : ndarray (n + 1,)
         Filled so that the neighbours of k are ``neighbours[first[k]:first[k + 1]]``.
     neighbours : ndarray (m,)
@@ -98,25 +79,25 @@ def find_neighbours(windows: Array, order: Indices, first: Indices32, neighbours
         place[order[rank]] = rank
     tallest = 0.0
     for k in range(windows.shape[0]):
-        if windows[k, COLUMNS] > 0.0:
-            tallest = max(tallest, windows[k, RADIUS_Y])
+        if windows[k].columns > 0:
+            tallest = max(tallest, windows[k].radius_y)
     for k in range(windows.shape[0]):
         first[k] = min(count, neighbours.size)
-        if windows[k, COLUMNS] <= 0.0:
+        if windows[k].columns <= 0:
             continue
         for step in (-1, 1):
             rank = place[k] + step
             while 0 <= rank < order.size:
                 other = order[rank]
                 rank += step
-                off_y = abs(windows[other, START_Y] - windows[k, START_Y])
-                if off_y > tallest + windows[k, RADIUS_Y]:
+                off_y = abs(windows[other].start_y - windows[k].start_y)
+                if off_y > tallest + windows[k].radius_y:
                     break
                 if (
-                    windows[other, COLUMNS] > 0.0
-                    and off_y <= windows[other, RADIUS_Y] + windows[k, RADIUS_Y]
-                    and abs(windows[other, START_X] - windows[k, START_X])
-                    <= windows[other, RADIUS_X] + windows[k, RADIUS_X]
+                    windows[other].columns > 0
+                    and off_y <= windows[other].radius_y + windows[k].radius_y
+                    and abs(windows[other].start_x - windows[k].start_x)
+                    <= windows[other].radius_x + windows[k].radius_x
                 ):
                     if count < neighbours.size:
                         neighbours[count] = other
@@ -127,19 +108,19 @@ def find_neighbours(windows: Array, order: Indices, first: Indices32, neighbours
 
 @compiled_ieee
 def _mask_stray_pixel(
-    pixels: Array32, model: Array, star: Array, window: Array, sigma: float, per_dn: float, model_error: float
+    pixels: Array32, model: Array, star: Fit, window: Window, sigma: float, per_dn: float, model_error: float
 ) -> bool:
     """Mask the pixel outside the star's core that contradicts the fit most, if any does."""
     worst = _STRAY_SIGMA * _STRAY_SIGMA
     stray = -1
-    variance = window[NOISE] * window[NOISE]
-    columns = int(window[COLUMNS])
+    variance = window.noise * window.noise
+    columns = window.columns
     for k in range(pixels.size):
-        off_x = abs(window[LEFT] + k % columns - star[X]) - 0.5 * abs(window[TRAIL_X])
-        off_y = abs(window[TOP] + k // columns - star[Y]) - 0.5 * abs(window[TRAIL_Y])
+        off_x = abs(window.left + k % columns - star.x) - 0.5 * abs(window.trail_x)
+        off_y = abs(window.top + k // columns - star.y) - 0.5 * abs(window.trail_y)
         if max(off_x, off_y) < _STRAY_DISTANCE_SIGMA * sigma or not pixels[k] < UNUSABLE:
             continue
-        light = star[FLUX] * model[0, k]
+        light = star.flux * model[0, k]
         off = pixels[k] - light
         error = model_error * light
         chi2 = off * off / (variance + light * per_dn + error * error)
@@ -158,89 +139,87 @@ def _is_at_rest(
     noise: tuple[float, float, float],
     model: Array,
     work: Array,
-    star: Array,
-    spot: Array,
+    star: Fit,
+    spot: Fit,
 ) -> bool:
     """Whether a spot at rest fits and the trail of a star does not; `spot` is workspace for its fit."""
-    bad = BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
-    if star[STATE] != GOOD or star[CHI2] <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
+    bad = BAD_FIT * (star.pixels - FIT_PARAMETERS)
+    if star.state != GOOD or star.chi2 <= bad or math.hypot(shape[1], shape[2]) <= SHORT_TRAIL_PX:
         return False
-    fit_star(pixels, bounds, (star[X], star[Y]), (shape[0], 0.0, 0.0), noise, 0.0, model, work, spot)
-    return bool(spot[STATE] == GOOD and spot[CHI2] <= min(bad, _AT_REST * star[CHI2]))
+    fit_star(pixels, bounds, (star.x, star.y), (shape[0], 0.0, 0.0), noise, 0.0, model, work, spot)
+    return bool(spot.state == GOOD and spot.chi2 <= min(bad, _AT_REST * star.chi2))
 
 
 @compiled_ieee
 def _classify_fit(
     pixels: Array32,
     model: Array,
-    star: Array,
-    window: Array,
+    star: Fit,
+    window: Window,
     sigma: float,
     least_ratio: float,
     saturation_dn: float,
     lit: tuple[float, float, float],
     size: tuple[int, int],
-) -> float:
+) -> int:
     """Return GOOD for a star, or the reason to reject the fit."""
     width, height = size
-    noise, patch = window[NOISE], window[PATCH]
-    length = math.hypot(window[TRAIL_X], window[TRAIL_Y])
-    if not star[FLUX] > 0.0:
-        return float(FAINT)
-    if not (-0.5 <= star[X] < width - 0.5 and -0.5 <= star[Y] < height - 0.5):
-        return float(OUTSIDE)
+    noise, patch = window.noise, window.patch
+    length = math.hypot(window.trail_x, window.trail_y)
+    if not star.flux > 0.0:
+        return FAINT
+    if not (-0.5 <= star.x < width - 0.5 and -0.5 <= star.y < height - 0.5):
+        return OUTSIDE
     squares = 0.0
     for k in range(pixels.size):
         squares += model[0, k] * model[0, k]
-    if patch == 0.0 and star[FLUX] * math.sqrt(squares) < least_ratio * noise:
-        return float(FAINT)
+    if patch == 0.0 and star.flux * math.sqrt(squares) < least_ratio * noise:
+        return FAINT
     bright = 0
     for k in range(pixels.size):
         bright += pixels[k] > lit[0] * noise
     if not lit[1] <= bright <= lit[2]:
-        return float(WRONG_SIZE)
+        return WRONG_SIZE
     allowed = _WANDER_PX * max(sigma, 1.0) + patch + 0.5 * length
-    if math.hypot(star[X] - window[START_X], star[Y] - window[START_Y]) > allowed:
-        return float(WANDERED)
+    if math.hypot(star.x - window.start_x, star.y - window.start_y) > allowed:
+        return WANDERED
     if patch > 0.0:
         # the wings must imply a saturated core
         return (
-            float(GOOD)
-            if star[FLUX] * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn
-            else float(HOT_PIXEL)
+            GOOD if star.flux * np.max(model[0, : pixels.size]) > _WING_SHARE * saturation_dn else HOT_PIXEL
         )
     _, by_shape, by_pixel, total, used = explained(pixels, model)
     if sigma > SHARP_SIGMA_PX and by_pixel > by_shape:
-        return float(HOT_PIXEL)
+        return HOT_PIXEL
     if by_shape < _MIN_EXPLAINED * (total - 2.0 * used * noise * noise):
-        return float(NOT_A_STAR)
-    return float(GOOD)
+        return NOT_A_STAR
+    return GOOD
 
 
 @compiled_ieee
-def _flags(star: Array, window: Array, pixels: Array32, sigma: float, size: tuple[int, int]) -> int:
+def _flags(star: Fit, window: Window, pixels: Array32, sigma: float, size: tuple[int, int]) -> int:
     """Flags of a star: whether its core has saturated pixels, and whether the image edge cuts off its light."""
     flags = 0
-    reach_x = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_X])
-    reach_y = _EDGE_SIGMA * sigma + 0.5 * abs(window[TRAIL_Y])
+    reach_x = _EDGE_SIGMA * sigma + 0.5 * abs(window.trail_x)
+    reach_y = _EDGE_SIGMA * sigma + 0.5 * abs(window.trail_y)
     if (
-        min(star[X] - reach_x, star[Y] - reach_y) < -0.5
-        or star[X] + reach_x > size[0] - 0.5
-        or star[Y] + reach_y > size[1] - 0.5
+        min(star.x - reach_x, star.y - reach_y) < -0.5
+        or star.x + reach_x > size[0] - 0.5
+        or star.y + reach_y > size[1] - 0.5
     ):
         flags |= AT_EDGE
-    if window[PATCH] > 0.0:
+    if window.patch > 0.0:
         flags |= SATURATED
-    column, row = round(star[X] - window[LEFT]), round(star[Y] - window[TOP])
-    inside = 0 <= row < window[ROWS] and 0 <= column < window[COLUMNS]
-    if inside and not pixels[row * int(window[COLUMNS]) + column] < UNUSABLE:
+    column, row = round(star.x - window.left), round(star.y - window.top)
+    inside = 0 <= row < window.rows and 0 <= column < window.columns
+    if inside and not pixels[row * window.columns + column] < UNUSABLE:
         flags |= SATURATED
     return flags
 
 
 @compiled_ieee
 def _subtract_star(
-    star: Array,
+    star: Fit,
     shape: tuple[float, float, float],
     bounds: tuple[int, int, int, int],
     lights: Array,
@@ -248,16 +227,16 @@ def _subtract_star(
     target: Array32,
 ) -> None:
     """Subtract the light of a candidate, if it is a star, from a window."""
-    if star[STATE] != GOOD:
+    if star.state != GOOD:
         return
-    star_model(star[X], star[Y], shape, bounds, lights, work)
+    star_model(star.x, star.y, shape, bounds, lights, work)
     for i in range(target.size):
-        target[i] -= np.float32(star[FLUX] * lights[0, i])
+        target[i] -= np.float32(star.flux * lights[0, i])
 
 
 @compiled_ieee
 def measure(
-    windows: Array,
+    windows: Records,
     pixels: Array32,
     first: Indices32,
     neighbours: Indices32,
@@ -266,7 +245,7 @@ def measure(
     size: tuple[int, int],
     todo: Mask,
     turns: tuple[int, int],
-    stars: Array,
+    stars: Records,
     flags: npt.NDArray[np.uint8],
 ) -> None:
     """Fit and classify candidates.
@@ -292,66 +271,67 @@ def measure(
     turns : (int, int)
         First and last round: `FRESH`, or `AGAIN` to continue from existing fits. In the last round a fit that is still bad is
         repeated without the pixel that contradicts it most.
-    stars : ndarray (n, FIT_COLUMNS)
-        Filled with the fits; STATE is NO_FIT before the first round.
+    stars : ndarray (n,) of FIT
+        Filled; `state` is NO_FIT before the first round.
     flags : ndarray (n,)
         Filled with bits `SATURATED`, `AT_EDGE`.
     """
     sigma, per_dn, model_error, least_ratio, saturation_dn = sensor
     largest, side = 1, _MIN_SIDE
     for k in range(windows.shape[0]):
-        if windows[k, COLUMNS] > 0.0:
-            largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
-            side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
+        if windows[k].columns > 0:
+            largest = max(largest, windows[k].columns * windows[k].rows)
+            side = max(side, windows[k].columns, windows[k].rows)
     model = np.empty((3, largest))
     lights = np.empty((3, largest))
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
-    spot = np.empty(stars.shape[1])
+    spot: Fit = np.empty_like(stars[:1])[0]
     for turn in range(turns[0], turns[1]):
         last = turns[0] > 0 and turn == turns[1] - 1
         for k in range(windows.shape[0]):
-            window, star = windows[k], stars[k]
+            window: Window = windows[k]
+            star: Fit = stars[k]
             alone = first[k] == first[k + 1]
-            if not todo[k] or window[COLUMNS] <= 0.0:
+            if not todo[k] or window.columns <= 0:
                 continue
-            if turn > 0 and (star[STATE] != GOOD or (alone and not last)):
+            if turn > 0 and (star.state != GOOD or (alone and not last)):
                 continue
-            bounds = (int(window[LEFT]), int(window[TOP]), int(window[COLUMNS]), int(window[ROWS]))
+            bounds = (window.left, window.top, window.columns, window.rows)
             count = bounds[2] * bounds[3]
-            begin = int(window[OFFSET])
+            begin = window.offset
             own = pixels[begin : begin + count]
-            shape = (sigma, window[TRAIL_X], window[TRAIL_Y])
+            shape = (sigma, window.trail_x, window.trail_y)
             target = own
             if not alone:
                 target = cleaned[:count]
                 copy_values(own, target)
                 for entry in range(first[k], first[k + 1]):
                     _subtract_star(stars[neighbours[entry]], shape, bounds, lights, work, target)
-            noise = (window[NOISE] * window[NOISE], per_dn, model_error)
-            guess = (star[X], star[Y]) if turn > 0 else (window[START_X], window[START_Y])
-            least = _HOPELESS * least_ratio * window[NOISE] if turn == 0 and window[PATCH] == 0.0 else 0.0
+            noise = (window.noise * window.noise, per_dn, model_error)
+            guess = (star.x, star.y) if turn > 0 else (window.start_x, window.start_y)
+            least = _HOPELESS * least_ratio * window.noise if turn == 0 and window.patch == 0.0 else 0.0
             fit_star(target, bounds, guess, shape, noise, least, model, work, star)
             if (
                 last
-                and star[STATE] == GOOD
-                and star[CHI2] > BAD_FIT * (star[PIXELS] - FIT_PARAMETERS)
+                and star.state == GOOD
+                and star.chi2 > BAD_FIT * (star.pixels - FIT_PARAMETERS)
                 and _mask_stray_pixel(target, model, star, window, sigma, per_dn, model_error)
             ):
-                fit_star(target, bounds, (star[X], star[Y]), shape, noise, 0.0, model, work, star)
-            if star[STATE] == GOOD:
-                star[STATE] = _classify_fit(
+                fit_star(target, bounds, (star.x, star.y), shape, noise, 0.0, model, work, star)
+            if star.state == GOOD:
+                star.state = _classify_fit(
                     target, model, star, window, sigma, least_ratio, saturation_dn, lit, size
                 )
             if not last and _is_at_rest(target, bounds, shape, noise, model, work, star, spot):
-                star[STATE] = NOT_A_STAR
-            if star[STATE] == GOOD:
+                star.state = NOT_A_STAR
+            if star.state == GOOD:
                 flags[k] = _flags(star, window, own, sigma, size)
         _drop_doubles(stars, first, neighbours, sigma)
 
 
 @compiled_ieee
-def _drop_doubles(stars: Array, first: Indices32, neighbours: Indices32, sigma: float) -> None:
+def _drop_doubles(stars: Records, first: Indices32, neighbours: Indices32, sigma: float) -> None:
     """Mark the fainter of two fits with the same position."""
     reach = max(0.7 * sigma, 0.5)
     for k in range(stars.shape[0]):
@@ -359,9 +339,9 @@ def _drop_doubles(stars: Array, first: Indices32, neighbours: Indices32, sigma: 
             other = neighbours[place]
             if (
                 other > k
-                and stars[k, STATE] == GOOD
-                and stars[other, STATE] == GOOD
-                and abs(stars[other, X] - stars[k, X]) < reach
-                and abs(stars[other, Y] - stars[k, Y]) < reach
+                and stars[k].state == GOOD
+                and stars[other].state == GOOD
+                and abs(stars[other].x - stars[k].x) < reach
+                and abs(stars[other].y - stars[k].y) < reach
             ):
-                stars[other, STATE] = TWICE
+                stars[other].state = TWICE

@@ -7,23 +7,15 @@ from typing import Final
 
 import numpy as np
 
-from starid.arrays import Array, Array32, Indices, Indices32, Mask
+from starid.arrays import Array, Array32, Indices, Indices32, Mask, Records
 from starid.imaging.centroid import (
-    CHI2,
-    FIT_COLUMNS,
-    FLUX,
+    FIT,
     GOOD,
-    PIXELS,
-    STATE,
     UNUSABLE,
-    VAR_FLUX,
-    VAR_X,
-    VAR_Y,
-    X,
-    Y,
+    Fit,
     star_model,
 )
-from starid.imaging.windows import COLUMNS, LEFT, NOISE, OFFSET, ROWS, TOP, TRAIL_X, TRAIL_Y, WINDOW_COLUMNS
+from starid.imaging.windows import WINDOW, Window
 from starid.jit import compiled_ieee
 from starid.photometry import EVEN_PAIR
 from starid.small_arrays import copy_values
@@ -81,7 +73,7 @@ def fit_pair(
     models: Array,
     work: Array,
     enough: float,
-    pair: Array,
+    pair: Records,
 ) -> bool:
     """Fit two stars at once to a window by Gauss–Newton steps, weighted as in `starid.imaging.centroid.fit_star`.
 
@@ -92,9 +84,9 @@ def fit_pair(
     models : ndarray (6, m)
         Room for rows·columns pixels; on return, the models of both stars.
     enough : float
-        CHI2 that a fit has to reach in its first steps, or it is abandoned.
-    pair : ndarray (2, FIT_COLUMNS)
-        First guesses of X, Y and FLUX on entry; filled with the fits. CHI2 and PIXELS are for both together.
+        `chi2` that a fit has to reach in its first steps, or it is abandoned.
+    pair : ndarray (2,) of FIT
+        First guesses of `x`, `y` and `flux` on entry; filled with the fits. `chi2` and `pixels` are for both together.
 
     Returns
     -------
@@ -110,25 +102,25 @@ def fit_pair(
     step = np.empty(_UNKNOWNS)
     for iteration in range(_ITERATIONS):
         for star in range(2):
-            star_model(pair[star, X], pair[star, Y], shape, window, models[3 * star : 3 * star + 3], work)
+            star_model(pair[star].x, pair[star].y, shape, window, models[3 * star : 3 * star + 3], work)
         matrix[:] = 0.0
         right[:] = 0.0
         chi2 = used = 0.0
         for k in range(pixels.size):
             if not pixels[k] < UNUSABLE:
                 continue
-            first, second = pair[0, FLUX] * models[0, k], pair[1, FLUX] * models[3, k]
+            first, second = pair[0].flux * models[0, k], pair[1].flux * models[3, k]
             light = first + second
             weight = 1.0 / (variance + light * per_dn + error2 * light * light)
             off = pixels[k] - light
             slopes[0], slopes[1], slopes[2] = (
-                pair[0, FLUX] * models[1, k],
-                pair[0, FLUX] * models[2, k],
+                pair[0].flux * models[1, k],
+                pair[0].flux * models[2, k],
                 models[0, k],
             )
             slopes[3], slopes[4], slopes[5] = (
-                pair[1, FLUX] * models[4, k],
-                pair[1, FLUX] * models[5, k],
+                pair[1].flux * models[4, k],
+                pair[1].flux * models[5, k],
                 models[3, k],
             )
             for i in range(_UNKNOWNS):
@@ -150,16 +142,16 @@ def fit_pair(
         longest = max(abs(step[0]), abs(step[1]), abs(step[3]), abs(step[4]))
         shrink = min(1.0, _MAX_STEP_PX / max(longest, 1e-12))
         for star in range(2):
-            pair[star, X] += shrink * step[3 * star]
-            pair[star, Y] += shrink * step[3 * star + 1]
-            flux = pair[star, FLUX]
+            pair[star].x += shrink * step[3 * star]
+            pair[star].y += shrink * step[3 * star + 1]
+            flux = pair[star].flux
             change = shrink * step[3 * star + 2]
-            pair[star, FLUX] = flux + min(max(change, -_MAX_CHANGE * flux), max(flux, -change))
-            pair[star, VAR_X] = inverse[3 * star, 3 * star]
-            pair[star, VAR_Y] = inverse[3 * star + 1, 3 * star + 1]
-            pair[star, VAR_FLUX] = inverse[3 * star + 2, 3 * star + 2]
-            pair[star, CHI2] = chi2
-            pair[star, PIXELS] = used
+            pair[star].flux = flux + min(max(change, -_MAX_CHANGE * flux), max(flux, -change))
+            pair[star].var_x = inverse[3 * star, 3 * star]
+            pair[star].var_y = inverse[3 * star + 1, 3 * star + 1]
+            pair[star].var_flux = inverse[3 * star + 2, 3 * star + 2]
+            pair[star].chi2 = chi2
+            pair[star].pixels = used
         if longest < _CONVERGED_PX:
             return True
     return False
@@ -167,7 +159,7 @@ def fit_pair(
 
 @compiled_ieee
 def _first_guesses(
-    left_over: Array, window: tuple[int, int, int, int], star: Array, sigma: float, pair: Array
+    left_over: Array, window: tuple[int, int, int, int], star: Fit, sigma: float, pair: Records
 ) -> bool:
     """Guess two stars from the residuals of a single-star fit; False if there is no residual light."""
     left, top, columns, rows = window
@@ -175,7 +167,7 @@ def _first_guesses(
     best_x = best_y = 0.0
     for j in range(1, rows - 1):
         for i in range(1, columns - 1):
-            off_x, off_y = left + i - star[X], top + j - star[Y]
+            off_x, off_y = left + i - star.x, top + j - star.y
             if math.hypot(off_x, off_y) < _CORE_SIGMA * sigma:
                 continue
             total = 0.0
@@ -187,42 +179,42 @@ def _first_guesses(
     if best <= 0.0:
         return False
     distance = math.hypot(best_x, best_y)
-    copy_values(star, pair[0])
-    copy_values(star, pair[1])
+    pair[0] = star
+    pair[1] = star
     if distance > _FAR_SIGMA * sigma:
-        pair[1, X] += best_x
-        pair[1, Y] += best_y
-        pair[1, FLUX] = min(best * 2.0 * math.pi * sigma * sigma, star[FLUX])
+        pair[1].x += best_x
+        pair[1].y += best_y
+        pair[1].flux = min(best * 2.0 * math.pi * sigma * sigma, star.flux)
         return True
     # very close: share the light between two stars on either side of the single fit
     half = 0.5 * _PAIR_SIGMA * sigma / distance
     for k in range(2):
         sense = 1.0 if k == 1 else -1.0
-        pair[k, X] += sense * half * best_x
-        pair[k, Y] += sense * half * best_y
-        pair[k, FLUX] *= 0.5
+        pair[k].x += sense * half * best_x
+        pair[k].y += sense * half * best_y
+        pair[k].flux *= 0.5
     return True
 
 
 @compiled_ieee
-def _is_better(pair: Array, chi2: float, sigma: float, models: Array, pixels: Array32) -> bool:
+def _is_better(pair: Records, chi2: float, sigma: float, models: Array, pixels: Array32) -> bool:
     """Whether two stars fit much better than one, and neither is noise or a single pixel."""
-    apart = math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y])
-    if pair[0, CHI2] > _BETTER * chi2 or apart < _CLOSEST_SIGMA * sigma:
+    apart = math.hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y)
+    if pair[0].chi2 > _BETTER * chi2 or apart < _CLOSEST_SIGMA * sigma:
         return False
-    total = pair[0, FLUX] + pair[1, FLUX]
+    total = pair[0].flux + pair[1].flux
     for k in range(2):
-        flux = pair[k, FLUX]
-        if flux < _MIN_SHARE * total or flux < _MIN_SIGNAL * math.sqrt(pair[k, VAR_FLUX]):
+        flux = pair[k].flux
+        if flux < _MIN_SHARE * total or flux < _MIN_SIGNAL * math.sqrt(pair[k].var_flux):
             return False
     # light of the fainter star without its highest pixel
     highest = everything = 0.0
-    faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
+    faint = 1 if pair[1].flux < pair[0].flux else 0
     for k in range(pixels.size):
         if pixels[k] < UNUSABLE:
-            value = pixels[k] - pair[1 - faint, FLUX] * models[3 * (1 - faint), k]
+            value = pixels[k] - pair[1 - faint].flux * models[3 * (1 - faint), k]
             highest = max(highest, value)
-            everything += pair[faint, FLUX] * models[3 * faint, k]
+            everything += pair[faint].flux * models[3 * faint, k]
     return highest < _ONE_PIXEL * everything
 
 
@@ -235,17 +227,17 @@ def _blend_shift(off_x: float, off_y: float, ratio: float, blend_px: float) -> f
 
 
 @compiled_ieee
-def doubt_close_pairs(stars: Array, order: Indices, blend_px: float) -> None:
+def doubt_close_pairs(stars: Records, order: Indices, blend_px: float) -> None:
     """Increase the errors of the brighter star of a pair that is barely resolved.
 
     A catalogue with merged pairs may have it as one star, displaced by the shift of the merged position.
 
     Parameters
     ----------
-    stars : ndarray (n, FIT_COLUMNS)
-        Fits; VAR_X and VAR_Y grow.
+    stars : ndarray (n,) of FIT
+        `var_x` and `var_y` grow.
     order : ndarray (n,)
-        Indices of the stars, sorted by decreasing Y.
+        Indices of the stars, sorted by decreasing `y`.
     blend_px : float
         See `split_pairs`.
     """
@@ -254,59 +246,59 @@ def doubt_close_pairs(stars: Array, order: Indices, blend_px: float) -> None:
         one = stars[order[place]]
         for later in range(place + 1, order.size):
             other = stars[order[later]]
-            if one[Y] - other[Y] > reach:
+            if one.y - other.y > reach:
                 break
-            off_x, off_y = other[X] - one[X], other[Y] - one[Y]
+            off_x, off_y = other.x - one.x, other.y - one.y
             if off_x * off_x + off_y * off_y > reach * reach:
                 continue
-            brighter, ratio = (one, other[FLUX] / one[FLUX])
+            brighter, ratio = (one, other.flux / one.flux)
             if ratio > 1.0:
                 brighter, ratio = other, 1.0 / ratio
             shift = _blend_shift(off_x, off_y, ratio, blend_px)
-            brighter[VAR_X] += (shift * off_x) ** 2
-            brighter[VAR_Y] += (shift * off_y) ** 2
+            brighter.var_x += (shift * off_x) ** 2
+            brighter.var_y += (shift * off_y) ** 2
 
 
 @compiled_ieee
-def _merge(pair: Array, blend_px: float, star: Array) -> None:
+def _merge(pair: Records, blend_px: float, star: Fit) -> None:
     """Replace two stars by one with their total light, at the position and with the errors of a single-spot fit.
 
     The position follows `starid.photometry.fitted_share`, so that resolved and unresolved pairs agree with an index
     of merged stars.
     """
-    faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
+    faint = 1 if pair[1].flux < pair[0].flux else 0
     bright = pair[1 - faint]
-    off_x, off_y = pair[faint, X] - bright[X], pair[faint, Y] - bright[Y]
-    shift = _blend_shift(off_x, off_y, pair[faint, FLUX] / bright[FLUX], blend_px)
-    star[X], star[Y] = bright[X] + shift * off_x, bright[Y] + shift * off_y
-    total = pair[0, FLUX] + pair[1, FLUX]
-    star[FLUX] = total
-    star[CHI2], star[PIXELS] = pair[0, CHI2], pair[0, PIXELS]
+    off_x, off_y = pair[faint].x - bright.x, pair[faint].y - bright.y
+    shift = _blend_shift(off_x, off_y, pair[faint].flux / bright.flux, blend_px)
+    star.x, star.y = bright.x + shift * off_x, bright.y + shift * off_y
+    total = pair[0].flux + pair[1].flux
+    star.flux = total
+    star.chi2, star.pixels = pair[0].chi2, pair[0].pixels
 
 
 def warm_up() -> None:
     """Compile `split_pairs`, without stars."""
     windows, stars, todo = (
-        np.zeros((1, WINDOW_COLUMNS)),
-        np.zeros((1, FIT_COLUMNS)),
+        np.zeros(1, WINDOW),
+        np.zeros(1, FIT),
         np.zeros(1, dtype=np.bool_),
     )
     pixels, near = np.empty(0, dtype=np.float32), (np.zeros(2, dtype=np.int32), np.empty(0, dtype=np.int32))
-    partners, none = np.empty((0, FIT_COLUMNS)), np.empty(0, dtype=np.int64)
+    partners, none = np.empty(0, FIT), np.empty(0, dtype=np.int64)
     split_pairs(windows, pixels, *near, (1.0, 0.0, 0.0), stars, none, 0.0, partners, none, todo)
 
 
 @compiled_ieee
 def split_pairs(
-    windows: Array,
+    windows: Records,
     pixels: Array32,
     first: Indices32,
     neighbours: Indices32,
     noise: tuple[float, float, float],
-    stars: Array,
+    stars: Records,
     suspects: Indices,
     blend_px: float,
-    partners: Array,
+    partners: Records,
     owners: Indices,
     todo: Mask,
 ) -> int:
@@ -322,7 +314,7 @@ def split_pairs(
         Indices of the stars to try.
     blend_px : float
         Pairs closer than this stay one star, at the position where a single spot fits.
-    partners : ndarray (m, FIT_COLUMNS)
+    partners : ndarray (m,) of FIT
         Filled with the fits of the fainter stars.
     owners : ndarray (m,)
         Filled with the indices of the brighter members.
@@ -337,49 +329,46 @@ def split_pairs(
     sigma, per_dn, model_error = noise
     largest, side = 1, _MIN_SIDE
     for k in suspects:
-        largest = max(largest, int(windows[k, COLUMNS] * windows[k, ROWS]))
-        side = max(side, int(max(windows[k, COLUMNS], windows[k, ROWS])))
+        largest = max(largest, windows[k].columns * windows[k].rows)
+        side = max(side, windows[k].columns, windows[k].rows)
     models = np.empty((6, largest))
     work = np.empty((5, side))
     cleaned = np.empty(largest, np.float32)
     left_over = np.empty(largest)
-    pair = np.empty((2, stars.shape[1]))
+    pair = np.empty_like(stars[:1].repeat(2))
     found = 0
     for k in suspects:
-        bounds = (
-            int(windows[k, LEFT]),
-            int(windows[k, TOP]),
-            int(windows[k, COLUMNS]),
-            int(windows[k, ROWS]),
-        )
+        window: Window = windows[k]
+        star: Fit = stars[k]
+        bounds = (window.left, window.top, window.columns, window.rows)
         count = bounds[2] * bounds[3]
-        begin = int(windows[k, OFFSET])
-        shape = (sigma, windows[k, TRAIL_X], windows[k, TRAIL_Y])
+        begin = window.offset
+        shape = (sigma, window.trail_x, window.trail_y)
         target = cleaned[:count]
         copy_values(pixels[begin:], target)
         for entry in range(first[k], first[k + 1]):
             other = stars[neighbours[entry]]
-            if other[STATE] == GOOD:
-                star_model(other[X], other[Y], shape, bounds, models[:3], work)
+            if other.state == GOOD:
+                star_model(other.x, other.y, shape, bounds, models[:3], work)
                 for i in range(count):
-                    target[i] -= np.float32(other[FLUX] * models[0, i])
-        star_model(stars[k, X], stars[k, Y], shape, bounds, models[:3], work)
+                    target[i] -= np.float32(other.flux * models[0, i])
+        star_model(star.x, star.y, shape, bounds, models[:3], work)
         for i in range(count):
-            left_over[i] = target[i] - stars[k, FLUX] * models[0, i] if target[i] < UNUSABLE else 0.0
-        if not _first_guesses(left_over, bounds, stars[k], sigma, pair):
+            left_over[i] = target[i] - star.flux * models[0, i] if target[i] < UNUSABLE else 0.0
+        if not _first_guesses(left_over, bounds, star, sigma, pair):
             continue
-        noises = (windows[k, NOISE] ** 2, per_dn, model_error)
-        enough = _BETTER * stars[k, CHI2]
+        noises = (window.noise**2, per_dn, model_error)
+        enough = _BETTER * star.chi2
         fitted = fit_pair(target, bounds, shape, noises, models, work, enough, pair)
-        if not fitted or not _is_better(pair, stars[k, CHI2], sigma, models, target):
+        if not fitted or not _is_better(pair, star.chi2, sigma, models, target):
             continue
         todo[k] = False
-        faint = 1 if pair[1, FLUX] < pair[0, FLUX] else 0
-        if math.hypot(pair[0, X] - pair[1, X], pair[0, Y] - pair[1, Y]) < blend_px:
-            _merge(pair, blend_px, stars[k])
+        faint = 1 if pair[1].flux < pair[0].flux else 0
+        if math.hypot(pair[0].x - pair[1].x, pair[0].y - pair[1].y) < blend_px:
+            _merge(pair, blend_px, star)
             continue
-        copy_values(pair[1 - faint], stars[k])
-        copy_values(pair[faint], partners[found])
+        stars[k] = pair[1 - faint]
+        partners[found] = pair[faint]
         owners[found] = k
         found += 1
     return found

@@ -9,7 +9,7 @@ import numpy as np
 
 from starid.arrays import Array, Array32, GreyImage, Indices32
 from starid.imaging.background import interpolate_at
-from starid.imaging.centroid import FIT_COLUMNS, FLUX, GOOD, STATE, X, Y, fit_star, spot_model
+from starid.imaging.centroid import FIT, GOOD, Fit, fit_star, spot_model
 from starid.jit import compiled_ieee
 
 NARROWEST_PX: Final = 0.25
@@ -32,7 +32,7 @@ def _one_width(
     noise: float,
     start: float,
     saturation: float,
-    result: Array,
+    result: Fit,
 ) -> float:
     """Fit the width of the star at a peak; NaN if that fails."""
     height, width = image.shape
@@ -57,9 +57,9 @@ def _one_width(
         place = (float(column), float(row))
         noises = (noise * noise, 0.0, _MODEL_ERROR)
         fit_star(pixels, window, place, (sigma, 0.0, 0.0), noises, 0.0, model, work, result)
-        if result[STATE] != GOOD or not result[FLUX] > 0.0:
+        if result.state != GOOD or not result.flux > 0.0:
             return math.nan
-        x, y, flux = result[X], result[Y], result[FLUX]
+        x, y, flux = result.x, result.y, result.flux
         spot_model(x, y, sigma, window, model, work)
         spot_model(x, y, sigma * (1.0 + _STEP), window, wider, work)
         spot_model(x, y, sigma * (1.0 - _STEP), window, narrower, work)
@@ -116,7 +116,7 @@ def spot_widths(
         Smallest count of a saturated pixel; saturated stars are rejected.
     """
     count = 0
-    result = np.empty(FIT_COLUMNS)
+    result: Fit = np.empty(1, FIT)[0]
     for k in range(peaks.shape[0]):
         if count == widths.size:
             break

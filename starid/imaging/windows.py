@@ -3,35 +3,55 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from starid.arrays import Array, Array32, GreyImage, Indices32
+from starid.arrays import Array, Array32, GreyImage, Indices32, Records, record_type
 from starid.imaging.background import MIN_NOISE_DN, interpolate_at
 from starid.imaging.trail_flow import trail_at
 from starid.jit import compiled_ieee
 
-WINDOW_COLUMNS: Final = 14
-(
-    LEFT,
-    TOP,
-    COLUMNS,
-    ROWS,
-    OFFSET,
-    START_X,
-    START_Y,
-    BASE,
-    NOISE,
-    PATCH,
-    TRAIL_X,
-    TRAIL_Y,
-    RADIUS_X,
-    RADIUS_Y,
-) = range(WINDOW_COLUMNS)
-"""Columns of a table of windows: position and size; start of the pixels in the packed array; first guess of the star;
-sky and noise of a pixel (counts); half-width of its saturated patch; its trail; half-widths of the window (pixels)."""
+
+class Window(Protocol):
+    """Window around a candidate, a record of `WINDOW`.
+
+    Attributes
+    ----------
+    left, top, columns, rows : int
+        Position and size, pixels; `columns` of a candidate without a window is the reason.
+    offset : int
+        Start of its pixels among those of all windows.
+    start_x, start_y : float
+        First guess of the star's position, image pixels.
+    base, noise : float
+        Sky at the first guess, and noise of a pixel, counts.
+    patch : float
+        Half-width of the saturated patch, pixels.
+    trail_x, trail_y : float
+        Trail, pixels.
+    radius_x, radius_y : int
+        Half-widths before the edges of the image cut the window, pixels.
+    """
+
+    left: int
+    top: int
+    columns: int
+    rows: int
+    offset: int
+    start_x: float
+    start_y: float
+    base: float
+    noise: float
+    patch: float
+    trail_x: float
+    trail_y: float
+    radius_x: int
+    radius_y: int
+
+
+WINDOW: Final = record_type(Window)
 
 LARGEST_HALF_WIDTH: Final = 40
 """Largest half-width of a window, pixels."""
@@ -45,11 +65,11 @@ PATCH_REACH: Final = 40
 MIN_SPREAD_PX: Final = 0.5
 """Smallest standard deviation of a spot, pixels, for the light of a star to reach more than one pixel."""
 
-EXTENDED: Final = -1.0
-SEEN_BEFORE: Final = -2.0
-NO_ROOM: Final = -3.0
-ONE_PIXEL: Final = -4.0
-"""Values of COLUMNS for candidates without a window."""
+EXTENDED: Final = -1
+SEEN_BEFORE: Final = -2
+NO_ROOM: Final = -3
+ONE_PIXEL: Final = -4
+"""`columns` of candidates without a window."""
 
 _MAX_PATCHES: Final = 1000
 _RING_PIXELS: Final = 48
@@ -247,7 +267,7 @@ def lay_windows(
     block: float,
     spot: tuple[float, float, float],
     flow: Array,
-    windows: Array,
+    windows: Records,
 ) -> int:
     """Define a window around every candidate.
 
@@ -265,8 +285,8 @@ def lay_windows(
         Standard deviation of the spot, pixels; saturation and typical noise of a pixel, counts.
     flow : ndarray (5,)
         Flow of the trails (`starid.imaging.trail_flow`).
-    windows : ndarray (n, WINDOW_COLUMNS)
-        Filled; COLUMNS of a candidate without a window is the reason.
+    windows : ndarray (n,) of WINDOW
+        Filled.
 
     Returns
     -------
@@ -286,16 +306,16 @@ def lay_windows(
     patch_count = 0
     total = 0
     for k in range(peaks.shape[0]):
-        window = windows[k]
+        window: Window = windows[k]
         column, row = peaks[k, 0], peaks[k, 1]
         patch = patches[patch_count]
         patch[0], patch[1], patch[2] = column, row, 0.0
         if image[row, column] >= saturation:
             if _in_patches(column, row, patches, patch_count):
-                window[COLUMNS] = SEEN_BEFORE
+                window.columns = SEEN_BEFORE
                 continue
             if not _saturated_patch(image, column, row, saturation, seen, stack, patch):
-                window[COLUMNS] = EXTENDED
+                window.columns = EXTENDED
                 continue
             patch_count = min(patch_count + 1, _MAX_PATCHES - 1)
         x, y, extra = patch[0], patch[1], patch[2]
@@ -306,53 +326,53 @@ def lay_windows(
         centre_x, centre_y = round(x), round(y)
         slopes = _slopes(level, block, x, y)
         around, spread = _ring_statistics(image, centre_x, centre_y, radius_x, radius_y, slopes, circle, ring)
-        sky_level, window[NOISE] = _sky_under(
+        sky_level, window.noise = _sky_under(
             around,
             spread,
             interpolate_at(level, block, x, y),
             interpolate_at(noise, block, x, y),
             typical_noise,
         )
-        window[BASE] = sky_level
-        if sigma >= MIN_SPREAD_PX and _stands_alone(image, column, row, sky_level, window[NOISE]):
-            window[COLUMNS] = ONE_PIXEL
+        window.base = sky_level
+        if sigma >= MIN_SPREAD_PX and _stands_alone(image, column, row, sky_level, window.noise):
+            window.columns = ONE_PIXEL
             continue
         left, top = max(centre_x - radius_x, 0), max(centre_y - radius_y, 0)
         columns = min(centre_x + radius_x, width - 1) - left + 1
         rows = min(centre_y + radius_y, height - 1) - top + 1
-        window[LEFT], window[TOP] = left, top
+        window.left, window.top = left, top
         if extra == 0.0:
             x, y = _first_position(image, column, row, sky_level)
-        window[START_X], window[START_Y], window[PATCH] = x, y, extra
-        window[TRAIL_X], window[TRAIL_Y] = trail_x, trail_y
-        window[RADIUS_X], window[RADIUS_Y] = radius_x, radius_y
-        window[OFFSET] = total
+        window.start_x, window.start_y, window.patch = x, y, extra
+        window.trail_x, window.trail_y = trail_x, trail_y
+        window.radius_x, window.radius_y = radius_x, radius_y
+        window.offset = total
         if min(columns, rows) < 3:
-            window[COLUMNS] = NO_ROOM
+            window.columns = NO_ROOM
             continue
-        window[COLUMNS], window[ROWS] = columns, rows
+        window.columns, window.rows = columns, rows
         total += columns * rows
     return total
 
 
 @compiled_ieee
 def cut_windows(
-    image: GreyImage, windows: Array, level: Array32, block: float, saturation: float, pixels: Array32
+    image: GreyImage, windows: Records, level: Array32, block: float, saturation: float, pixels: Array32
 ) -> None:
     """Copy the pixels of all windows, minus the sky; saturated ones become infinite.
 
-    The sky is a plane: `BASE` at the first guess of the star, with the slopes of the grid.
+    The sky is a plane: `base` at the first guess of the star, with the slopes of the grid.
     """
     position = 0
     for k in range(windows.shape[0]):
-        window = windows[k]
-        if window[COLUMNS] <= 0.0:
+        window: Window = windows[k]
+        if window.columns <= 0:
             continue
-        x, y, base = window[START_X], window[START_Y], window[BASE]
+        x, y, base = window.start_x, window.start_y, window.base
         slope_x, slope_y = _slopes(level, block, x, y)
-        left, top = int(window[LEFT]), int(window[TOP])
-        for j in range(top, top + int(window[ROWS])):
-            for i in range(left, left + int(window[COLUMNS])):
+        left, top = window.left, window.top
+        for j in range(top, top + window.rows):
+            for i in range(left, left + window.columns):
                 value = float(image[j, i])
                 sky = base + slope_x * (i - x) + slope_y * (j - y)
                 pixels[position] = np.float32(value - sky if value < saturation else math.inf)

@@ -1,14 +1,21 @@
 """Limits and scales of fields and parameters at their edges."""
 
 import asyncio
+import math
 import socket
 
 import pytest
 
+from starhil.protocol.can_framing import encode_reply_frames
+from starhil.protocol.conventions import Conventions
+from starhil.protocol.definition import UnknownNameError
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import detect_lost_peer
 from starhil.protocol.icd import load_unit
-from starhil.protocol.image_transfer import MAX_PACKETS, HoleMap
-from starhil.protocol.values import FieldError
+from starhil.protocol.image_transfer import MAP_PART_SIZE, MAX_PACKETS, HoleMap
+from starhil.protocol.messages import Reply, ReplyKind, RequestKind, check_receiver_limits
+from starhil.protocol.socketcand import CommandError, parse_can_id, parse_frame
+from starhil.protocol.values import FieldError, to_f32
 
 UNIT = """
 [unit]
@@ -30,6 +37,14 @@ fields = [
     { name = "double", type = "f64" },
     { name = "centi", type = "u16", scale = 0.01 },
 ]
+
+[[telecommand]]
+id = 2
+name = "label"
+doc = "d"
+provenance = "ours"
+action = "nothing"
+fields = [{ name = "text", type = "text", size = 4 }]
 """
 
 
@@ -91,3 +106,74 @@ def test_only_a_server_gives_up_a_peer_that_does_not_read(must_read):
         return value
 
     assert (asyncio.run(time_out()) > 0) is must_read
+
+
+@pytest.mark.parametrize(
+    ("row", "values", "message"),
+    [
+        ("label", {"text": "Ωmega"}, "label.text: 'Ωmega' is not ASCII text"),
+        ("label", {"text": 7}, "label.text: 7 is not ASCII text"),
+        ("label", {"text": "abcde"}, "label.text: 5 characters, at most 4"),
+        ("set", {"single": 1e39, "double": 0.0, "centi": 0.0}, "set.single: 1e[+]39 is outside -1 to 2.5"),
+        ("set", {"single": 0.0, "double": 0.0, "centi": math.inf}, "set.centi: inf is outside 0 to 655.35"),
+    ],
+)
+def test_what_no_field_can_hold_is_rejected_even_without_checks(icd, row, values, message):
+    with pytest.raises(FieldError, match=message):
+        icd.telecommands[row].encode(values, check=False)
+
+
+@pytest.mark.parametrize(
+    ("value", "single"), [(1e39, math.inf), (-1e39, -math.inf), (0.1, 0.10000000149011612)]
+)
+def test_a_number_beyond_single_precision_is_infinite(value, single):
+    assert to_f32(value) == single
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: encode_reply_frames(Reply(ReplyKind.ECHO, 1), 4), "CAN has no echo messages"),
+        (lambda: encode_reply_frames(Reply(ReplyKind.TELEMETRY, None), 4), "a telemetry on CAN needs an ID"),
+        (lambda: encode_reply_frames(Reply(ReplyKind.EVENT, 5, bytes(9)), 4), "of 9 bytes does not fit one CAN frame"),
+        (lambda: HoleMap().set_part(1, bytes(15)), f"hole map part of 15 bytes, must be {MAP_PART_SIZE}"),
+        (lambda: HoleMap().part(0), "hole map part 0 is outside 1 to 8"),
+        (lambda: check_receiver_limits(0, 1.0), "receiver limits 0 bytes, 1.0 s must be positive"),
+        (lambda: parse_frame(b"frame 123 nan 00"), "malformed frame: frame 123 nan 00"),
+        (lambda: parse_can_id(b"1234"), "CAN ID 1234 has neither"),
+    ],
+)  # fmt: skip
+def test_what_no_message_can_hold_is_rejected(call, message):
+    with pytest.raises((ProtocolError, CommandError), match=message):
+        call()
+
+
+def test_a_can_id_with_unknown_flags_above_29_bits_is_read_without_them():
+    assert parse_can_id(b"80000123") == (True, False, 0x123)
+    assert parse_can_id(b"C0000123") == (True, True, 0x123)
+
+
+@pytest.mark.parametrize(
+    ("klass", "row_id", "found", "kind"),
+    [
+        (None, 6, "set", RequestKind.TELECOMMAND),  # the first row with this ID
+        ("parameter", 6, "parameter", RequestKind.TELEMETRY),
+        (None, 250, "set", RequestKind.TELECOMMAND),  # no row: the first class
+    ],
+)
+def test_a_request_by_id_has_the_class_of_its_row(klass, row_id, found, kind):
+    request = load_unit("sagitta").request_of(row_id, klass, b"\1")
+    assert (request.klass, request.kind, request.id, request.data) == (found, kind, row_id, b"\1")
+
+
+def test_a_request_of_an_unknown_class_is_rejected_and_a_unit_without_classes_needs_none():
+    with pytest.raises(UnknownNameError, match="no class named 'write'; the unit has set, parameter, "):
+        load_unit("sagitta").request_of(6, "write")
+    assert load_unit("cubestar").request_of(160).kind is RequestKind.TELEMETRY
+
+
+@pytest.mark.parametrize(
+    ("epoch", "unix_s"), [("2000-01-01", 946_684_800), ("2000-01-01T02:00:00+02:00", 946_684_800)]
+)
+def test_an_epoch_without_a_time_zone_is_utc(epoch, unix_s):
+    assert Conventions(epoch=epoch).epoch_ns == unix_s * 10**9

@@ -221,6 +221,22 @@ HEADER = [{"role": "id", "type": "u8"}]
         ),
         ({"framing": {"kind": "slip", "end": 1, "escape": 1}, "request_header": HEADER}, "must differ"),
         (
+            {"framing": {"kind": "escaped", "escape": 2, "start": 2}, "request_header": HEADER},
+            "escape, start and end must differ",
+        ),
+        (
+            {"framing": {"kind": "slip"}, "request_header": [{"role": "id", "type": "bits8"}]},
+            "types bits8, bits16 and bits32 have `bits`",
+        ),
+        (
+            {
+                "framing": {"kind": "slip"},
+                "request_header": HEADER,
+                "reply_header": [*HEADER, {"role": "time", "type": "u32", "scale": 1e-10}],
+            },
+            "scale 1e-10 s is below a nanosecond",
+        ),
+        (
             {"framing": {"kind": "custom", "name": "mine"}, "request_header": HEADER},
             "no framing named 'mine'",
         ),

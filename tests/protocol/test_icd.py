@@ -406,6 +406,17 @@ def test_every_default_survives_the_wire(parameter: object) -> None:
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\nfirst_telemetry_id = 128\n'
 
 
+CANOPEN = """[canopen]
+device_type = 0
+device_name = "n"
+vendor_name = "v"
+vendor_id = 0
+product_code = 0
+revision = 0
+bit_rates = [1000000]
+"""
+
+
 def _row(
     extra: str = "",
     *,
@@ -441,6 +452,30 @@ BAD_DEFINITIONS = [
     ("default outside", HEAD + '[[parameter]]\nid = 1\nname = "window_width"\ndefault = 2\n', "default: window_width: 2 is outside"),
     ("parameter limits", HEAD + '[[parameter]]\nid = 1\nname = "window_width"\nmax = 1000\n', "do not fit type u8"),
     ("enum numbers", HEAD + '[[enum]]\nname = "e"\ndoc = "d"\nvalues = { a = 1, b = 1 }\n', "two names have the same number"),
+    ("repeat with other keys", HEAD + _row(fields='[{ type = "u8", repeat = { count = 2, fields = ["u8 a"] } }]'), "`repeat` allows no other keys but `doc`"),
+    ("repeat in repeat", HEAD + _row(fields='[{ repeat = { count = 2, fields = [{ name = "a", type = "u8", count = 2 }] } }]'), "a repeated group cannot contain `repeat` or `count`"),
+    ("text with other keys", HEAD + _row(fields='[{ text = "u8 a", doc = "d" }]'), "field 'u8 a': `text` allows no other keys"),
+    ("no type", HEAD + _row(fields='[{ name = "a" }]'), "field a: needs `type`, or `repeat`"),
+    ("bits of a number", HEAD + _row(fields='[{ name = "a", type = "u8", bits = [{ name = "b" }] }]'), "only types bits8, bits16 and bits32 have bits"),
+    ("size of a number", HEAD + _row(fields='[{ name = "a", type = "u8", size = 1 }]'), "type u8 has a fixed size; remove `size`"),
+    ("map and enum", HEAD + _row(fields='[{ name = "a", type = "enum8", enum = "mode", map = { 1 = "x" } }]'), "has both `map` and `enum`"),
+    ("no bits", HEAD + _row(fields='[{ name = "a", type = "bits8" }]'), "type bits8 needs `bits` and takes no count"),
+    ("bits too narrow", HEAD + _row(fields='[{ type = "bits8", bits = [{ name = "b", map = { 2 = "x" } }, { width = 7 }] }]'), "enumeration map does not fit 1 bits"),
+    ("constant too wide", HEAD + _row(fields='[{ type = "bits8", bits = [{ name = "b", const = 2 }, { width = 7 }] }]'), "const 2 does not fit 1 bits"),
+    ("scale 0", HEAD + _row(fields='[{ name = "a", type = "u8", scale = 0.0 }]'), "field a: scale is 0"),
+    ("empty list in a map", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 1 = [] } }]'), "map: 1: no value, or a duplicate one"),
+    ("value twice in a map", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 1 = ["x", "y"], 2 = "y" } }]'), "map: 2: no value, or a duplicate one"),
+    ("default not in the map", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 1 = "x" }, default = "y" }]'), "default 'y' is not in enumeration map"),
+    ("double enumeration", HEAD + 2 * '[[enum]]\nname = "e"\ndoc = "d"\nvalues = { a = 1 }\n', "enum e: defined twice"),
+    ("double parameter", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\n[[parameter]]\nid = 2\nname = "exposure"\n', "parameter exposure: defined twice"),
+    ("double parameter id", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\n[[parameter]]\nid = 1\nname = "analog_gain"\n', "ID 1 is already used by exposure"),
+    ("unit of a parameter", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\nunit = "s"\n', "unit 's', but in the device it is 'ms'"),
+    ("limits of a parameter", HEAD + '[[parameter]]\nid = 1\nname = "exposure"\nmin = 9\nmax = 8\n', "needs min and max, with min not above max"),
+    ("last id", HEAD + _row("last_id = 199"), "last_id 199 is below ID 200"),
+    ("argument without action", HEAD + _row(kind="telecommand", identifier=1, fields='[{ name = "a", type = "u8", argument = "mode" }]'), "argument mode: the row has no `action`"),
+    ("unknown fixed argument", HEAD + _row('action = "reset"\narguments = { mood = 1 }', kind="telecommand", identifier=1), "action reset has no argument 'mood'"),
+    ("member of two kinds", HEAD + CANOPEN + '[[canopen.object]]\nindex = 0x2000\nname = "o"\nmembers = [{ name = "m", parameter = "exposure", domain = "ro" }]\n', "needs value and/or telecommand, or parameter, or domain"),
+    ("type of no telecommand", HEAD + CANOPEN + '[[canopen.object]]\nindex = 0x2000\nname = "o"\nparameters = true\ntype = "u8"\n', "`type` is only for a telecommand"),
     ("no head", _row(), r"no \[unit\]"),
     ("no TOML", "[[[", "not valid TOML"),
 ]  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import subprocess
+import threading
 import time
 
 import can
@@ -13,7 +14,7 @@ import pytest
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports import TransportError, open_can
-from starhil.protocol.transports.python_can import PythonCanTransport
+from starhil.protocol.transports.python_can import QUEUE_LIMIT, PythonCanTransport
 from tests.protocol.transports.pairs import CAN_KINDS, FRAMES, HAS_VCAN, can_pair, until
 
 
@@ -135,6 +136,128 @@ def test_bus_off_is_reported_and_is_not_a_frame() -> None:
         await transport.close()
         assert got == []
         assert transport.statistics.dropped == 1
+
+    asyncio.run(main())
+
+
+class _ScriptedBus(can.BusABC):
+    """A bus that delivers prepared messages and fails as it is set to."""
+
+    def __init__(self, *messages: can.Message) -> None:
+        super().__init__(channel="scripted")
+        self.messages = list(messages)
+        self.sent: list[can.Message] = []
+        self.full = 0
+        """Number of sends for which the transmit buffer is full."""
+        self.fails = ""
+        self.closed = False
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self.fails:
+            raise can.CanOperationError(self.fails)
+        if self.messages:
+            return self.messages.pop(0), True
+        time.sleep(min(timeout or 0.0, 0.01))
+        return None, True
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:  # noqa: ARG002
+        if self.full:
+            self.full -= 1
+            raise can.CanTimeoutError
+        self.sent.append(msg)
+
+    def shutdown(self) -> None:
+        self.closed = True
+        super().shutdown()
+
+
+async def _open(bus: _ScriptedBus) -> tuple[PythonCanTransport, list[CanFrame], list[ProtocolError]]:
+    """Open a transport on a bus; return it with the frames and errors that it reports."""
+    transport = PythonCanTransport("scripted:0", lambda: bus)
+    got: list[CanFrame] = []
+    errors: list[ProtocolError] = []
+    await transport.start(got.append, errors.append)
+    return transport, got, errors
+
+
+def test_only_classic_frames_are_received() -> None:
+    async def main() -> None:
+        bus = _ScriptedBus(
+            can.Message(arbitration_id=1, is_fd=True, data=bytes(12)),
+            can.Message(arbitration_id=0x20, is_error_frame=True, data=bytes(8)),  # no acknowledgement
+            can.Message(arbitration_id=2, is_extended_id=False, data=b"\x07"),
+        )
+        transport, got, errors = await _open(bus)
+        await until(lambda: bool(got))
+        await transport.close()
+        assert [(frame.id, frame.data) for frame in got] == [(2, b"\x07")]
+        assert (errors, transport.statistics.received) == ([], 1)
+
+    asyncio.run(main())
+
+
+def test_frames_wait_while_the_transmit_buffer_is_full_and_none_beyond_the_limit() -> None:
+    async def main() -> None:
+        bus = _ScriptedBus()
+        transport, _, errors = await _open(bus)
+        bus.full = 2
+        taken = [transport.send(FRAMES[0]) for _ in range(QUEUE_LIMIT + 3)]
+        assert (sum(taken), transport.statistics.dropped) == (QUEUE_LIMIT, 3)
+        await transport.drain()
+        assert (len(bus.sent), bus.full, errors) == (QUEUE_LIMIT, 0, [])
+        await transport.close()
+        assert not transport.send(FRAMES[0])
+
+    asyncio.run(main())
+
+
+def test_a_bus_that_fails_while_it_is_read_is_reported_once_and_opened_again() -> None:
+    async def main() -> None:
+        bus = _ScriptedBus()
+        transport, got, errors = await _open(bus)
+        bus.fails = "interface gone"
+        await until(lambda: bus.closed)
+        bus.fails = ""
+        await until(lambda: transport.statistics.reconnects == 1)
+        bus.messages.append(can.Message(arbitration_id=5))
+        await until(lambda: [frame.id for frame in got] == [5])
+        assert [str(error) for error in errors] == [
+            "CAN scripted:0: lost: interface gone; waiting for it to come back"
+        ]
+        await transport.close()
+
+    asyncio.run(main())
+
+
+def test_frames_that_wait_when_a_bus_is_closed_are_counted_as_dropped() -> None:
+    async def main() -> None:
+        bus = _ScriptedBus()
+        transport, _, _ = await _open(bus)
+        bus.full = 1_000_000
+        transport.send(FRAMES[0])
+        await until(lambda: bus.full < 1_000_000)
+        await transport.close()
+        assert (transport.statistics.sent, transport.statistics.dropped) == (0, 1)
+        await transport.drain()
+
+    asyncio.run(main())
+
+
+def test_a_bus_whose_opening_is_cancelled_is_closed() -> None:
+    async def main() -> None:
+        bus, may_open = _ScriptedBus(), threading.Event()
+
+        def open_late() -> can.BusABC:
+            may_open.wait()
+            return bus
+
+        opening = asyncio.ensure_future(PythonCanTransport("late:0", open_late).start(lambda _: None))
+        await asyncio.sleep(0.01)
+        opening.cancel()
+        may_open.set()
+        with pytest.raises(asyncio.CancelledError):
+            await opening
+        await until(lambda: bus.closed)
 
     asyncio.run(main())
 

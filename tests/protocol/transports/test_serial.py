@@ -243,6 +243,7 @@ def test_a_symlink_taken_over_by_another_is_left_alone(tmp_path: Path) -> None:
         ("socket://127.0.0.1", "must be socket://HOST:PORT"),
         ("listen://127.0.0.1:x", "must be listen://HOST:PORT"),
         ("rfc2217://host:1", "must be auto, a tty's path"),
+        ("socket://[::1", "must be socket://HOST:PORT"),
     ],
 )
 def test_unavailable_ports_are_reported_in_one_line(spec: str, message: str) -> None:
@@ -396,5 +397,81 @@ def test_a_port_that_goes_while_its_bit_rate_changes_comes_back_at_the_new_one(
             await until(lambda: pair.two.statistics.reconnects == 1)
             assert pair.two._port.baudrate == 38400  # type: ignore[attr-defined]
             assert "lost: Input/output error" in str(pair.errors[0])
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (PermissionError(errno.EACCES, "Permission denied"), "no permission; join the group that owns it"),
+        (ValueError("Not a valid baudrate: 7"), "bit rate 7 is not possible here"),
+        (OSError("no number"), "cannot open: no number"),
+    ],
+)
+def test_the_remedy_of_a_port_that_does_not_open_depends_on_the_reason(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, message: str
+) -> None:
+    def fail(*_args: object, **_options: object) -> NoReturn:
+        raise error
+
+    monkeypatch.setattr(serial, "Serial", fail)
+    with pytest.raises(TransportError, match=f"^serial /dev/ttyUSB7: {message}"):
+        asyncio.run(open_serial("/dev/ttyUSB7", 7).start(lambda _: None))
+
+
+def test_only_a_pseudo_terminal_has_a_symlink(tmp_path: Path) -> None:
+    with pytest.raises(TransportError, match=r"serial /dev/ttyS0: a symlink needs a pseudo-terminal"):
+        open_serial("/dev/ttyS0", symlink=tmp_path / "tty")
+
+
+def test_a_rate_set_before_the_port_is_open_is_the_rate_at_which_it_opens(tmp_path: Path) -> None:
+    async def main() -> None:
+        one = open_serial("pty", symlink=tmp_path / "tty")
+        await one.start(lambda _: None)
+        two = open_serial(str(tmp_path / "tty"), 9600)
+        two.set_baud(19200)
+        await two.drain()
+        assert not two.send(b"nobody")
+        await two.start(lambda _: None)
+        assert two._port.baudrate == 19200  # type: ignore[attr-defined]
+        assert two.statistics.dropped == 6
+        await two.close()
+        await one.close()
+
+    asyncio.run(main())
+
+
+def test_the_bit_rate_changes_only_once_the_kernel_has_sent_its_buffer(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    async def main() -> None:
+        async with serial_pair("pty and tty", tmp_path, baud=19200) as pair:
+            waiting, seen = [3, 2, 0], []
+            monkeypatch.setattr(
+                type(pair.two._port),  # type: ignore[attr-defined]
+                "out_waiting",
+                property(lambda port: (seen.append(port.baudrate), waiting.pop(0))[1]),
+            )
+            pair.two.set_baud(38400)
+            await until(lambda: not waiting)
+            assert (seen, pair.two._port.baudrate) == ([19200] * 3, 38400)  # type: ignore[attr-defined]
+
+    asyncio.run(main())
+
+
+def test_without_pacing_a_message_is_written_at_once_at_any_bit_rate() -> None:
+    async def main() -> None:
+        one = open_serial("listen://127.0.0.1:0", 9600, paced=False)
+        await one.start(lambda _: None)
+        reader, writer = await asyncio.open_connection("127.0.0.1", int(one.description.rpartition(":")[2]))
+        await until(lambda: one._stream is not None)  # type: ignore[attr-defined]
+        one.set_baud(300)
+        begin = asyncio.get_running_loop().time()
+        one.send(bytes(3000))  # 100 s at 300 bit/s
+        assert await asyncio.wait_for(reader.readexactly(3000), DEADLINE_S) == bytes(3000)
+        assert asyncio.get_running_loop().time() - begin < DEADLINE_S
+        writer.close()
+        await one.close()
 
     asyncio.run(main())

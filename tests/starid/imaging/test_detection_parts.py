@@ -15,10 +15,9 @@ from scipy.stats import norm
 from starid.imaging.background import estimate_background, interpolate_at
 from starid.imaging.centroid import (
     FAINT,
-    FIT_COLUMNS,
+    FIT,
     GOOD,
     HOT_PIXEL,
-    STATE,
     fit_star,
     spot_model,
     trail_model,
@@ -205,11 +204,11 @@ def test_only_what_may_be_a_star_at_its_first_guess_is_fitted(light: str, state:
         pixels += (100.0 * model_of(30.3, 38.6, trail)[0]).astype(np.float32)
     elif light != "nothing":
         pixels[9 * 21 + 10] += -40.0 if light == "dark" else 40.0
-    fit = np.zeros(FIT_COLUMNS)
+    fit = np.zeros(1, FIT).view(np.recarray)[0]
     shape = (0.8, *(trail or (0.0, 0.0)))
     scratch = np.empty((3, 21 * 17)), np.empty((5, 21))
-    fit_star(pixels, WINDOW, (30.0, 39.0), shape, (1.0, 0.0, 0.01), 3.0, *scratch, fit)
-    assert fit[STATE] == state
+    fit_star.py_func(pixels, WINDOW, (30.0, 39.0), shape, (1.0, 0.0, 0.01), 3.0, *scratch, fit)
+    assert fit.state == state
 
 
 def flow_places(count: int, seed: int = 4) -> np.ndarray:
