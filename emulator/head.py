@@ -33,8 +33,7 @@ from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.links.traffic import Traffic
 from starhil.emulator.pipeline.imager import PipelineImager
-from starhil.emulator.pipeline.messages import PipelineReady
-from starhil.emulator.pipeline_setup import camera_constants
+from starhil.emulator.pipeline.messages import PipelineReady, camera_constants
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.revival import PipelineRevival
@@ -222,7 +221,7 @@ class Head:
     def pipeline_ready(self, warm: PipelineReady) -> None:
         """Pass the camera of a ready pipeline to the device."""
         self.warm = warm
-        self.device.pipeline_ready(camera_constants(warm))
+        self.device.pipeline_ready(camera_constants(warm.camera))
         self._on_warm()
 
     def start_time(self) -> None:

@@ -1,14 +1,13 @@
-"""The image pipeline of a profile, and the camera constants that it reports."""
+"""The image pipeline of a profile."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from starhil.emulator.pipeline.imager import PipelineImager, WorkerImager
-from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
+from starhil.emulator.pipeline.messages import PipelineSetup
 from starhil.emulator.pipeline.worker_process import WorkerProcess, WorkerThread
 from starhil.emulator.profile import Profile
-from starhil.protocol.values import Value
 
 
 def make_imager(
@@ -44,19 +43,3 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         dark_frames=profile.device.dark_frames,
         images=profile.images.resolved(profile.folder),
     )
-
-
-def camera_constants(warm: PipelineReady) -> dict[str, Value]:
-    """Return the camera parameters of a calibrated unit: focal length, centre and distortion, in pixels."""
-    camera = warm.camera
-    k1, k2, p1, p2, _ = camera["distortion"]
-    focal_x, focal_y = camera["focal_px"]
-    return {
-        "focal_length": (focal_x * focal_y) ** 0.5,
-        "centroid_x": camera["centre_px"][0],
-        "centroid_y": camera["centre_px"][1],
-        "k1": k1,
-        "k2": k2,
-        "p1": p1,
-        "p2": p2,
-    }

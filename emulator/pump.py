@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -128,15 +129,12 @@ class StepPump:
 
     def _pop_next(self, end_ns: int) -> Event | None:
         """Remove and return the earliest event of all devices that is due at `end_ns`, or None."""
-        due = [
-            (due_ns, scheduler)
-            for scheduler in self._schedulers
-            if (due_ns := scheduler.next_due_ns()) is not None
-        ]
-        if not due:
-            return None
-        _, earliest = min(due, key=lambda item: item[0])
-        return earliest.pop_due(end_ns)
+
+        def due_ns(scheduler: Scheduler) -> float:
+            due_ns = scheduler.next_due_ns()
+            return math.inf if due_ns is None else due_ns
+
+        return min(self._schedulers, key=due_ns).pop_due(end_ns)
 
     async def _settle(self) -> None:
         """Wait for the pipelines and the links, and let other tasks of the loop run."""

@@ -278,7 +278,7 @@ class PlayedImager:
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
-            raise _DeviationError("the device requests fewer frames than in the recorded run")
+            raise _DeviationError("it requests fewer frames than in the recorded run")
         self.pending -= 1
         self._arrived.popleft()()
 
@@ -407,7 +407,8 @@ class _Playing:
             try:
                 await self.entry(entry)
             except _DeviationError as deviation:
-                report.differences.append(f"{where}: {deviation}")
+                at = f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently"
+                report.differences.append(f"{where}: {at}: {deviation}")
                 return recording
             except (EmulatorError, ProtocolError, StaridError) as error:
                 raise EmulatorError(f"replay {where}: {error}") from None
@@ -420,47 +421,37 @@ class _Playing:
 
     async def entry(self, entry: Entry) -> None:
         """Play one entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
+        head, player, truth = self._head, self._player, self._truth
         match entry:
-            case _Plain():
-                await self._plain(entry)
             case _Item():
-                receive = self._player.receivers.get(entry.link)
+                receive = player.receivers.get(entry.link)
                 if receive is None:
-                    raise _DeviationError(_deviation(entry, f"the link {entry.link} is off"))
-                self._player.pass_item(entry.link, entry.item, outgoing=False)
+                    raise _DeviationError(f"the link {entry.link} is off")
+                player.pass_item(entry.link, entry.item, outgoing=False)
                 receive(entry.item)
             case _Feed():
-                if self._truth.feed is None:
-                    raise _DeviationError(_deviation(entry, "there is no live feed"))
-                await self._truth.feed.process(entry.data.encode("latin-1"))
+                if truth.feed is None:
+                    raise _DeviationError("there is no live feed")
+                await truth.feed.process(entry.data.encode("latin-1"))
             case _Truth():
-                await self._truth.set(entry.config, entry.start_s)
+                await truth.set(entry.config, entry.start_s)
             case _Fault():
-                self._head.faults.inject(entry.request)
-
-    async def _plain(self, entry: _Plain) -> None:
-        """Play an entry that consists of its time."""
-        device, player = self._head.device, self._player
-        match entry.do:
-            case "event":
-                due = device.scheduler.pop_due(player.clock.now_ns())
+                head.faults.inject(entry.request)
+            case _Plain(do="event"):
+                due = head.device.scheduler.pop_due(player.clock.now_ns())
                 if due is None:
-                    raise _DeviationError(_deviation(entry, "no event is due"))
+                    raise _DeviationError("no event is due")
                 call_guarded("event", due.action, due.due_ns)
-            case "reply" if player.pipeline is not None:
+            case _Plain(do="reply") if player.pipeline is not None:
                 await player.pipeline.deliver()
-            case "stored":
+            case _Plain(do="stored"):
                 if not player.writes:
-                    raise _DeviationError(_deviation(entry, "nothing is being written"))
+                    raise _DeviationError("nothing is being written")
                 player.writes.popleft()()
-            case "ready":
-                self._head.pipeline_ready(self._warm)
-            case "clear_faults":
-                self._head.faults.clear()
-
-
-def _deviation(entry: Entry, why: str) -> str:
-    return f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently: {why}"
+            case _Plain(do="ready"):
+                head.pipeline_ready(self._warm)
+            case _Plain(do="clear_faults"):
+                head.faults.clear()
 
 
 def _compare_sent(

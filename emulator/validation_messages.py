@@ -11,15 +11,13 @@ from starhil.protocol.names import did_you_mean
 from starid.errors import plain
 
 
-def explain(
-    error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
-) -> str:
+def explain(error: ValidationError, model: type[BaseModel], *, also: tuple[str, ...] = ()) -> str:
     """Describe the first validation error of a model in one line: key, problem and remedy.
 
-    `under` is the path of keys in the model to the validated input; `also` are further keys allowed at the top level.
+    `also` are further keys allowed at the top level.
     """
     first = _most_helpful_error(error)
-    loc = (*under, *first["loc"])
+    loc = first["loc"]
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])

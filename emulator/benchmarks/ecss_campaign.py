@@ -20,13 +20,13 @@ from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_stor
 from starhil.emulator.benchmarks.hard_sky import direction_around
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, PipelineReady, SolverSettings
+from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, camera_constants
 from starhil.emulator.pipeline.pipeline import Pipeline
-from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import load_profile
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd import load_unit
@@ -146,12 +146,9 @@ class EcssDevice:
         self.pipeline = Pipeline(replace(setup, sky=sky))
         self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
         parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))
-        ready = PipelineReady(self.pipeline.camera.to_dict(), len(self.pipeline.catalog), 0.0)
-        constants = camera_constants(ready)
+        constants = camera_constants(self.pipeline.camera.to_dict())
         parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
-        names = SolverSettings.__dataclass_fields__
-        chosen: dict[str, Any] = {name: parameters[name] for name in names}
-        self.settings = SolverSettings(**chosen)
+        self.settings = solver_settings(parameters)
         self.exposure_s = float(parameters["exposure"]) / 1000.0
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])

@@ -10,8 +10,9 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.console.history import COLUMNS, MODES
-from starhil.emulator.faults import NO_ERROR, DeviceFault, WireFault
+from starhil.emulator.faults import NO_ERROR, DeviceFault
 from starhil.emulator.head import Head
+from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
 from starhil.emulator.sky.objects import SkyObjects, range_of
 from starhil.protocol.codec import Field, Row

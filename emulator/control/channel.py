@@ -39,10 +39,10 @@ import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.scenario import load_scenario
@@ -55,7 +55,7 @@ from starhil.emulator.head import Head
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from starhil.emulator.pipeline.messages import as_quaternion
 from starhil.emulator.run import Run
-from starhil.emulator.truth.config import FixedConfig, TruthConfig
+from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
@@ -72,6 +72,7 @@ BUSY: Final = b'{"ok": false, "error": "too many connections to the control chan
 LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
 
 Answer = dict[str, Any]
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ControlServer:
@@ -275,7 +276,7 @@ class ControlServer:
         if "truth" in request:
             if not isinstance(request["truth"], dict):
                 raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
-            config = _parse(_TRUTH, _Truth, request["truth"], "truth")
+            config = _parse(_Truth, request).truth
         async with self._opening:  # reading a file takes time, so the last request wins
             await self._run.truth.set(config)
         return {"kind": config.kind, "address": self._run.truth.address}
@@ -289,7 +290,7 @@ class ControlServer:
         return {"run_time_s": clock.now_ns() / NANOSECONDS}
 
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
-        wanted = _parse(_FAULT, FaultRequest, request)
+        wanted = _parse(FaultRequest, request)
         head.faults.check(wanted)
         self._run.record("fault", request=request)
         head.faults.inject(wanted)
@@ -316,21 +317,17 @@ class ControlServer:
 
 
 class _Truth(BaseModel):
-    """Model that supplies the keys for validation messages."""
+    """Arguments of `set_truth`."""
 
-    truth: TruthConfig = FixedConfig(kind="fixed")
-
-
-_TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
-_FAULT: Final[TypeAdapter[FaultRequest]] = TypeAdapter(FaultRequest)
+    truth: TruthConfig
 
 
-def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object, *under: str) -> Any:
-    """Validate an argument of a request; the error message is one line."""
+def _parse(model: type[Model], value: object) -> Model:
+    """Validate the arguments of a request; the error message is one line."""
     try:
-        return adapter.validate_json(json.dumps(value))
+        return model.model_validate_json(json.dumps(value))
     except ValidationError as error:
-        raise EmulatorError(explain(error, model, under=under)) from None
+        raise EmulatorError(explain(error, model)) from None
 
 
 def _check_keys(request: dict[str, Any], *known: str) -> None:

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.scheduler import Event, Scheduler
@@ -35,7 +35,6 @@ from starhil.emulator.pipeline.messages import (
     Failure,
     FrameRequest,
     FrameResult,
-    SolverSettings,
     Triple,
 )
 from starhil.emulator.profile import Profile
@@ -259,8 +258,6 @@ class FrameCycle:
         index = self.index
         self.index += 1
         parameters = self._parameters
-        chosen: dict[str, Any] = {name: parameters[name] for name in _SETTINGS}
-        settings = SolverSettings(**chosen)
         conditions = self._surroundings.conditions(truth)
         return FrameRequest(
             index=index,
@@ -269,7 +266,7 @@ class FrameCycle:
             gain=float(parameters["analog_gain"]),
             solve=solve,
             predicted=predicted,
-            settings=settings,
+            settings=solver_settings(parameters),
             faults=self._surroundings.faults,
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,
@@ -364,6 +361,3 @@ class FrameCycle:
         if rate is not None and np.linalg.norm(rate) > np.radians(float(self._parameters["max_rate"])):
             return False, "rate_too_high", rate
         return True, "ok", rate
-
-
-_SETTINGS: Final = tuple(SolverSettings.__dataclass_fields__)

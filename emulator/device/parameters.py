@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from typing import Any, Final
 
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.messages import SolverSettings
 from starhil.protocol.codec import STRUCT_CODES
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import FieldError, MessageError, Parameter, Value
@@ -31,6 +32,12 @@ def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
     Read-out and processing overlap with the next exposure and do not count.
     """
     return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
+
+
+def solver_settings(parameters: Mapping[str, ParameterValue]) -> SolverSettings:
+    """Return the parameters that detection and identification use."""
+    chosen: dict[str, Any] = {name: parameters[name] for name in SolverSettings.__dataclass_fields__}
+    return SolverSettings(**chosen)
 
 
 def memory_format(definition: Parameter) -> str:

@@ -63,10 +63,6 @@ class Surroundings:
         )
         return Conditions(self._thermal.temperature_c(self._now_ns()), particles_s)
 
-    def set_faults(self, faults: dict[str, Any]) -> None:
-        """Replace the optical faults."""
-        self.faults = faults
-
 
 def orbit_of(profile: Profile) -> Orbit | None:
     """Return the true orbit of a profile, or None."""

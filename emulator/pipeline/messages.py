@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
@@ -94,6 +95,14 @@ class SolverSettings:
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
+
+
+def camera_constants(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a unit that is calibrated to a camera: focal length, centre and distortion, in pixels."""
+    focal_x, focal_y = camera["focal_px"]
+    names = ("focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2")
+    values = ((focal_x * focal_y) ** 0.5, *camera["centre_px"], *camera["distortion"][:4])
+    return dict(zip(names, values, strict=True))
 
 
 DIRECTION_BITS: Final = 32

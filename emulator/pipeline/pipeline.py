@@ -30,6 +30,7 @@ from starhil.emulator.pipeline.messages import (
     Preview,
     SolverSettings,
     as_triple,
+    camera_constants,
 )
 from starhil.emulator.pipeline.precompile import start_helper
 from starhil.emulator.pipeline.preview import make_preview
@@ -139,17 +140,7 @@ class Pipeline:
         Compiling a kernel during a run would interrupt frames for seconds, so some frames here have star
         trails. A `helper` that compiles the star identifier is waited for.
         """
-        camera = self.camera
-        k1, k2, p1, p2, _ = camera.distortion
-        settings = SolverSettings(
-            focal_length=math.sqrt(camera.focal_px[0] * camera.focal_px[1]),
-            centroid_x=camera.centre_px[0],
-            centroid_y=camera.centre_px[1],
-            k1=k1,
-            k2=k2,
-            p1=p1,
-            p2=p2,
-        )
+        settings = replace(SolverSettings(), **camera_constants(self.camera.to_dict()))
         attitude = Attitude.identity()
         request = FrameRequest(
             index=0,

@@ -13,8 +13,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import Preview
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame
-from starhil.emulator.sky.directions import icrs_vector
-from starhil.emulator.sky.objects import Obstruction, SkyObjects
+from starhil.emulator.sky.objects import CelestialBody, Obstruction, SkyObjects
 from starid.arrays import GreyImage
 from starid.attitude import Attitude
 from starid.camera import Camera
@@ -147,30 +146,16 @@ def _detections(
 
 def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:
     """Return the bodies in a sky, inside or outside the image."""
-    found = []
-    if sky.sun is not None:
-        radius_deg = math.degrees(sky.sun.radius_rad)
-        found.append(_body("sun", sky.sun.ra_deg, sky.sun.dec_deg, radius_deg, camera, attitude))
-    if sky.moon is not None:
-        radius_deg = sky.moon.diameter_deg / 2.0
-        found.append(_body("moon", sky.moon.ra_deg, sky.moon.dec_deg, radius_deg, camera, attitude))
-    if sky.earth is not None:
-        earth = sky.earth
-        found.append(_body("earth", earth.ra_deg, earth.dec_deg, earth.radius_deg, camera, attitude))
-    for number, planet in enumerate(sky.planets, 1):
-        name = planet.name or f"planet {number}"
-        found.append(_body(name, planet.ra_deg, planet.dec_deg, 0.0, camera, attitude))
-    return found
+    planets = ((planet.name or f"planet {number}", planet) for number, planet in enumerate(sky.planets, 1))
+    bodies = (("sun", sky.sun), ("moon", sky.moon), ("earth", sky.earth), *planets)
+    return [_body(name, body, camera, attitude) for name, body in bodies if body is not None]
 
 
-def _body(
-    name: str, ra_deg: float, dec_deg: float, radius_deg: float, camera: Camera, attitude: Attitude
-) -> Body:
+def _body(name: str, body: CelestialBody, camera: Camera, attitude: Attitude) -> Body:
     """Return a body with the outline of its disc in the image."""
-    centre = icrs_vector(ra_deg, dec_deg)
+    centre, radius = body.direction, body.radius_rad
     across = np.cross(centre, (0.0, 0.0, 1.0) if abs(centre[2]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
-    radius = math.radians(radius_deg)
     angle = np.linspace(0.0, 2.0 * math.pi, OUTLINE_POINTS + 1 if radius > 0.0 else 1)[:, None]
     ring = np.cos(angle) * across + np.sin(angle) * np.cross(centre, across)
     seen = attitude.to_sensor(math.cos(radius) * centre + math.sin(radius) * ring)
@@ -180,7 +165,7 @@ def _body(
     outline = [
         (x, y) if there else None for (x, y), there in zip(xy.round(1).tolist(), mapped.tolist(), strict=True)
     ]
-    return Body(name, ra_deg, dec_deg, radius_deg, outline)
+    return Body(name, body.ra_deg, body.dec_deg, math.degrees(radius), outline)
 
 
 def _covered(obstruction: Obstruction, width: int, height: int) -> list[tuple[float, float]]:
