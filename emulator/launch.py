@@ -63,14 +63,14 @@ class Emulator:
         profiles: Sequence[Profile],
         options: RunOptions | None = None,
         worker: WorkerProcess | None = None,
+        wiring: Wiring | None = None,
     ) -> None:
         check_heads(profiles)
         self.options = options = options or RunOptions()
-        wiring = None
         if options.record is not None:
             if len(profiles) > 1:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
-            wiring = Recorder(options.record, Wiring(make_clock(profiles[0].run.clock)))
+            wiring = Recorder(options.record, wiring or Wiring(make_clock(profiles[0].run.clock)))
         self.run = Run(profiles, wiring, worker, previews=options.watched)
         """Clock, truth and heads."""
         self.ended = asyncio.Event()

@@ -312,7 +312,9 @@ def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> li
     """Return a row for each field of a dataclass of the sky."""
     from starhil.emulator.sky.objects import _RANGES
 
-    texts = attribute_docstrings(kind, grouped=True)
+    texts: dict[str, str] = {}
+    for base in reversed(inspect.getmro(kind)[:-1]):
+        texts |= attribute_docstrings(base, grouped=True)
     rows: list[Row] = []
     for field in dataclasses.fields(kind):
         if field.name in (skipped or {}):

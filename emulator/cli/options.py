@@ -107,7 +107,11 @@ class BenchOptions:
     device_address: DeviceAddress = 4
     start: Annotated[bool, typer.Option("--start", help="Start the emulator for this run.")] = False
     profile: Annotated[
-        str | None, typer.Option(help="With --start: device profile.", autocompletion=names_of("profile"))
+        str | None,
+        typer.Option(
+            help="With --start: device profile, instead of the session's or cubestar.",
+            autocompletion=names_of("profile"),
+        ),
     ] = None
     junit: Annotated[Path | None, typer.Option(help=output_help("Write a JUnit XML file."))] = None
     view: Annotated[

@@ -12,7 +12,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.durable_file import replace_durably
@@ -24,27 +24,12 @@ LOCK_FILE: Final = "lock"
 MAX_BYTES: Final = 1_000_000
 
 
-class StateStore(Protocol):
-    """Stores the state that survives a restart."""
-
-    corrupt: bool
-    """Whether the stored state could not be read and was renamed."""
-
-    def load(self) -> dict[str, Any]:
-        """Return the last saved state, empty if there is none or it is corrupt."""
-
-    def save(self, content: dict[str, Any]) -> None:
-        """Save the complete content, or none of it."""
-
-    def close(self) -> None:
-        """Release the store for another process."""
-
-
 class MemoryStore:
     """State that survives a reset of the device, but not the end of the process."""
 
     def __init__(self) -> None:
         self.corrupt = False
+        """Whether the stored state could not be read and was renamed."""
         self._text = "{}"
 
     def load(self) -> dict[str, Any]:
@@ -112,6 +97,9 @@ class FileStore:
     def close(self) -> None:
         """Release the folder."""
         os.close(self._lock)
+
+
+StateStore: TypeAlias = MemoryStore | FileStore
 
 
 def _encode(content: dict[str, Any]) -> bytes:

@@ -19,16 +19,15 @@ from starhil.emulator.endurance.simulated_loop import WORKER_WAIT_S
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
+from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.pipeline.error_model import ErrorModelImager
 from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import MAX_STEP_S, StepPump
-from starhil.emulator.replay import prepare_recording
 from starhil.emulator.run import Run
-from starhil.emulator.tape import TRUTH_FILE, Recorder, Wiring
+from starhil.emulator.tape import Wiring
 from starhil.emulator.truth.config import TruthConfig
-from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.transports.base import Transport
@@ -153,9 +152,7 @@ class UnitUnderTest:
         self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
         self._folder = folder
         self._record = record
-        self._recorder: Recorder | None = None
-        self._truth_log: TruthLog | None = None
-        self._run: Run | None = None
+        self._emulator: Emulator | None = None
         self.frames = 0
         self.exposed_s = 0.0
         """Number of images solved in all, and the sum of their periods, seconds."""
@@ -167,9 +164,9 @@ class UnitUnderTest:
     @property
     def run(self) -> Run:
         """The run; power must be on."""
-        if self._run is None:
+        if self._emulator is None:
             raise EmulatorError("endurance: power is off")
-        return self._run
+        return self._emulator.run
 
     @property
     def head(self) -> Head:
@@ -181,7 +178,7 @@ class UnitUnderTest:
     async def power_on(self) -> None:
         """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
         reads = {name: transport.reads for name, transport in self._transports.items()}
-        self._run = None
+        self._emulator = None
         port = MemorySerial("serial", self._time_s)
         buses: dict[str, MemoryTransport[CanFrame]] = {
             name: MemoryTransport(name, self._time_s) for name in ("can", "canopen")
@@ -189,31 +186,18 @@ class UnitUnderTest:
         self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():
             transport.reads = reads.get(name, True)
-        wiring = MemoryWiring(port, buses)
         if self._record is not None:
             shutil.rmtree(self._record, ignore_errors=True)
-            prepare_recording(self._record, self.profile, "")
-            self._recorder = Recorder(self._record, wiring)
-            self._recorder.open()
-        self._run = Run([self.profile], self._recorder or wiring)
-        await self._run.open()
+        options = RunOptions(record=self._record)
+        self._emulator = Emulator([self.profile], options, wiring=MemoryWiring(port, buses))
+        await self._emulator.start()
         self.head.device.signals.frame_published.connect(self._count_frame)
-        if self._recorder is not None:
-            path = self._recorder.folder / TRUTH_FILE
-            self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
-            self.head.device.signals.frame_published.connect(self._truth_log.write)
-        self._run.begin()
-        await self._run.ready()
+        await self._emulator.ready()
 
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
-        if self._recorder is not None:
-            self._recorder.end()
-        await self.run.close()
-        files = (getattr(self._recorder, "file", None), getattr(self._truth_log, "file", None))
-        for file in files:
-            if file is not None:
-                file.close()
+        if self._emulator is not None:
+            await self._emulator.close()
         if factory:
             shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
 
@@ -226,7 +210,7 @@ class UnitUnderTest:
 
     def _time_s(self) -> float:
         """Return the simulation time; it is zero while the run is being opened."""
-        return 0.0 if self._run is None else self.now_s
+        return 0.0 if self._emulator is None else self.now_s
 
     def _count_frame(self, measurement: Measurement) -> None:
         self.frames += 1

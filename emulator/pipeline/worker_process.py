@@ -10,22 +10,9 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Final, Protocol
+from typing import Final, TypeAlias
 
 EXIT_GRACE_S: Final = 2.0
-
-
-class Worker(Protocol):
-    """A pipeline worker and the socket connected to it."""
-
-    socket: socket.socket
-
-    @property
-    def running(self) -> bool:
-        """Whether the worker is still running."""
-
-    def end(self) -> None:
-        """Close the socket, which ends the worker, and wait."""
 
 
 class WorkerThread:
@@ -77,6 +64,8 @@ class WorkerProcess:
             self.process.kill()
             self.process.wait()
 
+
+Worker: TypeAlias = WorkerProcess | WorkerThread
 
 _ahead: Final[list[WorkerProcess]] = []
 

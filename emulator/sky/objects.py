@@ -13,19 +13,28 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Self
 
+import numpy as np
+
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sky.directions import icrs_vector
 from starid.arrays import Array
 
 _ANGLE: Final = (-360.0, 360.0)
 _MAX_OBJECTS: Final = 100_000
 
 
+def icrs_vector(ra_deg: float, dec_deg: float) -> Array:
+    """Unit vector (3,) of a direction."""
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+
+
+@dataclass(frozen=True)
 class CelestialBody:
     """Something in one direction of the sky."""
 
     ra_deg: float
     dec_deg: float
+    """Direction of its centre, ICRS."""
 
     @cached_property
     def direction(self) -> Array:
@@ -42,9 +51,6 @@ class CelestialBody:
 class Moon(CelestialBody):
     """The Moon: a saturated disc, and its light scattered in the lens."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction of its centre, ICRS."""
     diameter_deg: float = 0.52
     """Apparent diameter."""
     magnitude: float = -12.7
@@ -68,9 +74,6 @@ class Moon(CelestialBody):
 class SunGlare(CelestialBody):
     """The Sun: stray light, and in the field of view a disc whose light, scattered in the lens, saturates the image."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction of the Sun, ICRS."""
     electrons_s: float = 1000.0
     """Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle."""
     exclusion_deg: float = 0.0
@@ -93,9 +96,6 @@ class SunGlare(CelestialBody):
 class EarthLimb(CelestialBody):
     """The Earth's disc in front of part of the sky."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction of the Earth's centre, ICRS."""
     radius_deg: float = 64.0
     """Angular radius of the Earth; 64° at an altitude of 700 km."""
     electrons_s: float = 1e6
@@ -126,9 +126,6 @@ class EarthLimb(CelestialBody):
 class PointSource(CelestialBody):
     """A planet, satellite or other point source that is not in the star catalogue."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction, ICRS."""
     magnitude: float
     """V magnitude in the sensor's band."""
     name: str = ""

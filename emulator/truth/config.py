@@ -19,8 +19,8 @@ from starhil.emulator.truth.orbit import LARGEST_ECCENTRICITY, KeplerOrbit, Orbi
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
+    ZERO_RATE,
     FixedTruth,
-    HoldSegment,
     RateSegment,
     RateTruth,
     Segment,
@@ -176,7 +176,7 @@ class HoldConfig(Strict):
 
     def build(self) -> Segment:
         """Make the segment."""
-        return HoldSegment(self.seconds)
+        return RateSegment(self.seconds, ZERO_RATE)
 
 
 class TurnConfig(Strict):

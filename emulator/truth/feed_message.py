@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -60,28 +60,6 @@ class FeedMessage:
     """Date as Unix time, or None."""
 
 
-class FeedFormat(Protocol):
-    """Format of the messages of a feed, and of the answers in lock-step."""
-
-    @property
-    def end(self) -> bytes:
-        """Bytes that end a message in a stream."""
-
-    @property
-    def max_size(self) -> int:
-        """Longest accepted message, bytes."""
-
-    def decode(self, data: bytes | str) -> FeedMessage:
-        """Decode one message; FeedError names the key that is invalid."""
-
-    def answer(self, run_time_s: float, fault: str) -> bytes:
-        """Return the answer to a message; `fault` is empty if it was accepted."""
-
-    @property
-    def always_answers(self) -> bool:
-        """Whether the sender expects an answer even without lock-step."""
-
-
 @dataclass(frozen=True)
 class JsonFormat:
     """JSON objects, one per line; see the module docstring."""
@@ -89,11 +67,14 @@ class JsonFormat:
     convention: Convention = "rotation"
     order: Order = "xyzw"
     end: bytes = b"\n"
+    """Bytes that end a message in a stream."""
     max_size: int = 4096
+    """Longest accepted message, bytes."""
     always_answers: bool = False
+    """Whether the sender expects an answer even without lock-step."""
 
     def decode(self, data: bytes | str) -> FeedMessage:
-        """Decode one line."""
+        """Decode one line; FeedError names the key that is invalid."""
         try:
             message: Any = parse_json(data)
         except RepeatedKeyError as error:

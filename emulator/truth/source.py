@@ -113,13 +113,6 @@ class RateTruth:
 
 
 @dataclass(frozen=True)
-class HoldSegment:
-    """Hold the attitude for a time, seconds."""
-
-    seconds: float
-
-
-@dataclass(frozen=True)
 class RateSegment:
     """Rotate at a constant body rate (3,), rad/s, sensor frame, for a time in seconds."""
 
@@ -139,7 +132,7 @@ class SlewSegment:
     """Acceleration of the `limited` shape, rad/s²."""
 
 
-Segment: TypeAlias = HoldSegment | RateSegment | SlewSegment
+Segment: TypeAlias = RateSegment | SlewSegment
 
 
 @dataclass(frozen=True)
@@ -159,8 +152,7 @@ class _Leg:
         if isinstance(segment, SlewSegment):
             angle, rate = _slew_angle_and_rate(segment, self.angle, self.seconds, elapsed)
             return TruthState(self.attitude.rotated(self.axis * angle), self.axis * rate)
-        rate_vector = segment.rate_rad_s if isinstance(segment, RateSegment) else ZERO_RATE
-        return TruthState(propagate(self.attitude, rate_vector, elapsed), rate_vector)
+        return TruthState(propagate(self.attitude, segment.rate_rad_s, elapsed), segment.rate_rad_s)
 
 
 def _slew_seconds(segment: SlewSegment, angle: float) -> float:
