@@ -59,6 +59,24 @@ def from_vector_part(x: float, y: float, z: float) -> Quaternion:
     return unit((x, y, z, math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))))
 
 
+def product(p: Sequence[float], q: Sequence[float]) -> Quaternion:
+    """Return the Hamilton product p ⊗ q."""
+    a, b, c, d = p
+    x, y, z, w = q
+    return Quaternion(
+        d * x + a * w + b * z - c * y,
+        d * y - a * z + b * w + c * x,
+        d * z + a * y - b * x + c * w,
+        d * w - a * x - b * y - c * z,
+    )
+
+
+def conjugate(q: Sequence[float]) -> Quaternion:
+    """Return the inverse of a unit quaternion."""
+    x, y, z, w = q
+    return Quaternion(-x, -y, -z, w)
+
+
 def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:
     """Return the attitude with this boresight and roll.
 
@@ -73,30 +91,22 @@ def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternio
     sine, cosine = math.sin(roll), math.cos(roll)
     row_x = tuple(-sine * n - cosine * e for n, e in zip(north, east, strict=True))
     row_y = tuple(-cosine * n + sine * e for n, e in zip(north, east, strict=True))
-    return _from_rows(row_x, row_y, boresight)
+    return from_matrix((row_x, row_y, boresight))
 
 
-def _from_rows(x: Sequence[float], y: Sequence[float], z: Sequence[float]) -> Quaternion:
-    """Return the quaternion of a rotation matrix, given by rows; its largest component is computed first."""
-    trace = x[0] + y[1] + z[2]
-    squares = (
-        1.0 + x[0] - y[1] - z[2],
-        1.0 - x[0] + y[1] - z[2],
-        1.0 - x[0] - y[1] + z[2],
-        1.0 + trace,
-    )
+def from_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
+    """Return the quaternion that rotates vectors as a matrix does, given by rows (Shepperd's method)."""
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
     largest = squares.index(max(squares))
-    twice = 2.0 * math.sqrt(squares[largest])
-    xy, xz, yz = y[0] + x[1], z[0] + x[2], z[1] + y[2]
-    wx, wy, wz = z[1] - y[2], x[2] - z[0], y[0] - x[1]
-    quarter = twice / 4.0
     parts = (
-        (quarter, xy / twice, xz / twice, wx / twice),
-        (xy / twice, quarter, yz / twice, wy / twice),
-        (xz / twice, yz / twice, quarter, wz / twice),
-        (wx / twice, wy / twice, wz / twice, quarter),
+        (squares[0], b + d, c + g, h - f),
+        (b + d, squares[1], f + h, c - g),
+        (c + g, f + h, squares[2], d - b),
+        (h - f, c - g, d - b, squares[3]),
     )[largest]
-    return unit(parts)
+    length = math.sqrt(sum(part * part for part in parts))
+    return Quaternion(*(part / length for part in parts))
 
 
 def boresight(q: Quaternion) -> tuple[float, float, float]:
@@ -133,12 +143,7 @@ def to_radec_roll(q: Quaternion) -> tuple[float, float, float]:
 
 def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
     """Compare two attitudes; a quaternion and its negative are the same attitude."""
-    # rotation from the true into the measured sensor frame: measured * conjugate(truth)
-    a, b = measured, truth
-    x = -a.w * b.x + a.x * b.w - a.y * b.z + a.z * b.y
-    y = -a.w * b.y + a.x * b.z + a.y * b.w - a.z * b.x
-    z = -a.w * b.z - a.x * b.y + a.y * b.x + a.z * b.w
-    w = a.w * b.w + a.x * b.x + a.y * b.y + a.z * b.z
+    x, y, z, w = product(measured, conjugate(truth))  # from the true into the measured sensor frame
     cross = 2.0 * math.atan2(math.hypot(x, y), math.hypot(z, w))
     total = 2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w))
     roll = 2.0 * math.atan2(abs(z), abs(w))

@@ -16,6 +16,9 @@ from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
 from starhil.hil_tests.links import CanHostLink
 from starhil.hil_tests.load_figures import Jitter, Spread
 from starhil.protocol.can_framing import MAX_STANDARD_ID, CanFrame
+from starhil.protocol.canopen import cob
+from starhil.protocol.canopen.abort import SdoAbortError
+from starhil.protocol.canopen.sdo_client import SdoTransfer, download, upload
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.transports import CanTransport, open_can
@@ -24,15 +27,8 @@ WARM_UP: Final = 3
 """Number of messages that are ignored at the start."""
 ANSWER_S: Final = 2.0
 
-SYNC: Final = 0x080
-NMT: Final = 0x000
-HEARTBEAT: Final = 0x700
-SDO_REQUEST: Final = 0x600
-SDO_REPLY: Final = 0x580
-SDO_ABORT: Final = 0x80
 PRODUCER_HEARTBEAT: Final = 0x1017
 TPDO_COMMUNICATION: Final = 0x1800
-DISABLED: Final = 0x8000_0000
 EVERY_SYNC: Final = 1
 EVENT_DRIVEN: Final = 255
 RESET_COMMUNICATION: Final = 130
@@ -109,44 +105,42 @@ class _Node:
 
     def on_frame(self, frame: CanFrame) -> None:
         """Process a frame from the bus."""
-        waiting = self._answer is not None and not self._answer.done()
-        if frame.id == SDO_REPLY + self._node and not frame.extended and waiting and self._answer is not None:
+        awaited = frame.id == cob.SDO_TRANSMIT + self._node and not frame.extended
+        if awaited and self._answer is not None and not self._answer.done():
             self._answer.set_result(frame.data)
 
     async def write(self, index: int, subindex: int, value: int, size: int) -> None:
         """Write an entry of up to four bytes; raise BenchError if the node refuses or does not answer."""
-        await self._transfer(0x23 | (4 - size) << 2, index, subindex, value)
+        await self._transfer(index, subindex, download(index, subindex, value.to_bytes(size, "little")))
 
-    async def read(self, index: int, subindex: int) -> int:
-        """Read an entry of up to four bytes; raise BenchError if the node refuses or does not answer."""
-        return await self._transfer(0x40, index, subindex, 0)
-
-    async def _transfer(self, command: int, index: int, subindex: int, value: int) -> int:
-        self._answer = asyncio.get_running_loop().create_future()
-        head = bytes((command, index & 0xFF, index >> 8, subindex))
-        self.send(SDO_REQUEST + self._node, head + value.to_bytes(4, "little"))
-        try:
-            answer = await asyncio.wait_for(self._answer, ANSWER_S)
-        except TimeoutError:
-            raise BenchError(
-                f"jitter: CANopen node {self._node} does not answer; is it on this bus?"
-            ) from None
-        content = int.from_bytes(answer[4:8], "little")
-        if answer[0] == SDO_ABORT:
-            raise BenchError(
-                f"jitter: node {self._node} refuses {index:04X}h:{subindex} with abort code {content:08X}h"
-            )
-        return content
+    async def _transfer(self, index: int, subindex: int, transfer: SdoTransfer) -> bytes:
+        request = next(transfer)
+        while True:
+            self._answer = asyncio.get_running_loop().create_future()
+            self.send(cob.SDO_RECEIVE + self._node, request)
+            try:
+                request = transfer.send(await asyncio.wait_for(self._answer, ANSWER_S))
+            except StopIteration as done:
+                return bytes(done.value)
+            except TimeoutError:
+                raise BenchError(
+                    f"jitter: CANopen node {self._node} does not answer; is it on this bus?"
+                ) from None
+            except SdoAbortError as abort:
+                raise BenchError(
+                    f"jitter: node {self._node} refuses {index:04X}h:{subindex} with abort code {abort.code:08X}h"
+                ) from None
 
     async def prepare_tpdo(self, transmission: int, event_ms: int) -> int:
         """Configure the first TPDO, start the node, and return the CAN ID of the TPDO."""
-        self.send(NMT, bytes((PRE_OPERATIONAL, self._node)))
-        can_id = await self.read(TPDO_COMMUNICATION, 1)
-        await self.write(TPDO_COMMUNICATION, 1, can_id | DISABLED, 4)
+        self.send(cob.NMT, bytes((PRE_OPERATIONAL, self._node)))
+        stored = await self._transfer(TPDO_COMMUNICATION, 1, upload(TPDO_COMMUNICATION, 1))
+        can_id = int.from_bytes(stored, "little")
+        await self.write(TPDO_COMMUNICATION, 1, can_id | cob.INVALID, 4)
         await self.write(TPDO_COMMUNICATION, 2, transmission, 1)
         await self.write(TPDO_COMMUNICATION, 5, event_ms, 2)
-        await self.write(TPDO_COMMUNICATION, 1, can_id & ~DISABLED, 4)
-        self.send(NMT, bytes((OPERATIONAL, self._node)))
+        await self.write(TPDO_COMMUNICATION, 1, can_id & ~cob.INVALID, 4)
+        self.send(cob.NMT, bytes((OPERATIONAL, self._node)))
         return can_id & MAX_STANDARD_ID
 
     def send(self, can_id: int, data: bytes = b"") -> None:
@@ -167,7 +161,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
     await transport.start(receive)
     try:
         yield master
-        master.send(NMT, bytes((RESET_COMMUNICATION, node)))
+        master.send(cob.NMT, bytes((RESET_COMMUNICATION, node)))
         await transport.drain()
         await asyncio.sleep(SETTLE_S)
     finally:
@@ -176,7 +170,7 @@ async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> Asy
 
 async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
     """Set the heartbeat period of a node and measure the intervals."""
-    arrivals = _Arrivals(lambda frame: frame.id == HEARTBEAT + node and not frame.extended)
+    arrivals = _Arrivals(lambda frame: frame.id == cob.ERROR_CONTROL + node and not frame.extended)
     async with _joined(spec, node, arrivals.on_frame) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
         arrivals.times.clear()
@@ -222,7 +216,7 @@ async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) 
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             sent_at = time.perf_counter()
-            master.send(SYNC)
+            master.send(cob.SYNC)
             syncs += 1
             await asyncio.sleep(period_s)
     if len(delays) < syncs:

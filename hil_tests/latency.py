@@ -15,9 +15,10 @@ import subprocess
 import sys
 import time
 import tty
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Final
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
@@ -64,6 +65,16 @@ class LatencyRow:
     p99_ms: float
     max_ms: float
     lost: int
+
+    @classmethod
+    def of(
+        cls, link: str, worker: str, rate_hz: float, viewers: int, taken: Sequence[float | None]
+    ) -> LatencyRow:
+        """Summarise latencies in seconds; None stands for a lost reply."""
+        found = [latency for latency in taken if latency is not None]
+        figures = Spread.of(found)
+        three = (figures.p50_ms, figures.p99_ms, figures.max_ms)
+        return cls(link, worker, rate_hz, viewers, len(found), *three, len(taken) - len(found))
 
 
 @dataclass(frozen=True)
@@ -214,6 +225,10 @@ class Viewers:
             process.wait()
 
 
+Ask = Callable[[str], float | None]
+"""Requests a row by name; returns the latency in seconds, or None without a reply."""
+
+
 def measure(
     unit: str,
     rates_hz: list[float],
@@ -230,8 +245,9 @@ def measure(
     icd = load_unit(unit)
     rows: list[LatencyRow] = []
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
-    names = [name for name in ROWS if name in icd.telemetry] or list(icd.telemetry)
     ready_s = memory_mb = 0.0
+    turns = [0, viewers] * PAIRS if viewers else [0]
+    """Number of viewers in each turn."""
     for rate in rates_hz:
         report(f"{worker}: {rate:g} Hz")
         with ExitStack() as stack:
@@ -254,16 +270,23 @@ def measure(
                 )
             )
             ready_s = ready_s or time.perf_counter() - begin
-            probes = _probes(icd, emulator.ready, stack)
-            watched = _Watched(emulator.ready.get("view", ""), viewers)
-            rows += _measure_rate(probes, names, worker, rate, seconds, rng, watched)
+            links = _open_links(icd, emulator.ready, stack)
+            taken: dict[tuple[int, str], list[float | None]] = {
+                (count, link): [] for count in dict.fromkeys(turns) for link in links
+            }
+            for count in turns:
+                with closing(Viewers(emulator.ready.get("view", ""), count)):
+                    time.sleep(SETTLE_S if count else 0.0)
+                    for link, latency in _latencies(icd, links, seconds / turns.count(0), rng):
+                        taken[count, link].append(latency)
+            rows += [
+                LatencyRow.of(link, worker, rate, count, values) for (count, link), values in taken.items()
+            ]
             memory_mb = max(memory_mb, emulator.memory_bytes() / 2**20)
     return rows, ProcessRow(worker, ready_s, memory_mb)
 
 
-def _probes(
-    icd: InterfaceDefinition, ready: Mapping[str, str], stack: ExitStack
-) -> dict[str, Callable[[str], float | None]]:
+def _open_links(icd: InterfaceDefinition, ready: Mapping[str, str], stack: ExitStack) -> dict[str, Ask]:
     """Open the links that the emulator has, and the echo process for comparison."""
     if "serial" not in ready:
         raise BenchError(f"bench latency: unit {icd.name} has no serial link to measure")
@@ -273,69 +296,19 @@ def _probes(
     if "can" in ready and icd.link.can is not None:
         opened["can"] = HubRequester(ready["can"], icd)
     opened["echo"] = EchoRequester(icd)
-    for probe in opened.values():
-        stack.callback(probe.close)
-    return {link: probe.ask for link, probe in opened.items()}
+    for requester in opened.values():
+        stack.callback(requester.close)
+    return {link: requester.ask for link, requester in opened.items()}
 
 
-@dataclass(frozen=True)
-class _Watched:
-    """Address of the console, and number of its viewers."""
-
-    address: str
-    viewers: int
-
-
-def _measure_rate(
-    probes: Mapping[str, Callable[[str], float | None]],
-    names: Sequence[str],
-    worker: str,
-    rate: float,
-    seconds: float,
-    rng: random.Random,
-    watched: _Watched,
-) -> list[LatencyRow]:
-    """Measure the links at one update rate, alternately without and with viewers."""
-    counts = (0, watched.viewers) if watched.viewers else (0,)
-    taken: dict[int, dict[str, list[float]]] = {count: {link: [] for link in probes} for count in counts}
-    lost = {count: dict.fromkeys(probes, 0) for count in counts}
-    turns = PAIRS if watched.viewers else 1
-    for _ in range(turns):
-        for count in counts:
-            with closing(Viewers(watched.address, count)):
-                time.sleep(SETTLE_S if count else 0.0)
-                _measure_links(probes, names, seconds / turns, rng, taken[count], lost[count])
-    return [
-        _row(link, worker, rate, count, values, lost[count][link])
-        for count in counts
-        for link, values in taken[count].items()
-    ]
-
-
-def _measure_links(
-    probes: Mapping[str, Callable[[str], float | None]],
-    names: Sequence[str],
-    seconds: float,
-    rng: random.Random,
-    taken: Mapping[str, list[float]],
-    lost: dict[str, int],
-) -> None:
-    """Send requests on each link in turn for some time, and add latencies in s and losses."""
+def _latencies(
+    icd: InterfaceDefinition, links: Mapping[str, Ask], seconds: float, rng: random.Random
+) -> Iterator[tuple[str, float | None]]:
+    """Send requests on each link in turn for some time; yield link and latency."""
+    names = cycle([name for name in ROWS if name in icd.telemetry] or list(icd.telemetry))
     end = time.monotonic() + seconds
-    count = 0
     while time.monotonic() < end:
-        name = names[count % len(names)]
-        count += 1
-        for link, ask in probes.items():
-            latency = ask(name)
-            if latency is None:
-                lost[link] += 1
-            else:
-                taken[link].append(latency)
+        name = next(names)
+        for link, ask in links.items():
+            yield link, ask(name)
             time.sleep(rng.expovariate(1.0 / PAUSE_S))
-
-
-def _row(link: str, worker: str, rate: float, viewers: int, seconds: list[float], lost: int) -> LatencyRow:
-    figures = Spread.of(seconds)
-    counts = (rate, viewers, len(seconds))
-    return LatencyRow(link, worker, *counts, figures.p50_ms, figures.p99_ms, figures.max_ms, lost)

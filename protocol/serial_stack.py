@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import Final, TypeVar
 
 from starhil.protocol import cubespace
-from starhil.protocol.checks import CheckFunction, build_check
+from starhil.protocol.checks import Check, CheckFunction, build_check
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Order
 from starhil.protocol.definition import InterfaceDefinition
@@ -27,7 +27,6 @@ from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.framings import (
     CUBESPACE,
-    BodySizeError,
     Deframer,
     Escaped,
     Framing,
@@ -36,12 +35,12 @@ from starhil.protocol.framings import (
 )
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
-    FixedFraming,
     HeaderFieldModel,
     LengthFraming,
     MessageClass,
     SerialLinkModel,
 )
+from starhil.protocol.message_format import MessageFormat
 from starhil.protocol.messages import (
     BURST_ID,
     DEFAULT_MAX_SIZE,
@@ -188,29 +187,23 @@ class SerialStack:
     ) -> None:
         self.baud: Final = link.baud
         self.link: Final = link
-        self.framing: Final = build_framing(link.framing, framings)
-        self.check: Final = build_check(link.check, byte_order, checks)
         self.classes: Final = _Classes(classes)
         self.rows: Final = tuple(rows)
         self.byte_order: Final = byte_order
         self.dialects: Final = dialects_of(link)
+        self._plugin = framings, checks
         self._silent = {row.id for row in rows if not row.answers}
         self._rows = {(row.klass, row.id): row for row in rows}
         self._rows_by_id: dict[int, RowShape] = {}
         for row in rows:
             self._rows_by_id.setdefault(row.id, row)
-        self._overhead = {
-            "start": len(self.framing.start),
-            "check": self.check.size,
-            "end": len(self.framing.end),
-        }
-        self.request_header: Final = self._header(
+        self.requests: Final = self._format(
             "request_header", cubespace.REQUEST_HEADER if self.dialects else link.request_header
         )
+        self.replies: Final = self._format("reply_header", link.reply_header)
         self._formats: Final = {dialect: self._dialect(dialect) for dialect in self.dialects}
         default = default_dialect(self.dialects)
         self._default_format: Final = self._one_format() if default is None else self._formats[default]
-        self.reply_header: Final = self.format().headers[ReplyKind.NACK]
         self._check_headers()
         longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)
         header = max(
@@ -220,17 +213,46 @@ class SerialStack:
         )
         self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest + header + self.check.size)
 
-    def _header(self, name: str, models: Sequence[HeaderFieldModel]) -> Header:
-        codes = self.classes.requests if name == "request_header" else self.classes.replies
-        return Header(models, self.byte_order, codes, self._overhead, f"link.serial.{name}")
+    def _format(self, name: str, models: Sequence[HeaderFieldModel]) -> MessageFormat:
+        framings, checks = self._plugin
+        return MessageFormat(
+            build_framing(self.link.framing, framings),
+            self.link.framing,
+            build_check(self.link.check, self.byte_order, checks),
+            models,
+            self.byte_order,
+            self.classes.requests if name == "request_header" else self.classes.replies,
+            f"link.serial.{name}",
+        )
+
+    @property
+    def framing(self) -> Framing:
+        """The framing of requests."""
+        return self.requests.framing
+
+    @property
+    def check(self) -> Check:
+        """The check of requests."""
+        return self.requests.check
+
+    @property
+    def request_header(self) -> Header:
+        """The header of requests."""
+        return self.requests.header
+
+    @property
+    def reply_header(self) -> Header:
+        """The header of replies; of those of a dialect, that of a refusal."""
+        return self.format().headers[ReplyKind.NACK]
 
     def _one_format(self) -> ReplyFormat:
-        header = self._header("reply_header", self.link.reply_header)
-        return ReplyFormat(self.framing, dict.fromkeys(set(ReplyKind) - {ReplyKind.ECHO}, header))
+        headers = dict.fromkeys(set(ReplyKind) - {ReplyKind.ECHO}, self.replies.header)
+        return ReplyFormat(self.replies.framing, headers)
 
     def _dialect(self, dialect: Dialect) -> ReplyFormat:
         headers = {
-            kind: self._header(kind.value, models) for kind, models in cubespace.REPLIES[dialect].items()
+            kind: self._format(kind.value, models).header
+            for kind, models in cubespace.REPLIES[dialect].items()
         }
         constants = (field.const for header in headers.values() for field in header.fields)
         starts = frozenset(constant for constant in constants if constant is not None)
@@ -286,7 +308,7 @@ class SerialStack:
 
     def encode_request(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
-        return self.framing.encode(self.request_body(request))
+        return self.requests.framing.encode(self.request_body(request))
 
     def request_body(self, request: Request) -> bytes:
         """Return header, data and check of a request."""
@@ -297,7 +319,9 @@ class SerialStack:
             values["flags"] = request.flags
         if "class" in self.request_header.roles:
             values["class"] = self.classes.request_code(request.klass)
-        return self.close(self.request_header.pack(values, request.klass, len(request.data)), request.data)
+        return self.requests.close(
+            self.request_header.pack(values, request.klass, len(request.data)), request.data
+        )
 
     def encode_reply(self, reply: Reply, dialect: Dialect | None = None) -> bytes:
         """Return a reply as bytes on the line; empty for a refusal that the unit's header cannot express.
@@ -340,59 +364,10 @@ class SerialStack:
                 reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
             )
         data = b"" if refused or (self.dialects and accepted) else reply.data
-        return form.framing.encode(self.close(header.pack(values, reply.klass, len(data)), data))
-
-    def close(self, header: bytes, data: bytes) -> bytes:
-        """Return header, data and check of a message."""
-        if not self.check.size:
-            return header + data
-        return header + data + self.check.compute(self._covered(header, data))
-
-    def _covered(self, header: bytes, data: bytes) -> bytes:
-        covers = self.check.covers
-        return (
-            (self.framing.start if "start" in covers else b"")
-            + (header if "header" in covers else b"")
-            + (data if "data" in covers else b"")
-        )
-
-    def open(self, header: Header, body: bytes) -> tuple[Envelope, bytes] | LinkFault:
-        """Return header and data of a body, or its fault."""
-        end = len(body) - self.check.size
-        try:
-            envelope = header.unpack(body[: max(end, 0)])
-        except HeaderError as error:
-            if {"header", "data"} <= self.check.covers and not self._checks(body, 0, end):
-                return self._bad_check(body[end:])
-            return LinkFault(FaultKind.UART_PROTOCOL, str(error))
-        if envelope is None:
-            return LinkFault(
-                FaultKind.UART_PROTOCOL, f"message of {len(body)} bytes is shorter than its header"
-            )
-        if not self._checks(body, envelope.size, end):
-            return self._bad_check(body[end:])
-        address = envelope.values.get("address")
-        if address is not None and address != header.defaults["address"]:
-            text = f"message to address {address:#04x}, not {header.defaults['address']:#04x}"
-            return LinkFault(FaultKind.UART_ADDRESS, text)
-        found = end - envelope.size
-        if "length" in header.roles and envelope.values["length"] != header.length(envelope.size, found):
-            text = f"{found} bytes of data, but length {envelope.values['length']}"
-            return LinkFault(FaultKind.UART_PROTOCOL, text)
-        return envelope, body[envelope.size : end]
-
-    def _checks(self, body: bytes, header_size: int, end: int) -> bool:
-        if not self.check.size:
-            return True
-        covered = self._covered(body[:header_size], body[header_size:end])
-        return self.check.compute(covered) == body[end:]
-
-    @staticmethod
-    def _bad_check(check: bytes) -> LinkFault:
-        return LinkFault(FaultKind.UART_CHECK, f"check {check.hex().upper()} is wrong")
+        return form.framing.encode(self.replies.close(header.pack(values, reply.klass, len(data)), data))
 
     def _request_of(self, body: bytes) -> Request | LinkFault:
-        opened = self.open(self.request_header, body)
+        opened = self.requests.open(body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened
@@ -421,30 +396,15 @@ class SerialStack:
 
     def _request_size(self, body: bytes) -> int | None:
         """Return the size of a request that begins with these bytes, or None if more are needed."""
-        framing = self.link.framing
-        if isinstance(framing, FixedFraming) and framing.request_size is not None:
-            return framing.request_size
-        return self.measure(self.request_header, body, self._request_data_size)
+        if self.requests.request_size is not None:
+            return self.requests.request_size
+        return self.requests.measure(body, self._request_data_size)
 
     def _request_data_size(self, envelope: Envelope) -> int:
         row = self.row(envelope.klass, envelope.values["id"])
         if row is None:
             raise HeaderError(f"no row with id {envelope.values['id']}")
         return row.request_size
-
-    def measure(self, header: Header, body: bytes, data_size: Callable[[Envelope], int]) -> int | None:
-        """Return the size of the body that begins with these bytes, or None if more are needed.
-
-        `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.
-        """
-        try:
-            envelope = header.unpack(body)
-            if envelope is None:
-                return None
-            data = header.data_size(envelope) if "length" in header.roles else data_size(envelope)
-        except HeaderError as error:
-            raise BodySizeError(str(error)) from None
-        return envelope.size + data + self.check.size
 
 
 class HostReceiver:
@@ -491,7 +451,7 @@ class HostReceiver:
         """Return the size of the echo or reply that begins with these bytes, or None if more are needed."""
         if self._echo is not None:
             return len(self._echo)
-        return self._stack.measure(self._stack.reply_header, body, self._data_size)
+        return self._stack.replies.measure(body, self._data_size)
 
     def _data_size(self, envelope: Envelope) -> int:
         values = envelope.values
@@ -510,7 +470,7 @@ class HostReceiver:
         stack = self._stack
         if stack.dialects:
             return self._reply_in_dialect(body)
-        opened = stack.open(stack.reply_header, body)
+        opened = stack.replies.open(body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened

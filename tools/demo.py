@@ -22,6 +22,7 @@ from rich.table import Table
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.load_figures import percentile
 from starid.attitude import Attitude
 
 CROSS_LIMIT_ARCSEC = 60.0
@@ -152,7 +153,7 @@ def report(comparisons: dict[str, Comparison], console: Console) -> bool:
         "roll error, maximum, arcsec": lambda found: f"{found.roll_arcsec.max():.2f}",
         "mid-exposure to attitude, median, ms": lambda found: f"{np.median(found.latency_ms):.1f}",
         "request to reply, median, ms": lambda found: f"{np.median(found.reply_ms):.2f}",
-        "request to reply, 99 %, ms": lambda found: f"{np.percentile(found.reply_ms, 99):.2f}",
+        "request to reply, 99 %, ms": lambda found: f"{percentile(found.reply_ms.tolist(), 0.99):.2f}",
         f"within {CROSS_LIMIT_ARCSEC:.0f} and {ROLL_LIMIT_ARCSEC:.0f} arcsec": lambda found: (
             "yes" if within_limits(found) else "NO"
         ),

@@ -15,7 +15,7 @@ An answer is one of
 
 Other lines begin with a verb:
 
-    need 1016 1029              skip the case if an object is missing
+    need 1016 1010:3            skip the case if an object or entry is missing
     set 1017:0 20 u16           write a number; it must be accepted
     set 1003:0 1 u8 > A|B       it must be refused with one of these aborts; VALUES stands for those of a wrong value
     set 1010:1 save             write a text
@@ -23,11 +23,24 @@ Other lines begin with a verb:
     value BYTES, kept           read the writable number: these bytes, or as it was before the dialogue
     nmt 1, nmt 1 all, nmt 1 other       an NMT command to the node, to all nodes, to another node
     boot-up, state 7f           the boot-up message; the next heartbeat, with this state
+    none {heartbeat} 0.3        no frame with this CAN ID, within a time, s
     guard 7f, guard             node guarding is answered with this state and toggle bit, or not at all
     watched                     a heartbeat of the node that this one watches
     emcy 8130 0.3, calm 0.4     this EMCY, or none, within a time, s
-    send 000 01 extended        a frame, with 29 bits of CAN ID if so said
+    send 000 01 extended        a frame, with 29 bits of CAN ID or as a remote frame if so said
     sleep 0.2, drain, quiet, reset      wait; forget what was received; PDOs and heartbeat off; reset of the communication
+    clock, took 0.08 0.16       start of a time; its limits, s
+
+and of PDOs:
+
+    transmit 1 start=3          the first TPDO carries a constant object, with this transmission type; other settings as in `set_up`
+    carry 1800 255 times=2      the first TPDO or RPDO (1400) carries a writable object, which is restored at the end
+    off 1800                    disable the PDO with this communication record
+    sync, sync 3                a SYNC, or one with a counter
+    tpdo 2a00, tpdo, no-tpdo 0.1        the TPDO comes with these bytes or any, or not within a time, s
+    event-tpdo 2a00 3.0         the same within a time; skip the case if it does not come
+    rest 0.1                    wait for a TPDO that may come or not
+    rpdo 2a00, put 2a00, object 2a00    send the RPDO; write the carried object by SDO; its value
 
 Names in braces are in `Names`; all are found before the first request.
 """
@@ -38,7 +51,7 @@ import re
 from binascii import crc_hqx
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
@@ -55,6 +68,17 @@ from starhil.hil_tests.conformance.canopen_probe import (
     size_of,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
+from starhil.hil_tests.conformance.pdo_setup import (
+    TPDO,
+    Carried,
+    constant,
+    entry,
+    first,
+    pdo_id,
+    send_sync,
+    set_up,
+    writable,
+)
 from starhil.hil_tests.judge.canopen import multiplexer
 
 LONGEST_TIMEOUT_S: Final = 12.0
@@ -62,6 +86,8 @@ LONGEST_TIMEOUT_S: Final = 12.0
 
 IDENTITY: Final = ("vendor", "product", "revision", "serial")
 """Parts of 1018h, from sub-index 1 on."""
+COB_IDS: Final = {"request": 0x600, "response": 0x580, "heartbeat": 0x700}
+"""CAN IDs to which the node ID is added."""
 
 Ask = Callable[[bytes, float], bytes | None]
 """Sends a request (empty: none) and returns the next answer within a time, or None."""
@@ -83,11 +109,18 @@ class Names(dict[str, str]):
 
     `text`, `number`, `write_only`: multiplexer of a long readable text, of a writable number of 16 bits, of an object
     that cannot be read; `new`, `low`, `high`: another value for the number, and its bytes; `crc`, `bad_crc`: CRC of this
-    value, and another; `tpdo`: index of the first TPDO; `node`; `vendor`, `product`, `revision`, `serial`: parts of the identity.
+    value, and another; `tpdo`, `tpdo_id`: index and default CAN ID of the first TPDO; `value`: of the constant object;
+    `before`, `other`, `changed`: values of the carried object; `node`; `request`, `response`, `heartbeat`: CAN IDs, and
+    `other_request`: that of another node; `vendor`, `product`, `revision`, `serial`: parts of the identity.
     """
 
     def __init__(self, probe: CanopenProbe) -> None:
         self._probe = probe
+
+    @cached_property
+    def carried(self) -> Carried:
+        """The writable object for a PDO."""
+        return writable(self._probe)
 
     def __missing__(self, name: str) -> str:
         self[name] = found = self._find(name)
@@ -102,9 +135,19 @@ class Names(dict[str, str]):
         if name == "write_only":
             return mux(probe.find("write-only object", lambda item: item.access_type == "wo"))
         if name == "tpdo":
-            return f"{next(iter(probe.pdo_indices(0x1800)), 0x1800):04x}"
+            return f"{next(iter(probe.pdo_indices(TPDO)), TPDO):04x}"
+        if name == "tpdo_id":
+            return f"{pdo_id(first(probe, TPDO), probe.node):03x}"
+        if name in ("before", "other", "changed"):
+            return bytes(getattr(self.carried, name)).hex()
+        if name == "value":
+            return probe.value(constant(probe)).hex()
         if name == "node":
             return f"{probe.node:02x}"
+        if name in COB_IDS:
+            return f"{COB_IDS[name] + probe.node:03x}"
+        if name == "other_request":
+            return f"{COB_IDS['request'] + probe.node % 127 + 1:03x}"
         if name in IDENTITY:
             return probe.read(0x1018, IDENTITY.index(name) + 1).hex()
         before = probe.value(writable_number(probe))
@@ -141,24 +184,28 @@ def sdo(probe: CanopenProbe) -> Ask:
 
 def hold(probe: CanopenProbe, lines: str, ask: Ask) -> None:
     """Hold a dialogue."""
-    for needed in re.findall(r"need ([\w ]+)", lines):
-        probe.require(*(int(index, 16) for index in needed.split()))
-    master = _Master(probe, lines)
-    for number, line in enumerate(lines.format_map(Names(probe)).split(";"), 1):
+    for needed in re.findall(r"need ([\w: ]+)", lines):
+        probe.require(*needed.split())
+    names = Names(probe)
+    master = _Master(probe, lines, names)
+    for number, line in enumerate(lines.format_map(names).split(";"), 1):
         try:
             if _ends(master, line.strip(), ask):
-                return
+                break
         except CaseFailed as failure:
             raise CaseFailed(f"{failure.expected} (step {number}: {line.strip()})", failure.seen) from None
+    if "carry" in lines:
+        master.put(names.carried.before.hex())
 
 
 class _Master:
     """The verbs of a dialogue, with the words that follow them."""
 
-    def __init__(self, probe: CanopenProbe, lines: str) -> None:
+    def __init__(self, probe: CanopenProbe, lines: str, names: Names) -> None:
         self.drain, self.quiet, self.reset = probe.drain, probe.quiet, probe.reset_communication
         self.boot_up, self.watched = probe.expect_boot_up, probe.send_watched_heartbeat
-        self._probe = probe
+        self._probe, self._names = probe, names
+        self._pdo_id, self._began = 0, 0.0
         self._emergency = probe.emergency_id() if re.search("emcy|calm", lines) else 0
         self._number = writable_number(probe) if re.search("value|kept", lines) else None
         self._before = b"" if self._number is None else probe.value(self._number)
@@ -194,6 +241,9 @@ class _Master:
     def state(self, wanted: str) -> None:
         check_equal(f"{self._probe.state():02x}", wanted, "state")
 
+    def none(self, can_id: str, for_s: str = "0.1") -> None:
+        self._probe.expect_silence(int(can_id, 16), f"frame with CAN ID 0x{can_id}", float(for_s))
+
     def guard(self, wanted: str = "") -> None:
         can_id = 0x700 + self._probe.node
         self._probe.send(can_id, remote=True)
@@ -209,11 +259,68 @@ class _Master:
     def calm(self, for_s: str) -> None:
         self._probe.expect_silence(self._emergency, "EMCY", float(for_s))
 
-    def send(self, can_id: str, data: str, extended: str = "") -> None:
-        self._probe.send(int(can_id, 16), data, extended=bool(extended))
+    def send(self, can_id: str, *content: str) -> None:
+        data = "".join(word for word in content if word not in ("extended", "remote"))
+        self._probe.send(int(can_id, 16), data, extended="extended" in content, remote="remote" in content)
 
     def sleep(self, seconds: str) -> None:
         self._probe.wait_for(NOBODY, float(seconds))
+
+    def clock(self) -> None:
+        self._began = self._probe.port.now()
+
+    def took(self, least: str, most: str) -> None:
+        seconds = self._probe.port.now() - self._began
+        check(float(least) <= seconds <= float(most), f"after {least} to {most} s", f"{seconds:.3f} s")
+
+    # PDOs
+
+    def transmit(self, kind: str, *settings: str) -> None:
+        self._set_up(TPDO, [entry(constant(self._probe))], kind, settings)
+
+    def carry(self, kind: str, transmission: str, *settings: str) -> None:
+        given = dict(setting.split("=") for setting in settings)
+        objects = [int(given.pop("behind"), 0)] if "behind" in given else []
+        objects += [entry(self._names.carried.item)] * int(given.pop("times", "1"))
+        self._set_up(int(kind, 16), objects, transmission, [f"{name}={text}" for name, text in given.items()])
+
+    def _set_up(self, kind: int, objects: list[int], transmission: str, settings: Iterable[str]) -> None:
+        given = {name: int(text, 0) for name, text in (setting.split("=") for setting in settings)}
+        self._pdo_id = set_up(self._probe, first(self._probe, kind), objects, int(transmission), **given)
+
+    def off(self, index: str) -> None:
+        self._probe.disable_pdo(int(index, 16))
+
+    def sync(self, counter: str = "") -> None:
+        send_sync(self._probe, int(counter) if counter else None)
+
+    def tpdo(self, *data: str) -> None:
+        self._check_tpdo(self._probe.expect(self._pdo_id, "TPDO"), *data)
+
+    def event_tpdo(self, wanted: str, within_s: str = str(ANSWER_S)) -> None:
+        seen = self._probe.wait_for(self._pdo_id, float(within_s))
+        if seen is None:
+            raise CaseSkipped("a write to a mapped object is not an event on this device")
+        self._check_tpdo(seen, wanted)
+
+    def _check_tpdo(self, seen: bytes, *wanted: str) -> None:
+        for data in wanted:
+            check_equal(seen, bytes.fromhex(data), "data")
+
+    def no_tpdo(self, for_s: str = "0.1") -> None:
+        self._probe.expect_silence(self._pdo_id, "TPDO", float(for_s))
+
+    def rest(self, seconds: str) -> None:
+        self._probe.wait_for(self._pdo_id, float(seconds))
+
+    def rpdo(self, data: str) -> None:
+        self._probe.send(self._pdo_id, data)
+
+    def put(self, data: str) -> None:
+        self._probe.put(self._names.carried.item, bytes.fromhex(data))
+
+    def object(self, data: str) -> None:
+        check_equal(self._probe.value(self._names.carried.item), bytes.fromhex(data), "value")
 
 
 def _codes(names: str) -> tuple[int, ...]:

@@ -55,6 +55,11 @@ class ProvokedError:
         else:
             self._probe.send_watched_heartbeat()
 
+    def occur(self) -> bytes:
+        """Cause the error and return its EMCY."""
+        self.cause()
+        return self._probe.expect(self.emergency, "EMCY")
+
     def clear(self) -> None:
         """Clear the error."""
         if self._by_sync:
@@ -62,12 +67,16 @@ class ProvokedError:
         else:
             self._probe.send_watched_heartbeat()
 
+    def end(self) -> bytes:
+        """Clear the error and return its EMCY 0000h."""
+        self.clear()
+        return self._probe.expect(self.emergency, "EMCY 0000h")
+
 
 @EMCY.case("format", "EMCY has 8 bytes: code, error register, 5 bytes", "CiA 301 7.2.7.3")
 def emcy_format(probe: CanopenProbe) -> None:
     error = ProvokedError(probe)
-    error.cause()
-    data = probe.expect(error.emergency, "EMCY")
+    data = error.occur()
     check_equal(len(data), 8, "bytes")
     check(data[2] & 0x01, "generic bit of the error register", data[2])
     check_equal(probe.number(0x1001), data[2], "1001h")
@@ -76,8 +85,7 @@ def emcy_format(probe: CanopenProbe) -> None:
 @EMCY.case("once", "one EMCY per error", "CiA 301 7.2.7.1")
 def emcy_once(probe: CanopenProbe) -> None:
     error = ProvokedError(probe)
-    error.cause()
-    probe.expect(error.emergency, "EMCY")
+    error.occur()
     error.cause()
     probe.expect_silence(error.emergency, "second EMCY")
 
@@ -85,11 +93,9 @@ def emcy_once(probe: CanopenProbe) -> None:
 @EMCY.case("gone", "EMCY 0000h when the error is cleared", "CiA 301 7.2.7.1")
 def emcy_gone(probe: CanopenProbe) -> None:
     error = ProvokedError(probe)
-    error.cause()
-    probe.expect(error.emergency, "EMCY")
+    error.occur()
     count = probe.number(0x1003, 0) if 0x1003 in probe.od else 0
-    error.clear()
-    data = probe.expect(error.emergency, "EMCY 0000h")
+    data = error.end()
     check_equal(data[:3], bytes(3), "error code and register")
     check_equal(probe.number(0x1001), 0, "1001h")
     if 0x1003 in probe.od:
@@ -105,12 +111,10 @@ def emcy_history(probe: CanopenProbe) -> None:
     probe.expect_abort(b"\x40" + multiplexer(0x1003, 1), Abort.NO_DATA, Abort.GENERAL, Abort.NO_SUBINDEX)
     length = max(probe.od.indices[0x1003].subindices)
     for number in range(1, length + 3):
-        error.cause()
-        probe.expect(error.emergency, "EMCY")
+        error.occur()
         check_equal(probe.number(0x1003, 0), min(number, length), "errors")
         check_equal(probe.number(0x1003, 1) & 0xFFFF, error.code, "newest error")
-        error.clear()
-        probe.expect(error.emergency, "EMCY 0000h")
+        error.end()
 
 
 @EMCY.case("history-order", "older errors move up")
@@ -119,15 +123,13 @@ def emcy_history_order(probe: CanopenProbe) -> None:
     probe.require(0x1003, 0x1016)
     error = ProvokedError(probe)
     probe.set(0x1003, 0, 0, 1)
-    error.cause()
-    probe.expect(error.emergency, "EMCY")
+    error.occur()
     probe.set(0x1016, 1, WATCHED_NODE << 16 | 50)
     probe.send_watched_heartbeat()
     register = probe.expect(error.emergency, "EMCY 8130h", 0.5)[2]
     codes = [probe.number(0x1003, subindex) & 0xFFFF for subindex in (1, 2)]
     check_equal(codes, [0x8130, error.code], "errors")
-    error.clear()
-    data = probe.expect(error.emergency, "EMCY 0000h")
+    data = error.end()
     check_equal(data[2], register, "error register with the error that remains")
 
 
@@ -152,11 +154,9 @@ def emcy_inhibit(probe: CanopenProbe) -> None:
     probe.require(0x1015)
     error = ProvokedError(probe)
     probe.set(0x1015, 0, 1000, 2)
-    error.cause()
-    probe.expect(error.emergency, "EMCY")
+    error.occur()
     start = probe.port.now()
-    error.clear()
-    probe.expect(error.emergency, "EMCY 0000h")
+    error.end()
     seconds = probe.port.now() - start
     check(0.08 <= seconds <= 0.15, "0.1 s between two EMCY", f"{seconds:.3f} s")
 

@@ -436,11 +436,16 @@ class CanopenProbe:
                 return item
         raise CaseSkipped(f"the EDS has no {what}")
 
-    def require(self, *indices: int) -> None:
-        """Skip the case if an object is missing."""
-        for index in indices:
-            if index not in self.od:
-                raise CaseSkipped(f"the EDS has no object {index:04X}h")
+    def require(self, *objects: int | str) -> None:
+        """Skip the case if an object, or an entry given as `INDEX:SUBINDEX` in hexadecimal, is missing."""
+        for item in objects:
+            index, _, subindex = (
+                f"{item:04X}".partition(":") if isinstance(item, int) else item.partition(":")
+            )
+            if int(index, 16) not in self.od:
+                raise CaseSkipped(f"the EDS has no object {index}h")
+            if subindex and not self.has(int(index, 16), int(subindex, 16)):
+                raise CaseSkipped(f"the EDS has no object {index}h:{subindex}")
 
     def pdo_indices(self, first: int) -> list[int]:
         """Return the indices of communication records from 1400h or 1800h on."""

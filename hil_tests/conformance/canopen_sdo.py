@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from binascii import crc_hqx
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from canopen.objectdictionary import ODVariable, datatypes
 
@@ -55,6 +55,18 @@ DIALOGUES: Final = (
     Dialogue("time-out", "a transfer whose client stops sending times out", "40 {text} > *; wait > abort TIMEOUT {text}; 60 > abort COMMAND"),
     Dialogue("stopped", "no SDO in STOPPED", "40 {text} > *; nmt 2; 60 > silence; 40 00 10 00 > silence", "CiA 301 7.3.2.2.5", intrusive=True),
 )  # fmt: skip
+READ: Final = "40 00 10 00 00 00 00 00"
+IGNORED: Final = (
+    Dialogue(
+        "wrong-length", "frames with a length other than 8 bytes are ignored",
+        "send {request}; none {response}; send {request} 40001000; none {response}; send {request} 40001000000000; none {response}",
+        "CiA 301 7.2.4.3.2",
+    ),
+    Dialogue("extended", "frames with a 29-bit CAN ID are ignored", f"send {{request}} {READ} extended; none {{response}}", "CiA 301 7.3.5"),
+    Dialogue("remote", "remote frames are ignored", "send {request} remote; none {response}", "CiA 301 7.2.4"),
+    Dialogue("other-node", "requests to another node are not answered", f"send {{other_request}} {READ}; none {{response}}", "CiA 301 7.3.5"),
+)  # fmt: skip
+"""Frames that are not requests to the node."""
 BLOCK_DIALOGUES: Final = (
     Dialogue(
         "upload-block-size", "block size 0 and above 127",
@@ -93,14 +105,7 @@ BLOCK_DIALOGUES: Final = (
     Dialogue("download-abort", "an abort by the client ends a block download", "c6 {number} 02 > block {number}; 80 {number} 00000405 > silence; 60 > abort COMMAND", intrusive=True),
     Dialogue("download-refused", "block download to objects that cannot be written", "c2 00 10 00 04 > abort READ_ONLY 001000; c2 05 00 00 04 > abort NO_OBJECT 050000", intrusive=True),
 )  # fmt: skip
-IGNORED: Final = (
-    ("wrong-length", "frames with a length other than 8 bytes are ignored", "CiA 301 7.2.4.3.2", [{"data": "40001000000000"[:2 * length]} for length in (0, 4, 7)]),
-    ("extended", "frames with a 29-bit CAN ID are ignored", "CiA 301 7.3.5", [{"data": "4000100000000000", "extended": True}]),
-    ("remote", "remote frames are ignored", "CiA 301 7.2.4", [{"remote": True}]),
-)  # fmt: skip
-"""ID, title, clause and content of frames with the CAN ID of a request."""
-
-add_dialogues(SDO, DIALOGUES)
+add_dialogues(SDO, (*DIALOGUES, *IGNORED))
 add_dialogues(SDO_BLOCK, BLOCK_DIALOGUES)
 
 
@@ -110,22 +115,6 @@ add_dialogues(SDO_BLOCK, BLOCK_DIALOGUES)
 def transfer(command: int, item: ODVariable, data: bytes = b"") -> bytes:
     """Return the request that initiates a transfer of an object."""
     return bytes([command]) + multiplexer(item.index, item.subindex) + data
-
-
-def _ignored(frames: list[dict[str, Any]], probe: CanopenProbe) -> None:
-    for frame in frames:
-        probe.send(0x600 + probe.node, **frame)
-        probe.expect_silence(0x580 + probe.node, f"answer to {probe.log[-1].partition(' -> ')[2]}")
-
-
-for _name, _title, _clause, _frames in IGNORED:
-    SDO.case(_name, _title, _clause)(partial(_ignored, _frames))
-
-
-@SDO.case("other-node", "requests to another node are not answered", "CiA 301 7.3.5")
-def other_node(probe: CanopenProbe) -> None:
-    probe.send(0x600 + (probe.node % 127 + 1), upload_request(0x1000, 0).ljust(8, b"\0"))
-    probe.expect_silence(0x580 + probe.node, "answer to another node's request")
 
 
 @SDO.case("expedited-upload", "expedited upload states its size", "CiA 301 7.2.4.3.6")

@@ -22,12 +22,6 @@ LSS: Final = CaseArea[CanopenProbe]("canopen.lss", "CiA 305 states", intrusive=T
 SIGNATURE_REFUSED: Final = (Abort.NOT_STORED, 0x08000021, 0x08000022)
 
 
-def _reset(probe: CanopenProbe, command: int = RESET_NODE) -> None:
-    probe.drain()
-    probe.command(command)
-    probe.expect_boot_up()
-
-
 RESET: Final = "drain; nmt 129; boot-up; "
 STORE_DIALOGUES: Final = (
     Dialogue(
@@ -38,6 +32,10 @@ STORE_DIALOGUES: Final = (
     Dialogue(
         "pdo", "a stored PDO configuration is restored by a reset",
         f"need 1010 1800; set 1800:2 17 u8; set 1010:2 save; {RESET}holds 1800:2 17; set 1011:1 load; {RESET}drain",
+    ),
+    Dialogue(
+        "groups", "communication and application parameters are stored separately",
+        f"need 1010 1010:3; set 1017:0 777 u16; set 1010:3 save; {RESET}kept; set 1011:1 load; {RESET}drain",
     ),
 )  # fmt: skip
 
@@ -61,11 +59,6 @@ def signature(probe: CanopenProbe) -> None:
                 probe.expect_refusal(index, 1, value, 4, *SIGNATURE_REFUSED)
 
 
-def _restore(probe: CanopenProbe) -> None:
-    probe.set(0x1011, 1, b"load")
-    _reset(probe)
-
-
 @STORE.case("restore", "defaults take effect at the next reset", "CiA 301 7.5.2.12")
 def restore(probe: CanopenProbe) -> None:
     probe.require(0x1010, 0x1011)
@@ -74,21 +67,10 @@ def restore(probe: CanopenProbe) -> None:
     probe.set(0x1010, 1, b"save")
     probe.set(0x1011, 1, b"load")
     check_equal(probe.number(0x1017), 777, "1017h before the reset")
-    _reset(probe)
+    probe.drain()
+    probe.command(RESET_NODE)
+    probe.expect_boot_up()
     check_equal(probe.number(0x1017), 0 if default is None else default.default, "1017h after the reset")
-
-
-@STORE.case("groups", "communication and application parameters are stored separately")
-def groups(probe: CanopenProbe) -> None:
-    probe.require(0x1010)
-    if probe.od.get_variable(0x1010, 3) is None:
-        raise CaseSkipped("1010h has no sub-index 3")
-    before = probe.number(0x1017)
-    probe.set(0x1017, 0, before ^ 0x11, 2)
-    probe.set(0x1010, 3, b"save")
-    _reset(probe)
-    check_equal(probe.number(0x1017), before, "1017h")
-    _restore(probe)
 
 
 # LSS

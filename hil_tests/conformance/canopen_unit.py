@@ -13,7 +13,6 @@ from starhil.hil_tests.conformance.attitude_cases import (
     identifying_stars,
     reported_mode,
 )
-from starhil.hil_tests.conformance.canopen_pdo import SYNCHRONOUS, send_sync
 from starhil.hil_tests.conformance.canopen_probe import (
     NO_RTR,
     NOBODY,
@@ -25,6 +24,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
 )
 from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal
 from starhil.hil_tests.conformance.link_probe import checked_values
+from starhil.hil_tests.conformance.pdo_setup import SYNCHRONOUS, send_sync
 from starhil.hil_tests.conformance.row_cases import CLOCK_S
 from starhil.hil_tests.judge.canopen import (
     EXPEDITED,

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any, Final
 
+from jinja2 import StrictUndefined, Template
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -22,25 +22,7 @@ STYLES: Final = {
     NOT_RUN: ("-", "dim"),
 }
 SHOWN_IF_VERBOSE: Final = (PASSED, NOT_RUN)
-
-_PAGE: Final = """<!doctype html>
-<html lang="en"><meta charset="utf-8"><title>{title}</title>
-<style>
-body {{ font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; color: #1b1f24; }}
-table {{ border-collapse: collapse; width: 100%; margin: 1rem 0 2rem; }}
-th, td {{ text-align: left; vertical-align: top; padding: .3rem .6rem; border-bottom: 1px solid #d8dee4; }}
-th {{ background: #f6f8fa; }} code, pre {{ font: 12.5px/1.4 ui-monospace, monospace; }}
-.passed {{ color: #1a7f37; }} .failed {{ color: #cf222e; font-weight: 600; }} .skipped, .not-run {{ color: #9a6700; }}
-details pre {{ background: #f6f8fa; padding: .5rem; overflow-x: auto; }}
-</style>
-<h1>{title}</h1>
-<table>{facts}</table>
-<p><b>{total}</b> cases: <span class="passed">{passed} passed</span>, <span class="failed">{failed} failed</span>,
-<span class="skipped">{skipped} skipped</span>, <span class="not-run">{not_run} not run</span>.</p>
-{areas}
-{details}
-</html>
-"""
+TEMPLATE: Final = Path(__file__).with_name("report.html.j2")
 
 
 def count(outcomes: Sequence[Outcome], status: str) -> int:
@@ -78,16 +60,18 @@ def print_outcome(console: Console, outcome: Outcome, *, verbose: bool) -> None:
     console.print(line, soft_wrap=True)
 
 
-def areas_of(outcomes: Sequence[Outcome]) -> list[str]:
-    """Return the areas in the order of their first case."""
-    return list(dict.fromkeys(outcome.area for outcome in outcomes))
+def by_area(outcomes: Sequence[Outcome]) -> dict[str, list[Outcome]]:
+    """Return the outcomes of each area, in the order of their first case."""
+    areas: dict[str, list[Outcome]] = {}
+    for outcome in outcomes:
+        areas.setdefault(outcome.area, []).append(outcome)
+    return areas
 
 
 def print_summary(console: Console, outcomes: Sequence[Outcome]) -> None:
     """Print a table by area."""
     table = Table("area", "cases", *STYLES, "seconds", box=None, pad_edge=False)
-    for area in areas_of(outcomes):
-        rows = [outcome for outcome in outcomes if outcome.area == area]
+    for area, rows in by_area(outcomes).items():
         numbers = [len(rows), *(count(rows, status) for status in STYLES)]
         style = "red" if count(rows, FAILED) else ""
         table.add_row(area, *map(str, numbers), f"{sum(row.seconds for row in rows):.1f}", style=style)
@@ -115,49 +99,13 @@ def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:
 
 def write_html_report(path: Path, outcomes: Sequence[Outcome], facts: Mapping[str, str]) -> None:
     """Write an HTML page with facts about the run, and all cases: clause, result, traffic, expected and seen."""
-    rows = []
-    for area in areas_of(outcomes):
-        mine = [outcome for outcome in outcomes if outcome.area == area]
-        cells = "".join(f"<td>{count(mine, status)}</td>" for status in STYLES)
-        rows.append(
-            f'<tr><td><a href="#{escape(area)}">{escape(area)}</a></td><td>{len(mine)}</td>{cells}</tr>'
-        )
-    heads = "".join(f"<th>{word}</th>" for word in ("area", "cases", *STYLES))
-    text = _PAGE.format(
+    template = Template(TEMPLATE.read_text(encoding="utf-8"), autoescape=True, undefined=StrictUndefined)
+    text = template.render(
         title="Conformance",
-        facts="".join(
-            f"<tr><th>{escape(name)}</th><td>{escape(fact)}</td></tr>" for name, fact in facts.items()
-        ),
-        total=len(outcomes),
-        passed=count(outcomes, PASSED),
-        failed=count(outcomes, FAILED),
-        skipped=count(outcomes, SKIPPED),
-        not_run=count(outcomes, NOT_RUN),
-        areas=f"<table><tr>{heads}</tr>{''.join(rows)}</table>",
-        details="".join(_area_table(area, outcomes) for area in areas_of(outcomes)),
+        facts=facts,
+        outcomes=outcomes,
+        statuses=list(STYLES),
+        areas=by_area(outcomes),
+        count=count,
     )
     write_report(path, text.encode(errors="replace"))
-
-
-def _area_table(area: str, outcomes: Sequence[Outcome]) -> str:
-    rows = "".join(_row(outcome) for outcome in outcomes if outcome.area == area)
-    heads = "".join(
-        f"<th>{word}</th>" for word in ("case", "checked behaviour", "clause or source", "result")
-    )
-    return f'<h2 id="{escape(area)}">{escape(area)}</h2><table><tr>{heads}</tr>{rows}</table>'
-
-
-def _row(outcome: Outcome) -> str:
-    kind_of_result = outcome.status.replace(" ", "-")
-    result = f'<span class="{kind_of_result}">{outcome.status}</span> in {outcome.seconds * 1e3:.0f} ms'
-    if outcome.status == FAILED:
-        result += f"<br>expected {escape(outcome.expected)}<br>seen {escape(outcome.seen)}"
-    elif outcome.status in (SKIPPED, NOT_RUN):
-        result += f"<br>{escape(outcome.seen)}"
-    if outcome.log:
-        result += f"<details><summary>sent and received</summary><pre>{escape(chr(10).join(outcome.log))}</pre></details>"
-    kind = " <small>(intrusive)</small>" if outcome.intrusive else ""
-    return (
-        f"<tr><td><code>{escape(outcome.id)}</code>{kind}</td><td>{escape(outcome.title)}</td>"
-        f"<td>{escape(outcome.clause)}</td><td>{result}</td></tr>"
-    )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, Final
 
 from starhil.hil_tests.conformance.case import (
@@ -33,6 +34,7 @@ from starhil.hil_tests.judge.serial import Headed, SerialLine
 CLAUSE: Final = "[link.serial]"
 CUBESPACE: Final = "serial framing 1F 7F … 1F FF (libCubeObc, AlbertaSat adcs_io.c)"
 STUFFING: Final = "1F in the data is doubled (libCubeObc, CTS)"
+UNSTUFFED: Final = "flight software differs: AlbertaSat, RADSAT"
 REPLIES: Final = "reply formats: a AlbertaSat, b RADSAT, c libCubeObc"
 DEFAULT_MAX_SIZE: Final = 512
 """Longest message that a receiver accepts, unless the definition or a row asks for more."""
@@ -144,21 +146,16 @@ def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
         )  # which may be omitted before a frame
         check_equal(probe.raw.strip(end), whole.strip(end), "bytes")
 
-    yield case_in("framing", "one", "a request is answered once", one, clause)
-    yield case_in("framing", "reply-form", "a reply is one frame without extra bytes", form, clause)
-    yield case_in(
-        "framing", "two-at-once", "two requests sent together are both answered, in order", two, clause
-    )
-    yield case_in("framing", "byte-by-byte", "a request may be sent byte by byte", bytewise, clause)
-    yield case_in("framing", "junk", "bytes that are not a message are ignored", junk, clause)
-    yield case_in("framing", "half", "an incomplete message is dropped after a time-out", half, rule(2))
-    yield case_in(
-        "framing",
-        "overlong",
-        "a message that is too long is dropped, and the next one answered",
-        overlong,
-        rule(4),
-    )
+    for name, title, run, source in (
+        ("one", "a request is answered once", one, clause),
+        ("reply-form", "a reply is one frame without extra bytes", form, clause),
+        ("two-at-once", "two requests sent together are both answered, in order", two, clause),
+        ("byte-by-byte", "a request may be sent byte by byte", bytewise, clause),
+        ("junk", "bytes that are not a message are ignored", junk, clause),
+        ("half", "an incomplete message is dropped after a time-out", half, rule(2)),
+        ("overlong", "a message that is too long is dropped, and the next one answered", overlong, rule(4)),
+    ):
+        yield case_in("framing", name, title, run, source)
 
 
 READ: Final = "1F 7F {row} 1F FF"
@@ -207,19 +204,12 @@ def _cubespace(unit: Unit) -> Iterator[Case[SerialProbe]]:
     yield case_in("framing", "longest", title, longest, rule(4))
     if any(row.id == ESCAPE for row in unit.rows):
         return
-    title = "ID 1F doubled is ID 31, which does not exist"
-    yield case_in(
-        "stuffing",
-        "id",
-        title,
-        lambda probe: _refuses_31(probe, "1F 7F 1F 1F 1F FF"),
-        STUFFING,
-        intrusive=True,
-    )
-    # sent with data, because some senders stuff only the data
-    clause = "flight software differs: AlbertaSat, RADSAT"
-    run: Run = lambda probe: _refuses_31(probe, "1F 7F 1F 00 01 1F FF")  # noqa: E731
-    yield case_in("stuffing", "id-single", "ID 1F not doubled is ID 31, too", run, clause, intrusive=True)
+    # the second is sent with data, because some senders stuff only the data
+    for name, title, text, clause in (
+        ("id", "ID 1F doubled is ID 31, which does not exist", "1F 7F 1F 1F 1F FF", STUFFING),
+        ("id-single", "ID 1F not doubled is ID 31, too", "1F 7F 1F 00 01 1F FF", UNSTUFFED),
+    ):
+        yield case_in("stuffing", name, title, partial(_refuses_31, text), clause, intrusive=True)
 
 
 def _id_texts(row: Row) -> tuple[tuple[str, str], ...]:
@@ -231,7 +221,7 @@ def longest(probe: SerialProbe) -> None:
     probe.expect_refusal(probe.lively, bytes(DEFAULT_MAX_SIZE - 1), INVALID_LENGTH)
 
 
-def _refuses_31(probe: SerialProbe, text: str) -> None:
+def _refuses_31(text: str, probe: SerialProbe) -> None:
     probe.send_text(text)
     probe.expecting(str(ESCAPE))
     answer = probe.next_answer()
@@ -280,17 +270,14 @@ def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
     def missing(body: bytes) -> Iterator[bytes]:
         yield body[:-size]
 
-    yield case_in(
-        "check", "wrong", "a message with a bit of the check flipped is not answered", silent(wrong), CLAUSE
-    )
+    cases = [("wrong", "a message with a bit of the check flipped is not answered", wrong)]
     if "header" in envelope.covers:
-        yield case_in(
-            "check", "damaged", "a message with a bit flipped is not answered", silent(damaged), CLAUSE
-        )
-    yield case_in("check", "missing", "a message without the check is not answered", silent(missing), CLAUSE)
+        cases.append(("damaged", "a message with a bit flipped is not answered", damaged))
+    cases.append(("missing", "a message without the check is not answered", missing))
     if size > 1:
-        title = "a check with its bytes in the other order is not accepted"
-        yield case_in("check", "swapped", title, silent(swapped), CLAUSE)
+        cases.append(("swapped", "a check with its bytes in the other order is not accepted", swapped))
+    for name, title, change in cases:
+        yield case_in("check", name, title, silent(change), CLAUSE)
 
 
 # --- header ---

@@ -6,19 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from starhil.hil_tests.endurance.truth import (
-    IDENTITY,
-    Error,
-    Motion,
-    Quaternion,
-    Vector,
-    conjugate,
-    cross,
-    frame_turned,
-    of_matrix,
-    of_pairs,
-    product,
-)
+from starhil.hil_tests.attitude import Quaternion, conjugate, from_matrix, product
+from starhil.hil_tests.endurance.truth import Error, Motion, Vector, cross, frame_turned, of_pairs
 from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
 from starhil.protocol.codec import Field
 from starhil.protocol.conventions import Conventions
@@ -38,6 +27,7 @@ KEPT_PERIODS: Final = 20
 SMALLEST_SCALAR: Final = 0.1
 """Smallest scalar that is computed from the other three numbers of a quaternion."""
 ARCSEC: Final = math.radians(1.0 / 3600.0)
+NO_TURN: Final = Quaternion(0.0, 0.0, 0.0, 1.0)
 
 Readings = Mapping[str, tuple[Field, Value]]
 """Field and value of each quantity of a row."""
@@ -70,7 +60,7 @@ class AttitudeJudge:
         self.motions: list[Motion] = []
         self.dark_since_s: float | None = None
         self._periods: list[tuple[float, float]] = []
-        self._turn_cache: tuple[tuple[float, ...], Quaternion] = ((), IDENTITY)
+        self._turn_cache: tuple[tuple[float, ...], Quaternion] = ((), NO_TURN)
 
     def started(self, now_s: float, values: Mapping[str, Known | None]) -> None:
         """The unit has started with these parameters."""
@@ -143,7 +133,7 @@ class AttitudeJudge:
         if abs(length - 1.0) > tolerance:
             raise Violation(f"{row}: the quaternion has length {length!r}")
         x, y, z, w = (number / length for number in numbers)
-        q = (x, y, z, w)
+        q = Quaternion(x, y, z, w)
         measured = self._to_sensor(conjugate(q) if self._conventions.quaternion == "attitude" else q, values)
         if measured is not None:
             self.count += 1
@@ -218,11 +208,11 @@ class AttitudeJudge:
             return None
         numbers = tuple(float(angle[0]) for angle in angles if angle is not None)
         if self._turn_cache[0] != numbers:
-            turn = IDENTITY
+            turn = NO_TURN
             for axis, angle in enumerate(numbers):
                 unit = [float(index == axis) for index in range(3)]
                 turn = product(frame_turned(unit, math.radians(angle)), turn)
-            self._turn_cache = (numbers, product(of_matrix(self._conventions.rows), turn))
+            self._turn_cache = (numbers, product(from_matrix(self._conventions.rows), turn))
         return product(conjugate(self._turn_cache[1]), reported)
 
     def check_period(

@@ -32,19 +32,7 @@ TURN_S: Final = 1e-6
 
 
 class Obc:
-    """The OBC's end of all links of a unit.
-
-    Parameters
-    ----------
-    icd
-        Definition of the unit.
-    unit
-        The unit.
-    oracle
-        What the unit may and must do.
-    outcome
-        Where requests and readings are counted.
-    """
+    """The OBC's end of all links of a unit; requests and readings are counted in `outcome`."""
 
     def __init__(self, icd: InterfaceDefinition, unit: Unit, oracle: Oracle, outcome: Outcome) -> None:
         self._icd = icd
@@ -149,8 +137,11 @@ class Obc:
 
     # --- requests ---
 
-    async def request(self, link: str, key: Sequence[Any], data: bytes) -> None:
-        """Send a request and judge the answers."""
+    async def request(self, link: str, row: Sequence[Any], data: str = "") -> None:
+        """Send a request, data in hexadecimal, and judge the answers."""
+        await self._request(link, row, bytes.fromhex(data))
+
+    async def _request(self, link: str, key: Sequence[Any], data: bytes) -> None:
         klass, row_id, kind = key
         row = self._icd.rows_by_key.get((klass, row_id))
         if row is not None and row.kind != kind:
@@ -311,47 +302,47 @@ class Obc:
 
     # --- many requests, parts of requests, and other input ---
 
-    def burst(self, link: str, keys: Sequence[Sequence[Any]]) -> None:
+    async def burst(self, link: str, rows: Sequence[Sequence[Any]]) -> None:
         """Send telemetry requests without waiting; the answers come in order."""
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
-        rows = [self._icd.rows_by_key[klass, row_id] for klass, row_id, _ in keys]
-        rows = [row for row in rows if self._oracle.verdict(row, "telemetry", b"") is ErrorCode.OK]
-        self._outcome.requests += len(rows)
-        self._ports[link].ask(*(Request(row.id, klass=row.klass, telemetry=True) for row in rows))
+        known = [self._icd.rows_by_key[klass, row_id] for klass, row_id, _ in rows]
+        asked = [row for row in known if self._oracle.verdict(row, "telemetry", b"") is ErrorCode.OK]
+        self._outcome.requests += len(asked)
+        self._ports[link].ask(*(Request(row.id, klass=row.klass, telemetry=True) for row in asked))
         replies = self._answers(link)
-        if len(replies) != len(rows) or any(reply.kind != "telemetry" for reply in replies):
-            raise Violation(f"{link}: {len(replies)} answers to {len(rows)} requests")
-        for _ in rows:
+        if len(replies) != len(asked) or any(reply.kind != "telemetry" for reply in replies):
+            raise Violation(f"{link}: {len(replies)} answers to {len(asked)} requests")
+        for row, reply in zip(asked, replies, strict=True):
             self._oracle.counted("telemetry")
-        for row, reply in zip(rows, replies, strict=True):
             if reply.row_id not in (None, row.id) or len(reply.data) != row.size:
                 raise Violation(f"{link}: {reply} where {row.name} was next")
 
-    async def flood(self, link: str, key: Sequence[Any], data: bytes, count: int) -> None:
+    async def flood(self, link: str, row: Sequence[Any], count: int, data: str = "") -> None:
         """Send the same request many times, each judged, so that counters of 16 bits wrap."""
+        content = bytes.fromhex(data)
         for _ in range(count):
             if self._oracle.stuck or link in self._oracle.disturbed:
                 return
-            await self.request(link, key, data)
+            await self._request(link, row, content)
 
-    async def cut(self, link: str, key: Sequence[Any], share: float) -> None:
+    async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
         """Send the first part of a request, as a client that goes away, and let another client come."""
         if link in self._oracle.disturbed:
             return
-        row = self._icd.rows_by_key[key[0], key[1]]
-        data = bytes(row.size) if row.kind == "telecommand" else b""
-        self._ports[link].cut(Request(row.id, data, row.klass, row.kind == "telemetry"), share)
+        known = self._icd.rows_by_key[row[0], row[1]]
+        content = bytes(known.size) if known.kind == "telecommand" else b""
+        self._ports[link].cut(Request(known.id, content, known.klass, known.kind == "telemetry"), share)
         if self._fixed_framing:  # any bytes are a request
             self._oracle.forget()
         await self.settle(link)
 
-    async def junk(self, link: str, data: bytes, frames: Sequence[tuple[int, str]]) -> None:
+    async def junk(self, link: str, data: str = "", frames: Sequence[tuple[int, str]] = ()) -> None:
         """Send input that is not a request for this unit; nothing may answer."""
         if link in self._oracle.disturbed:
             return
         if link == "serial":
-            self._unit.deliver(link, data)
+            self._unit.deliver(link, bytes.fromhex(data))
             self._oracle.forget()  # some framings find a request in any bytes
         for can_id, content in frames:
             if link == "canopen":  # an SDO of another node
@@ -363,7 +354,7 @@ class Obc:
                 self._unit.deliver(link, CanFrame(can_id, bytes.fromhex(content)))
         await self.settle(link)
 
-    def set_state(self, link: str, command: int) -> None:
+    async def set_state(self, link: str, command: int) -> None:
         """Send an NMT command to the node."""
         port = self._ports[link]
         if isinstance(port, CanopenPort):

@@ -35,16 +35,8 @@ SECOND_NS: Final = 1_000_000_000
 class Oracle:
     """A model of a unit that is updated by what happens on its bus.
 
-    Parameters
-    ----------
-    icd
-        Definition of the unit.
-    parameters
-        Defaults of parameters in the profile of the run.
-    start_unix_s
-        Device clock at each start.
-    sigma_arcsec
-        Largest standard deviation across and about the boresight that the unit may leave unstated.
+    `parameters` are the defaults of the profile, `start_unix_s` the device clock at each start, and `sigma_arcsec` the largest
+    standard deviations across and about the boresight that the unit may leave unstated.
     """
 
     def __init__(
@@ -79,40 +71,12 @@ class Oracle:
         self._frames: int | None = None
         self._selected: int | None = None
         self._last: tuple[int, ErrorCode] | None = None
-        self._effects: dict[str, Callable[[Row, Mapping[str, Any]], None]] = {
-            "set_parameters": self._parameters_set,
-            "set_parameter": self._parameter_set,
-            "select_parameter": self._parameter_selected,
-            "select_unsolicited": self._unsolicited_selected,
-            "save_parameters": self._parameters_saved,
-            "restore_parameters": self._parameters_restored,
-            "default_parameters": self._defaults_set,
-            "clear_counters": self._counters_cleared,
-            "set_clock": self._clock_changed,
-            "set_mode": self._mode_commanded,
-            "start_burst": self._burst_started,
-            "subscribe": self._subscribed_rows,
-        }
         self._checks: dict[str, Callable[[str, Field, Value], None]] = {
             "mode": self._check_mode,
-            "counters.telecommands": partial(self._check_count, "telecommands"),
-            "counters.telemetry": partial(self._check_count, "telemetry"),
-            "counters.requests": self._check_requests,
-            "clock.unix": partial(self._check_clock, 2**64),
-            "clock.seconds": partial(self._check_clock, 2**32),
-            "clock.milliseconds": partial(self._check_fraction, self._clock_s, 1e3),
-            "clock.microseconds": partial(self._check_fraction, self._clock_s, 1e6),
-            "clock.nanoseconds": partial(self._check_fraction, self._clock_s, 1e9),
-            "uptime": self._check_uptime,
-            "uptime.seconds": self._check_uptime,
-            "uptime.milliseconds": partial(self._check_fraction, self._uptime_s, 1e3),
-            "boot.count": self._check_boot_count,
             "frame.counter": self._check_frames,
             "frame.period": self._check_period,
-            "selected.id": self._check_selected,
-            "selected.value": self._check_selected_value,
-            "request.last": self._check_last,
             "request.error": self._check_error,
+            **{name: partial(self._check_fraction, name) for name in _FRACTIONS},
         }
         self._start(0.0)
 
@@ -251,14 +215,45 @@ class Oracle:
     def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode, *, sure: bool) -> None:
         """A telecommand was answered with a code, which is the one expected or not for sure."""
         self._last = (row_id, code) if sure else None
-        if row is None or code is not ErrorCode.OK:
-            return
-        arguments = self._arguments(row, data)
-        action = row.action or "nothing"
-        if action in self._effects:
-            self._effects[action](row, arguments)
-        elif action not in _WITHOUT_EFFECT:
-            self.forget()
+        if row is not None and code is ErrorCode.OK:
+            self._take_effect(row, self._arguments(row, data))
+
+    def _take_effect(self, row: Row, arguments: Mapping[str, Any]) -> None:
+        match row.action:
+            case "set_parameters":
+                self._set({
+                    field.parameter: (arguments[field.name], resolution(field))
+                    for field in row.named_fields.values() if field.parameter is not None
+                })  # fmt: skip
+            case "set_parameter":
+                parameter = self._icd.parameters_by_id[int(arguments["parameter"])]
+                self._set({parameter.name: (parameter.check(arguments["value"]), 1e-9)})
+                self._selected = parameter.id
+            case "select_parameter":
+                self._selected = int(arguments["parameter"])
+            case "select_unsolicited":
+                selection = (int(arguments["telemetry"]), 0.0)
+                self._set({"unsolicited_selection": selection, "unsolicited_rate": None})
+            case "save_parameters":
+                self._stored = dict(self.values)
+            case "restore_parameters":
+                self._set({**self._defaults, **self._stored})
+            case "default_parameters":
+                self._set(self._defaults)
+            case "clear_counters":
+                self.counts = {"telecommands": 0, "telemetry": 0}
+            case "set_clock":
+                self._set_clock(arguments)
+            case "set_mode":
+                wanted = str(arguments["mode"])
+                self.modes = set(IMAGING) if wanted in IMAGING else {wanted}
+                self._has_imaged = self._has_imaged or wanted in IMAGING
+            case "start_burst":
+                self.bursts = True
+            case "subscribe":
+                self._subscribed = True
+            case action if action not in _WITHOUT_EFFECT:
+                self.forget()
 
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
         """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
@@ -276,39 +271,7 @@ class Oracle:
         if changes.keys() & _TIMING:
             self.attitudes.retimed(self.now_s, self.values)
 
-    def _parameters_set(self, row: Row, arguments: Mapping[str, Any]) -> None:
-        self._set(
-            {
-                field.parameter: (arguments[field.name], resolution(field))
-                for field in row.named_fields.values()
-                if field.parameter is not None
-            }
-        )
-
-    def _parameter_set(self, _row: Row, arguments: Mapping[str, Any]) -> None:
-        parameter = self._icd.parameters_by_id[int(arguments["parameter"])]
-        self._set({parameter.name: (parameter.check(arguments["value"]), 1e-9)})
-        self._selected = parameter.id
-
-    def _parameter_selected(self, _row: Row, arguments: Mapping[str, Any]) -> None:
-        self._selected = int(arguments["parameter"])
-
-    def _unsolicited_selected(self, _row: Row, arguments: Mapping[str, Any]) -> None:
-        self._set({"unsolicited_selection": (int(arguments["telemetry"]), 0.0), "unsolicited_rate": None})
-
-    def _parameters_saved(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        self._stored = dict(self.values)
-
-    def _parameters_restored(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        self._set({**self._defaults, **self._stored})
-
-    def _defaults_set(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        self._set(self._defaults)
-
-    def _counters_cleared(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        self.counts = {"telecommands": 0, "telemetry": 0}
-
-    def _clock_changed(self, _row: Row, arguments: Mapping[str, Any]) -> None:
+    def _set_clock(self, arguments: Mapping[str, Any]) -> None:
         if self._icd.conventions.epoch_ns is None:  # the day is that of the clock
             self._clock = None
         else:
@@ -318,22 +281,11 @@ class Oracle:
             )
             self._clock = (self.now_s, total + self._icd.conventions.epoch_ns)
 
-    def _mode_commanded(self, _row: Row, arguments: Mapping[str, Any]) -> None:
-        wanted = str(arguments["mode"])
-        self.modes = set(IMAGING) if wanted in IMAGING else {wanted}
-        self._has_imaged = self._has_imaged or wanted in IMAGING
-
-    def _subscribed_rows(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        self._subscribed = True
-
     @property
     def streams(self) -> bool:
         """Whether telemetry may come without a request."""
         rate = self.values.get("unsolicited_rate")
         return self._subscribed or rate is None or float(rate[0]) > 0.0
-
-    def _burst_started(self, _row: Row, _arguments: Mapping[str, Any]) -> None:
-        self.bursts = True
 
     # --- readings ---
 
@@ -359,6 +311,10 @@ class Oracle:
                 self._check_parameter(where, field, value, quantity.removeprefix(PARAMETER))
             elif quantity in self._checks:
                 self._checks[quantity](where, field, value)
+            elif (known := self._expected(quantity, field)) is not None:
+                self._expect(where, field, value, *known)
+            elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
+                self._learn(quantity, value)
 
     def judge_attitude(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
         """Judge the attitude in a row, or in the PDOs of an instant."""
@@ -407,17 +363,38 @@ class Oracle:
             raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
         self.modes = set(IMAGING) if value in IMAGING else {value}
 
-    def _check_count(self, name: str, where: str, field: Field, value: Value) -> None:
-        known = self.counts[name]
-        if known is not None:
-            self._expect(where, field, value, known)
-        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
-            self.counts[name] = value
+    def _expected(self, quantity: str, field: Field) -> tuple[float, float] | None:
+        """Return the number that a field must report, and its tolerance; None if it is not known or has no rule."""
+        number, tolerance = None, 0.0
+        match quantity:
+            case "counters.telecommands" | "counters.telemetry":
+                number = self.counts[quantity.removeprefix("counters.")]
+            case "counters.requests" if None not in self.counts.values():
+                number = sum(count or 0 for count in self.counts.values())
+            case "boot.count":
+                number = self._boot_count
+            case "selected.id":
+                number = self._selected
+            case "selected.value" if self._selected is not None:
+                parameter = self._icd.parameters_by_id[self._selected]
+                known = self.values[parameter.name]
+                names = {} if parameter.enum is None else parameter.enum.values
+                return None if known is None else (float(names.get(str(known[0]), known[0])), known[1])
+            case "request.last" if self._last is not None:
+                number = self._last[0]
+            case "clock.unix" | "clock.seconds" if (clock_s := self._clock_s()) is not None:
+                wraps_s = 2**64 if quantity == "clock.unix" else 2**32
+                return clock_s % wraps_s, 1.0 if field.kind != "float" else 1e-6
+            case "uptime" | "uptime.seconds" if (uptime_s := self._uptime_s()) is not None:
+                return uptime_s * (factor("s", field.unit) or 1.0), 1.01
+        return None if number is None else (number, tolerance)
 
-    def _check_requests(self, where: str, field: Field, value: Value) -> None:
-        telecommands, telemetry = self.counts["telecommands"], self.counts["telemetry"]
-        if telecommands is not None and telemetry is not None:
-            self._expect(where, field, value, telecommands + telemetry)
+    def _learn(self, quantity: str, value: int) -> None:
+        """Take over a count that is not known."""
+        if quantity in ("counters.telecommands", "counters.telemetry"):
+            self.counts[quantity.removeprefix("counters.")] = value
+        elif quantity == "boot.count" and self._is_counted:
+            self._boot_count = value
 
     def _clock_s(self) -> float | None:
         if self._clock is None:
@@ -429,31 +406,14 @@ class Oracle:
     def _uptime_s(self) -> float | None:
         return None if self._started_s is None else self.now_s - self._started_s
 
-    def _check_clock(self, modulo_s: int, where: str, field: Field, value: Value) -> None:
-        clock_s = self._clock_s()
-        if clock_s is not None:
-            self._expect(where, field, value, clock_s % modulo_s, 1.0 if field.kind != "float" else 1e-6)
-
-    def _check_uptime(self, where: str, field: Field, value: Value) -> None:
-        uptime_s = self._uptime_s()
-        if uptime_s is not None:
-            self._expect(where, field, value, uptime_s * (factor("s", field.unit) or 1.0), 1.01)
-
-    def _check_fraction(
-        self, seconds: Callable[[], float | None], scale: float, where: str, _field: Field, value: Value
-    ) -> None:
-        """Check the part of a second, in units of 1 / scale."""
-        expected_s = seconds()
+    def _check_fraction(self, quantity: str, where: str, _field: Field, value: Value) -> None:
+        """Check the part of a second."""
+        expected_s = self._uptime_s() if quantity.startswith("uptime") else self._clock_s()
         if expected_s is None or isinstance(value, (str, bytes)):
             return
+        scale = _FRACTIONS[quantity]
         if abs((value / scale - expected_s + 0.5) % 1.0 - 0.5) > 1.01 / scale + 1e-6:
             raise Violation(f"{where}: {value!r}, not {expected_s % 1.0 * scale!r}")
-
-    def _check_boot_count(self, where: str, field: Field, value: Value) -> None:
-        if self._boot_count is not None:
-            self._expect(where, field, value, self._boot_count)
-        elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF and self._is_counted:
-            self._boot_count = value
 
     def _check_frames(self, where: str, _field: Field, value: Value) -> None:
         if isinstance(value, int) and value:  # 0: there is no frame now
@@ -463,22 +423,6 @@ class Oracle:
 
     def _check_period(self, where: str, field: Field, value: Value) -> None:
         self.attitudes.check_period(where, field, value, self.now_s, self.values)
-
-    def _check_selected(self, where: str, field: Field, value: Value) -> None:
-        if self._selected is not None:
-            self._expect(where, field, value, self._selected)
-
-    def _check_selected_value(self, where: str, field: Field, value: Value) -> None:
-        parameter = None if self._selected is None else self._icd.parameters_by_id[self._selected]
-        known = None if parameter is None else self.values[parameter.name]
-        if parameter is not None and known is not None:
-            expected, tolerance = known
-            names = {} if parameter.enum is None else parameter.enum.values
-            self._expect(where, field, value, float(names.get(str(expected), expected)), tolerance)
-
-    def _check_last(self, where: str, field: Field, value: Value) -> None:
-        if self._last is not None:
-            self._expect(where, field, value, self._last[0])
 
     def _check_error(self, where: str, _field: Field, value: Value) -> None:
         if self._last is not None and isinstance(value, str) and value != self._last[1].name.lower():
@@ -493,8 +437,24 @@ _ORBIT: Final = frozenset({"orbit_semi_major_axis", "orbit_eccentricity"})
 _BOUND: Final = _TIMING | _ORBIT | {"min_star_pixels", "max_star_pixels"}
 """Parameters that bound each other, so that a value within its limits may be refused."""
 _WITHOUT_EFFECT: Final = frozenset(
-    ["nothing", "reset", "save_image", "open_image", "load_image_chunk", "load_file_block", "set_hole_map"]
+    [
+        None,
+        "nothing",
+        "reset",
+        "save_image",
+        "open_image",
+        "load_image_chunk",
+        "load_file_block",
+        "set_hole_map",
+    ]
 )
 """Actions that leave what the oracle knows as it is."""
+_FRACTIONS: Final = {
+    "clock.milliseconds": 1e3,
+    "clock.microseconds": 1e6,
+    "clock.nanoseconds": 1e9,
+    "uptime.milliseconds": 1e3,
+}
+"""Units of the parts of a second in one second."""
 _CLOCK: Final = {"unix": "s", "seconds": "s", "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns"}
 """Units in which the arguments of `set_clock` are understood."""

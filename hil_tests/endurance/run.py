@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.life import MOST_EVENTS, Life, Step
+from starhil.hil_tests.endurance.life import MOST_EVENTS, Life
 from starhil.hil_tests.endurance.obc import Obc
 from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
 from starhil.hil_tests.endurance.outcome import Outcome
@@ -22,19 +22,7 @@ ORION: Final = {"kind": "fixed", "attitude": {"ra_deg": 83.8, "dec_deg": -1.2, "
 
 
 class LifeRun:
-    """Executes the steps of a life.
-
-    Parameters
-    ----------
-    life
-        The life.
-    icd
-        Definition of the unit.
-    unit
-        The unit.
-    sigma_arcsec
-        Largest standard deviations that the unit may leave unstated.
-    """
+    """Executes the steps of a life on a unit; `sigma_arcsec` are the largest standard deviations that it may leave unstated."""
 
     def __init__(
         self, life: Life, icd: InterfaceDefinition, unit: Unit, sigma_arcsec: tuple[float, float]
@@ -46,19 +34,19 @@ class LifeRun:
         start_unix_s = life.profile.get("run", {}).get("start_unix_s", 1_767_225_600.0)
         self.outcome = Outcome()
         self._oracle = Oracle(icd, parameters, start_unix_s, sigma_arcsec)
-        self._obc = Obc(icd, unit, self._oracle, self.outcome)
+        self._obc = obc = Obc(icd, unit, self._oracle, self.outcome)
         self._not_read: set[str] = set()
         """Links whose peer does not read."""
         self._lived_s = 0.0
         self._descriptors = self._memory_bytes = 0
-        self._actions: dict[str, Callable[[Step], Any]] = {
+        self._actions: dict[str, Callable[..., Awaitable[None]]] = {
             "wait": self._wait,
-            "request": self._request,
-            "burst": self._burst,
-            "flood": self._flood,
-            "cut": self._cut,
-            "junk": self._junk,
-            "nmt": self._nmt,
+            "request": obc.request,
+            "burst": obc.burst,
+            "flood": obc.flood,
+            "cut": obc.cut,
+            "junk": obc.junk,
+            "nmt": obc.set_state,
             "truth": self._truth,
             "fault": self._fault,
             "clear": self._clear,
@@ -68,6 +56,7 @@ class LifeRun:
             "peer": self._peer,
             "recover": self._recover,
         }
+        """What a step does; its other keys are the arguments."""
 
     async def run(self) -> Outcome:
         """Execute all steps, or those up to the first violation."""
@@ -78,7 +67,7 @@ class LifeRun:
             self._descriptors, self._memory_bytes = unit.open_descriptors(), unit.memory_bytes()
             for step in self._life.steps:
                 outcome.step += 1
-                await self._actions[step["do"]](step)
+                await self._actions[step["do"]](**{key: value for key, value in step.items() if key != "do"})
                 self._obc.hear()
                 self._oracle.time_passed(unit.now_s)
                 self._check_inside()
@@ -109,50 +98,27 @@ class LifeRun:
 
     # --- time and power ---
 
-    async def _wait(self, step: Step) -> None:
-        await self._obc.pass_time(step["s"], most=step.get("most", MOST_EVENTS))
+    async def _wait(self, s: float, most: int = MOST_EVENTS) -> None:
+        await self._obc.pass_time(s, most=most)
 
-    async def _power(self, step: Step) -> None:
+    async def _power(self, *, factory: bool) -> None:
         self._lived_s += self._unit.now_s
-        await self._unit.power_off(factory=step["factory"])
+        await self._unit.power_off(factory=factory)
         await self._unit.power_on()
-        self._powered(factory=step["factory"])
+        self._powered(factory=factory)
 
     def _powered(self, *, factory: bool) -> None:
         self._oracle.powered(factory=factory, motion=Motion.of(ORION, 0.0))
         self._oracle.disturbed |= self._not_read
         self._obc.connect()
 
-    # --- requests ---
-
-    async def _request(self, step: Step) -> None:
-        await self._obc.request(step["link"], step["row"], bytes.fromhex(step.get("data", "")))
-
-    async def _burst(self, step: Step) -> None:
-        self._obc.burst(step["link"], step["rows"])
-
-    async def _flood(self, step: Step) -> None:
-        await self._obc.flood(
-            step["link"], step["row"], bytes.fromhex(step.get("data", "")), int(step["count"])
-        )
-
-    async def _cut(self, step: Step) -> None:
-        await self._obc.cut(step["link"], step["row"], step["share"])
-
-    async def _junk(self, step: Step) -> None:
-        await self._obc.junk(step["link"], bytes.fromhex(step.get("data", "")), step.get("frames", ()))
-
-    async def _nmt(self, step: Step) -> None:
-        self._obc.set_state(step["link"], step["command"])
-
     # --- surroundings ---
 
-    async def _truth(self, step: Step) -> None:
-        await self._unit.set_truth(step["truth"])
-        self._oracle.moved(Motion.of(step["truth"], self._unit.now_s))
+    async def _truth(self, truth: Mapping[str, Any]) -> None:
+        await self._unit.set_truth(truth)
+        self._oracle.moved(Motion.of(truth, self._unit.now_s))
 
-    async def _fault(self, step: Step) -> None:
-        fault = step["fault"]
+    async def _fault(self, fault: Mapping[str, Any]) -> None:
         self._obc.hear()  # what was sent before
         self._unit.fault(fault)
         oracle = self._oracle
@@ -169,7 +135,7 @@ class LifeRun:
         if "error" in device:
             oracle.failed()
 
-    async def _clear(self, _step: Step) -> None:
+    async def _clear(self) -> None:
         self._unit.clear_faults()
         oracle = self._oracle
         oracle.covered(fully=False)
@@ -183,36 +149,35 @@ class LifeRun:
             oracle.disturbed = set(self._not_read)
             self._obc.connect()
 
-    async def _end_pipeline(self, _step: Step) -> None:
+    async def _end_pipeline(self) -> None:
         await self._unit.end_pipeline()
         self._oracle.failed()
 
-    async def _disk(self, step: Step) -> None:
-        self._unit.set_disk(full=step["full"])
-        self._oracle.disk_full = step["full"]
+    async def _disk(self, *, full: bool) -> None:
+        self._unit.set_disk(full=full)
+        self._oracle.disk_full = full
 
-    async def _peer(self, step: Step) -> None:
-        link, reads = step["link"], step["reads"]
+    async def _peer(self, link: str, *, reads: bool) -> None:
         self._unit.set_peer(link, reads=reads)
         self._not_read = self._not_read - {link} if reads else self._not_read | {link}
         if not reads:
             self._oracle.disturbed.add(link)
 
-    async def _recover(self, _step: Step) -> None:
+    async def _recover(self) -> None:
         """End all faults and restore the unit; its attitude must become valid."""
         for link in self._unit.links:
-            await self._peer({"link": link, "reads": True})
-        await self._disk({"full": False})
-        await self._clear({})
-        await self._power({"factory": True})
-        await self._truth({"truth": ORION})
+            await self._peer(link, reads=True)
+        await self._disk(full=False)
+        await self._clear()
+        await self._power(factory=True)
+        await self._truth(ORION)
         await self._obc.pass_time(RECOVERY_S / 3.0)
         self._obc.connect()
         for row in self._icd.telecommands.values():
             if row.action == "set_mode":
                 fields = [field for field in row.named_fields.values() if field.argument == "mode"]
                 data = row.encode({fields[0].name: "lost_in_space"})
-                await self._obc.request(self._unit.links[0], (row.klass, row.id, row.kind), data)
+                await self._obc.request(self._unit.links[0], (row.klass, row.id, row.kind), data.hex())
                 break
         await self._obc.pass_time(RECOVERY_S)
         for row in self._icd.telemetry.values():

@@ -5,52 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
+
+from starhil.hil_tests.attitude import Quaternion, conjugate, from_matrix, from_radec_roll, product
 
 Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-
-IDENTITY: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
-
-
-def product(p: Quaternion, q: Quaternion) -> Quaternion:
-    """Return the Hamilton product p ⊗ q."""
-    a, b, c, d = p
-    x, y, z, w = q
-    return (
-        d * x + a * w + b * z - c * y,
-        d * y - a * z + b * w + c * x,
-        d * z + a * y - b * x + c * w,
-        d * w - a * x - b * y - c * z,
-    )
-
-
-def conjugate(q: Quaternion) -> Quaternion:
-    """Return the inverse of a unit quaternion."""
-    x, y, z, w = q
-    return (-x, -y, -z, w)
 
 
 def frame_turned(axis: Sequence[float], angle_rad: float) -> Quaternion:
     """Return the quaternion that takes vectors into a frame turned by an angle about an axis."""
     k = -math.sin(0.5 * angle_rad)
-    return (k * axis[0], k * axis[1], k * axis[2], math.cos(0.5 * angle_rad))
-
-
-def of_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
-    """Return the quaternion that rotates vectors as a matrix does (Shepperd's method)."""
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    squares = (1.0 + a - e - i, 1.0 - a + e - i, 1.0 - a - e + i, 1.0 + a + e + i)
-    largest = max(range(4), key=lambda index: squares[index])
-    four = (
-        (squares[0], b + d, c + g, h - f),
-        (b + d, squares[1], f + h, c - g),
-        (c + g, f + h, squares[2], d - b),
-        (h - f, c - g, d - b, squares[3]),
-    )[largest]
-    length = math.sqrt(sum(value * value for value in four))
-    x, y, z, w = (value / length for value in four)
-    return (x, y, z, w)
+    return Quaternion(k * axis[0], k * axis[1], k * axis[2], math.cos(0.5 * angle_rad))
 
 
 def cross(a: Vector, b: Vector) -> Vector:
@@ -78,19 +43,7 @@ def of_pairs(seen: tuple[Vector, Vector], known: tuple[Vector, Vector]) -> Quate
         ]
         for row in range(3)
     ]
-    return of_matrix(rows)
-
-
-def of_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:
-    """Return the attitude of a sensor: x = −sin(roll)·n − cos(roll)·e, y = −cos(roll)·n + sin(roll)·e, z = b."""
-    ra, dec, roll = (math.radians(angle) for angle in (ra_deg, dec_deg, roll_deg))
-    boresight = (math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec))
-    north = (-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec))
-    east = (-math.sin(ra), math.cos(ra), 0.0)
-    sine, cosine = math.sin(roll), math.cos(roll)
-    right = [-sine * n - cosine * e for n, e in zip(north, east, strict=True)]
-    down = [-cosine * n + sine * e for n, e in zip(north, east, strict=True)]
-    return of_matrix((right, down, boresight))
+    return from_matrix(rows)
 
 
 @dataclass(frozen=True)
@@ -115,7 +68,7 @@ class Motion:
     def of(cls, truth: Mapping[str, Any], start_s: float) -> Motion:
         """Return the motion of a truth table of kind `fixed` or `rate`."""
         angles = truth["attitude"]
-        attitude = of_radec_roll(angles["ra_deg"], angles["dec_deg"], angles.get("roll_deg", 0.0))
+        attitude = from_radec_roll(angles["ra_deg"], angles["dec_deg"], angles.get("roll_deg", 0.0))
         x, y, z = (math.radians(value) for value in truth.get("rate_deg_s", (0.0, 0.0, 0.0)))
         return cls(start_s, attitude, (x, y, z))
 

@@ -17,74 +17,56 @@ class Unit(Protocol):
     @property
     def now_s(self) -> float:
         """Simulation time since power was switched on, seconds."""
-        ...
 
     @property
     def frames(self) -> int:
         """Number of images solved in all."""
-        ...
 
     @property
     def exposed_s(self) -> float:
         """Simulation time in which images were taken, in all, seconds: the sum of their periods."""
-        ...
 
     async def power_on(self) -> None:
         """Switch the unit on."""
-        ...
 
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
-        ...
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
         """Let time pass, or less, after about `most` events."""
-        ...
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
         """Pass bytes or a frame to the unit."""
-        ...
 
     def take(self, link: str) -> list[tuple[float, Any]]:
         """Return what the unit has sent, and when, seconds."""
-        ...
 
     async def set_truth(self, truth: Mapping[str, Any]) -> None:
         """Replace the truth."""
-        ...
 
     def fault(self, fault: Mapping[str, Any]) -> None:
         """Inject faults."""
-        ...
 
     def clear_faults(self) -> None:
         """End all faults."""
-        ...
 
     async def end_pipeline(self) -> None:
         """End the image pipeline unexpectedly."""
-        ...
 
     def set_disk(self, *, full: bool) -> None:
         """Set whether files can be written."""
-        ...
 
     def set_peer(self, link: str, *, reads: bool) -> None:
         """Set whether the peer of a link reads."""
-        ...
 
     def internal_errors(self) -> list[str]:
         """Return the internal errors since the last call."""
-        ...
 
     def open_descriptors(self) -> int:
         """Return the number of open file descriptors."""
-        ...
 
     def queued_events(self) -> int:
         """Return the number of queued events."""
-        ...
 
     def memory_bytes(self) -> int:
         """Return the memory in use, bytes."""
-        ...

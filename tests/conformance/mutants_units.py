@@ -35,7 +35,7 @@ def bodies(change: Callable[[bytes, SerialStack], bytes]) -> Damage:
     """Change the bodies of the frames that the device sends."""
 
     def damage(unit: SimulatedUnit) -> None:
-        framing = stack_of(unit).framing
+        framing = stack_of(unit).replies.framing
         encode = framing.encode
         framing.encode = lambda body: encode(change(body, stack_of(unit)))  # type: ignore[method-assign]
 
@@ -95,33 +95,33 @@ def with_code(old: ErrorCode, code: ErrorCode | None) -> Damage:
 
 def unchecked(unit: SimulatedUnit) -> None:
     """Accept any check."""
-    stack_of(unit)._checks = lambda *_: True  # type: ignore[method-assign]
+    stack_of(unit).requests._checks = lambda *_: True  # type: ignore[method-assign]
 
 
 def only_whole_check_missing(unit: SimulatedUnit) -> None:
     """Compare the lowest byte of the check only."""
-    stack = stack_of(unit)
+    form = stack_of(unit).requests
 
     def checks(body: bytes, size: int, end: int) -> bool:
-        covered = stack._covered(body[:size], body[size:end])
-        return stack.check.compute(covered)[:1] == body[end:][:1]
+        covered = form._covered(body[:size], body[size:end])
+        return form.check.compute(covered)[:1] == body[end:][:1]
 
-    stack._checks = checks  # type: ignore[method-assign]
+    form._checks = checks  # type: ignore[method-assign]
 
 
 def any_address(unit: SimulatedUnit) -> None:
     """Take messages to other addresses for one's own."""
-    stack = stack_of(unit)
-    opened = stack.open
+    form = stack_of(unit).requests
+    opened = form.open
 
-    def open_any(header: Any, body: bytes) -> Any:
-        result = opened(header, body)
+    def open_any(body: bytes) -> Any:
+        result = opened(body)
         if isinstance(result, LinkFault) and result.kind is FaultKind.UART_ADDRESS:
-            envelope = header.unpack(body[: len(body) - stack.check.size])
-            return envelope, body[envelope.size : len(body) - stack.check.size]
+            envelope: Any = form.header.unpack(body[: len(body) - form.check.size])
+            return envelope, body[envelope.size : len(body) - form.check.size]
         return result
 
-    stack.open = open_any  # type: ignore[method-assign]
+    form.open = open_any  # type: ignore[method-assign]
 
 
 def any_class(unit: SimulatedUnit) -> None:
@@ -267,7 +267,7 @@ def mutants() -> Iterator[UnitMutant]:
             "replies come from another address",
             one,
             bodies(
-                lambda body, stack: stack.close(
+                lambda body, stack: stack.requests.close(
                     bytes((body[0] ^ 1, body[1] ^ 1)) + body[2 : -stack.check.size], b""
                 )
             ),
