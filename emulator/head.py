@@ -32,8 +32,8 @@ from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.links.traffic import Traffic
-from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.messages import PipelineReady, camera_constants
+from starhil.emulator.pipeline_setup import PipelineImager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.revival import PipelineRevival

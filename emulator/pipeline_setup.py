@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeAlias
 
-from starhil.emulator.pipeline.imager import PipelineImager, WorkerImager
+from starhil.emulator.pipeline.error_model import ErrorModelImager
+from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.messages import PipelineSetup
 from starhil.emulator.pipeline.worker_process import WorkerProcess, WorkerThread
 from starhil.emulator.profile import Profile
+
+PipelineImager: TypeAlias = WorkerImager | ErrorModelImager
+"""An image pipeline that can be started, and started again after an unexpected end."""
 
 
 def make_imager(
@@ -20,8 +25,6 @@ def make_imager(
     if worker is not None:
         worker.end()
     if profile.run.worker == "error_model":
-        from starhil.emulator.pipeline.error_model import ErrorModelImager
-
         return ErrorModelImager(setup)
     return WorkerImager(setup, WorkerThread())
 

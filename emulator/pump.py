@@ -8,12 +8,12 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
+from starhil.emulator.clock import NANOSECONDS, Clock, LatchedClock, SteppedClock
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager
-from starhil.emulator.tape import LatchedClock, Recorder
+from starhil.emulator.tape import Recorder
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")

@@ -15,8 +15,8 @@ from typing import Final
 from starhil.emulator.device.device import PIPELINE_ENDED, Device
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
-from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.messages import PipelineReady
+from starhil.emulator.pipeline_setup import PipelineImager
 
 log = logging.getLogger("starhil.run")
 

@@ -26,9 +26,8 @@ from starhil.emulator.clock import NANOSECONDS, SteppedClock, make_clock
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.head import Head, check_links
-from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.worker_process import WorkerProcess
-from starhil.emulator.pipeline_setup import make_imager
+from starhil.emulator.pipeline_setup import PipelineImager, make_imager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import StepPump
 from starhil.emulator.tape import Recorder, Wiring

@@ -310,8 +310,6 @@ def sky() -> str:
 
 def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> list[Row]:
     """Return a row for each field of a dataclass of the sky."""
-    from starhil.emulator.sky.objects import _RANGES
-
     texts: dict[str, str] = {}
     for base in reversed(inspect.getmro(kind)[:-1]):
         texts |= attribute_docstrings(base, grouped=True)
@@ -319,7 +317,7 @@ def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> li
     for field in dataclasses.fields(kind):
         if field.name in (skipped or {}):
             continue
-        low, high = _RANGES.get(field.name, (None, None))
+        low, high = field.metadata.get("limits", (None, None))
         allowed = "" if low is None or high is None or abs(low) >= 1e5 else f"{number(low)} to {number(high)}"
         value = "required" if field.default is dataclasses.MISSING else literal(field.default)
         rows.append((f"`{field.name}`", unit(field.name), allowed, value, texts[field.name]))

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import explained
 from starid.cli.output import prepare_output
 
 PROGRESS_S: Final = 5.0
@@ -33,12 +33,8 @@ async def report_slow_start() -> None:
 def writing(path: Path) -> Iterator[None]:
     """Write the file of an option -o, whose folder is made; a failure is one line."""
     prepare_output(path, "-o")
-    try:
+    with explained(f"{path}: cannot be written", "choose another file with -o"):
         yield
-    except OSError as error:
-        raise EmulatorError(
-            f"{path}: cannot be written ({error.strerror}); choose another file with -o"
-        ) from None
 
 
 def print_text(text: str) -> None:

@@ -166,23 +166,18 @@ class _Scene:
 
 
 def _scene(profile: str | None) -> _Scene:
-    """Return the scene for the device of a profile, or the default."""
-    from starhil.emulator.sensor.model import SensorModel
-    from starhil.emulator.sky.objects import SkyObjects
-    from starhil.emulator.sky.view import Sky, SkyView
-    from starid.camera import Camera
-    from starid.catalog import DEFAULT_EPOCH
-
-    if profile is None:
-        return _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
+    """Return the scene for the device of a profile, by default one without keys."""
     from starhil.emulator.device.device import profile_defaults
     from starhil.emulator.device.parameters import Parameters
     from starhil.emulator.device.surroundings import orbit_of
     from starhil.emulator.pipeline_setup import pipeline_setup
-    from starhil.emulator.profile import load_profile
+    from starhil.emulator.profile import Profile, load_profile
+    from starhil.emulator.sensor.model import SensorModel
+    from starhil.emulator.sky.view import Sky
     from starhil.protocol.icd import load_unit
+    from starid.camera import Camera
 
-    loaded = load_profile(profile)
+    loaded = Profile() if profile is None else load_profile(profile)
     icd = load_unit(loaded.unit_source)
     parameters = Parameters(icd, profile_defaults(loaded, icd))
     setup = pipeline_setup(loaded)

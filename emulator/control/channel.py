@@ -48,7 +48,7 @@ from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.measurement import Measurement
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import until_cancelled
 from starhil.emulator.head import Head
@@ -59,7 +59,7 @@ from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.errors import ProtocolError, reason
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
 from starid.errors import StaridError
 
@@ -118,15 +118,12 @@ class ControlServer:
         host, _, port = where.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
-        try:
+        what = f"control channel {where}: cannot listen"
+        with explained(what, "choose another port, or auto", errors=(OSError, ValueError)):
             serve = until_cancelled(self._serve_connection)
             self._server = await asyncio.start_server(
                 serve, host, int(port), limit=MAX_LINE - 1, backlog=self._limit.size
             )
-        except (OSError, ValueError) as error:  # an invalid host name is a ValueError
-            raise EmulatorError(
-                f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"
-            ) from None
         address = self._server.sockets[0].getsockname()
         return f"{address[0]}:{address[1]}"
 

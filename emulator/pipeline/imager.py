@@ -51,24 +51,6 @@ class Imager(Protocol):
         """Wait until no requests are pending."""
 
 
-class PipelineImager(Imager, Protocol):
-    """An image pipeline that can be started, and started again after an unexpected end."""
-
-    ended: Signal[str]
-    """The pipeline has ended after it was ready, and why; a failed start raises instead."""
-    watchers: set[object]
-    """Viewers of the frames; frames come with a preview unless this is empty."""
-
-    async def start(self) -> PipelineReady:
-        """Wait until the pipeline is ready; raise EmulatorError with the reason if it fails, in one line."""
-
-    async def restart(self) -> PipelineReady:
-        """Start the pipeline again after it has ended, and wait until it is ready."""
-
-    async def close(self) -> None:
-        """End the pipeline and wait for it."""
-
-
 class WorkerImager:
     """The pipeline in a worker, a process or a thread, connected by a socket pair.
 
@@ -79,7 +61,9 @@ class WorkerImager:
     def __init__(self, setup: PipelineSetup, worker: Worker) -> None:
         self.worker = worker
         self.ended = Signal[str]("end of the image pipeline")
+        """The pipeline has ended after it was ready, and why; a failed start raises instead."""
         self.watchers: set[object] = set()
+        """Viewers of the frames; frames come with a preview unless this is empty."""
         self._setup = setup
         self._waiting: deque[ReplyCallback] = deque()
         """Callbacks of pending requests, in order."""
@@ -100,7 +84,7 @@ class WorkerImager:
         await self._idle.wait()
 
     async def start(self) -> PipelineReady:
-        """Wait until the pipeline is ready."""
+        """Wait until the pipeline is ready; raise EmulatorError with the reason if it fails, in one line."""
         self._started = asyncio.get_running_loop().create_future()
         reader, self._writer = await asyncio.open_connection(sock=self.worker.socket)
         self._writer.write(with_length(self._setup))

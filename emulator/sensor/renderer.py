@@ -17,7 +17,6 @@ from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
-from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
 from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.light_grid import Backdrop
@@ -196,7 +195,7 @@ class Renderer:
         rate = _rate(rate_rad_s)
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
-        self._optics = drifted_camera(self.camera, sensor, temperature)
+        self._optics = sensor.camera_at(self.camera, temperature)
         optical_axis = self._pointing(attitude, temperature)
         area = None
         if others is not None and others.has_extended_objects:
@@ -279,7 +278,7 @@ class Renderer:
 
     def _pointing(self, attitude: Attitude, temperature_c: float) -> Attitude:
         """Return the attitude of the optics, which drift against the mounting with the temperature."""
-        drift = boresight_drift_rad(self.sensor, temperature_c)
+        drift = self.sensor.boresight_drift_rad(temperature_c)
         return attitude.rotated(drift) if np.any(drift) else attitude
 
     def _mean_without_stars(self, exposure_s: float, temperature_c: float, area: AreaLight | None) -> Array32:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Final, Literal
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import explained
 from starhil.emulator.guard import until_cancelled
 from starhil.emulator.json_lines import read_lines
 from starhil.emulator.truth.live import LiveTruth
@@ -66,7 +66,8 @@ class LiveFeed:
             return f"tcp:{host}:{port}"
         loop = asyncio.get_running_loop()
         protocol = "udp" if socket == "udp" else "tcp"
-        try:
+        what = f"truth feed {protocol}:{host}:{port}: cannot listen"
+        with explained(what, "choose another port, or 0", errors=(OSError, ValueError)):
             if socket == "udp":
                 transport, _ = await loop.create_datagram_endpoint(
                     lambda: _Datagrams(self), local_addr=(host, port)
@@ -82,10 +83,6 @@ class LiveFeed:
                     backlog=self._limit.size,
                 )
                 address = self._server.sockets[0].getsockname()
-        except (OSError, ValueError) as error:  # ValueError: not a valid host name
-            raise EmulatorError(
-                f"truth feed {protocol}:{host}:{port}: cannot listen ({reason(error)}); choose another port, or 0"
-            ) from None
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, data: bytes) -> None:
