@@ -94,7 +94,7 @@ class Emulator:
     async def start(self) -> None:
         """Open files, links and control channel, switch the devices on and start time."""
         with self._rejecting():
-            await self._start()
+            await self._start(self.options, self.run)
 
     @contextmanager
     def _rejecting(self) -> Iterator[None]:
@@ -104,8 +104,7 @@ class Emulator:
             self._rejected = True
             raise
 
-    async def _start(self) -> None:
-        options, run = self.options, self.run
+    async def _start(self, options: RunOptions, run: Run) -> None:
         if run.recorder is not None:
             from starhil.emulator.replay import prepare_recording
 

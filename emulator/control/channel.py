@@ -72,6 +72,7 @@ BUSY: Final = b'{"ok": false, "error": "too many connections to the control chan
 LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
 
 Answer = dict[str, Any]
+Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -89,17 +90,18 @@ class ControlServer:
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("control channel", BUSY)
-        self._actions: dict[str, Callable[[Head, dict[str, Any]], Awaitable[Answer]]] = {
-            "status": self._status,
-            "truth": self._truth,
-            "frames": self._last_frames,
-            "set_truth": self._set_truth,
-            "step": self._step,
-            "fault": self._fault,
-            "clear_faults": self._clear_faults,
-            "scenario": self._run_scenario,
-            "quit": self._quit_run,
+        self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
+            "status": (self._status, ()),
+            "truth": (self._truth, ("run_time_s", "unix_s")),
+            "frames": (self._last_frames, ("count",)),
+            "set_truth": (self._set_truth, ("truth",)),
+            "step": (self._step, ("seconds",)),
+            "fault": (self._fault, None),
+            "clear_faults": (self._clear_faults, ()),
+            "scenario": (self._run_scenario, ("name",)),
+            "quit": (self._quit_run, ()),
         }
+        """What a request may `do`: function, and keys unless a model checks them."""
         for head in run.heads:
             head.device.signals.frame_published.connect(self._frames[head.number].append)
 
@@ -177,11 +179,13 @@ class ControlServer:
     async def execute(self, request: dict[str, Any]) -> Answer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
         wanted = str(request.pop("do", ""))
-        action = self._actions.get(wanted)
-        if action is None:
+        if wanted not in self._actions:
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+        action, known = self._actions[wanted]
         try:
             head = self._head(request)
+            if known is not None:
+                _check_keys(request, known)
             if self._run.recorder is not None:
                 self._run.recorder.latch()
             return {"ok": True, **await action(head, request)}
@@ -204,8 +208,7 @@ class ControlServer:
             raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
         return heads[number - 1]
 
-    async def _status(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request)
+    async def _status(self, head: Head, _request: dict[str, Any]) -> Answer:
         profile, device = head.profile, head.device
         truth = device.surroundings.truth.state(device.clock.now_ns() / NANOSECONDS)
         source = self._run.truth.source
@@ -241,7 +244,6 @@ class ControlServer:
         return answer
 
     async def _truth(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "run_time_s", "unix_s")
         device = head.device
         run_ns = device.clock.now_ns()
         if "run_time_s" in request:
@@ -261,14 +263,12 @@ class ControlServer:
         }
 
     async def _last_frames(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "count")
         count = int(_number(request, "count", 1.0))
         if not 1 <= count <= KEPT_FRAMES:
             raise EmulatorError(f"count: {count} is outside 1 … {KEPT_FRAMES}")
         return {"frames": [compare(measurement) for measurement in list(self._frames[head.number])[-count:]]}
 
     async def _set_truth(self, _head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "truth")
         config = self._run.truth.configured
         if "truth" in request:
             if not isinstance(request["truth"], dict):
@@ -279,7 +279,6 @@ class ControlServer:
         return {"kind": config.kind, "address": self._run.truth.address}
 
     async def _step(self, _head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "seconds")
         clock, stepper = self._run.clock, self._run.stepper
         if stepper is None:
             raise EmulatorError(f"step: the clock is {clock.name}; run with --clock stepped")
@@ -293,22 +292,19 @@ class ControlServer:
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
 
-    async def _clear_faults(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request)
+    async def _clear_faults(self, head: Head, _request: dict[str, Any]) -> Answer:
         self._run.record("clear_faults")
         head.faults.clear()
         return {"faults": head.faults.describe()}
 
     async def _run_scenario(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "name")
         if self._run.recorder is not None:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
         scenario.enter(head, self._run.truth, start_s=self._run.clock.now_ns() / NANOSECONDS)
         return {"events": len(scenario.at)}
 
-    async def _quit_run(self, _head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request)
+    async def _quit_run(self, _head: Head, _request: dict[str, Any]) -> Answer:
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
 
@@ -327,7 +323,7 @@ def _parse(model: type[Model], value: object) -> Model:
         raise EmulatorError(explain(error, model)) from None
 
 
-def _check_keys(request: dict[str, Any], *known: str) -> None:
+def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:
     for key in request:
         if key not in known:
             raise EmulatorError(f"unknown key {key!r}; known: {', '.join(known) or 'none'}")

@@ -57,17 +57,6 @@ STARS_SENT: Final = 16
 DOWNLOAD_BITS: Final = 8
 """Bits per pixel of an image for download."""
 
-REASONS: Final[dict[Reason, str]] = {
-    Reason.OK: "ok",
-    Reason.TOO_FEW_STARS: "too_few_stars",
-    Reason.NO_MATCH: "no_match",
-    Reason.AMBIGUOUS: "ambiguous",
-    Reason.RESIDUAL: "residual",
-    Reason.PREDICTION_LOST: "prediction_lost",
-    Reason.BAD_INPUT: "bad_input",
-}
-"""Reason of the star identifier → its name in telemetry."""
-
 _WARM_UP_BODIES: Final = SkyObjects(
     sun=SunGlare(0.0, 80.0),
     moon=Moon(90.0, 80.0),
@@ -320,7 +309,7 @@ class Pipeline:
         )
         valid = solution.valid
         x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
-        reason = REASONS[solution.reason] if found.searchable else "detection_failed"
+        reason = solution.reason.value if found.searchable else "detection_failed"
         rate = solution.rate_rad_s
         return FrameResult(
             index=request.index,

@@ -196,7 +196,8 @@ class Renderer:
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
         self._optics = sensor.camera_at(self.camera, temperature)
-        optical_axis = self._pointing(attitude, temperature)
+        drift = sensor.boresight_drift_rad(temperature)  # of the optics against the mounting
+        optical_axis = attitude.rotated(drift) if np.any(drift) else attitude
         area = None
         if others is not None and others.has_extended_objects:
             area = self._painter.paint(others, optical_axis)
@@ -217,7 +218,10 @@ class Renderer:
             planet_xy = np.full((len(planets), 2), np.nan)
             shown = count + np.flatnonzero(inside[count:])
             planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
-            object_truth = self._add_objects(mean, others, planet_xy, exposure, index, area)
+            rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
+            false_xy = self._add_false_stars(mean, others, rng, exposure)
+            streaks = add_cosmic_rays(mean, int(rng.poisson(others.cosmic_rays_s * exposure)), rng)
+            object_truth = ObjectTruth(false_xy, planet_xy, streaks, area.covered_share if area else 0.0)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[centred]]
@@ -231,21 +235,6 @@ class Renderer:
         )
         rates = (float(rate[0]), float(rate[1]), float(rate[2]))
         return Frame(image, stars, attitude, rates, exposure, self.seed, index, object_truth)
-
-    def _add_objects(
-        self,
-        mean: Array32,
-        objects: SkyObjects,
-        planet_xy: Array,
-        exposure_s: float,
-        index: int,
-        area: AreaLight | None,
-    ) -> ObjectTruth:
-        """Add false stars and particles to `mean`, in place."""
-        rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
-        false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
-        streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
-        return ObjectTruth(false_xy, planet_xy, streaks, 0.0 if area is None else area.covered_share)
 
     def _add_false_stars(
         self,
@@ -275,11 +264,6 @@ class Renderer:
         start, _ = self.camera.project(frame.attitude.rotated(-half).to_sensor(icrs))
         end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
         return end - start
-
-    def _pointing(self, attitude: Attitude, temperature_c: float) -> Attitude:
-        """Return the attitude of the optics, which drift against the mounting with the temperature."""
-        drift = self.sensor.boresight_drift_rad(temperature_c)
-        return attitude.rotated(drift) if np.any(drift) else attitude
 
     def _mean_without_stars(self, exposure_s: float, temperature_c: float, area: AreaLight | None) -> Array32:
         """Return the mean electrons (h, w) of sky, dark current and extended objects, in a buffer that is reused."""
@@ -320,7 +304,10 @@ class Renderer:
         A path is the parabola through the projections at the start, middle and end of the exposure. The numbers of planets
         follow those of the stars.
         """
-        near = self._near(self._vectors, attitude, rate, exposure_s)
+        readout_s = self.camera.height * self.sensor.row_time_s
+        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
+        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
+        near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
         icrs = self._vectors[near]
         if observer is not None:
             icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
@@ -330,19 +317,6 @@ class Renderer:
             near = np.concatenate([near, len(self._rows) + np.arange(len(planets))])
         path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
-
-    def _near(
-        self,
-        vectors: Array,
-        attitude: Attitude,
-        rate: Array,
-        exposure_s: float,
-    ) -> Indices:
-        """Return the numbers of the directions (n, 3) in the cone around the field that the exposure sweeps."""
-        readout_s = self.camera.height * self.sensor.row_time_s
-        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
-        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
-        return np.flatnonzero(vectors @ attitude.boresight >= cosine)
 
     def _path_of(
         self,
