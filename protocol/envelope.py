@@ -108,11 +108,12 @@ class Header:
         self._classes = classes
         self.overhead: Final = overhead
         """Sizes of `start`, `check` and `end`."""
-        parts = next((field.includes for field in self.fields if field.role == "length"), [])
+        length = next((field for field in self.fields if field.role == "length"), None)
+        parts, offset = ([], 0) if length is None else (length.includes, length.offset)
         self._counted: Final = (
-            sum(overhead.get(part, 0) for part in parts), parts.count("header"), parts.count("data")
+            offset + sum(overhead.get(part, 0) for part in parts), parts.count("header"), parts.count("data")
         )  # fmt: skip
-        """What a length counts: bytes of fixed parts, and how often header and data."""
+        """What a length counts: bytes of fixed parts and its offset, and how often header and data."""
         self._sizes: Final[dict[str, int]] = {}
         """Class → size of the header."""
         self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
@@ -127,6 +128,13 @@ class Header:
             if role
         }
         """Value of each role for messages that do not set it."""
+        self.counts: Final = frozenset(
+            kind
+            for field in self.fields
+            for counts in (field.counts, *(bit.counts for bit in field.bits))
+            for kind in counts
+        )
+        """Messages whose `sequence` the sender counts: `reply`, `unsolicited`."""
 
     def roles_in(self, klass: str) -> frozenset[str]:
         """Return the roles that the header carries in messages of a class."""
@@ -161,6 +169,8 @@ class Header:
                 value = 0
                 for name, shift, mask, _, given in bits:
                     part = given if name is None else values.get(name, given)
+                    if name in WRAPPING:
+                        part &= mask
                     if not 0 <= part <= mask:
                         text = f"header: {name or 'constant'} {part} does not fit {mask.bit_length()} bits"
                         raise ProtocolError(text)
@@ -231,6 +241,11 @@ def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderFiel
         raise IcdError(f"{where}: scale {model.scale:g} s is below a nanosecond")
     if model.role is None and model.const is None and model.default is None and not model.bits:
         raise IcdError(f"{where}: needs a role, or `const` or `default`")
+    counting = [bit.role for bit in model.bits if bit.counts] + [model.role] * bool(model.counts)
+    if any(role != "sequence" for role in counting):
+        raise IcdError(f"{where}: only role sequence has `counts`")
+    if model.offset and model.role != "length":
+        raise IcdError(f"{where}: only role length has an `offset`")
     given = {"default": _default(model), "order": model.order or byte_order}
     field = HeaderField.model_construct(**dict(model) | given | {"bits": _bits(model.bits)})
     width = sum(bit.width for bit in field.bits)

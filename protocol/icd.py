@@ -528,6 +528,8 @@ class _Reader:
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
             raise IcdError(f"{where}: last_id {last} is below ID {model.id}")
+        if kind == "telecommand" and model.unsolicited is not None:
+            raise IcdError(f"{where}: only telemetry is sent unsolicited")
         if kind == "telemetry" and model.readback is not None:
             raise IcdError(f"{where}: only telecommands have a readback")
         if model.readback is not None and not model.name.startswith(SETS):
@@ -564,6 +566,7 @@ class _Reader:
                 source=model.source or (self._unit.source if provenance == "confirmed" else ""),
                 klass=klass,
                 action=model.action,
+                unsolicited=model.unsolicited,
                 arguments={
                     name: number if value == NUMBER else value for name, value in model.arguments.items()
                 },

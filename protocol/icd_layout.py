@@ -148,7 +148,7 @@ class Layout:
             slot = self._slot("bytes", model.size or 0)
         else:
             slot = self._scalar_slot(type_, model.order)
-        self._check_numbers(model, where)
+        self._check_numbers(model, where, str(model.type), INTEGER_RANGES.get(str(model.type)))
         keys = self._keys(model, where, suffix, number, unit=model.unit, named=type_.startswith("enum"))
         if model.const is not None:
             keys |= {"minimum": model.const, "maximum": model.const}
@@ -184,6 +184,10 @@ class Layout:
         """Return the enumeration of a field, by name or in its `map`, and its aliases."""
         if model.name is None:
             return None, {}
+        if model.enumeration is not None and isinstance(model, FieldModel) and not named:
+            bits = str(model.type).removeprefix("u")
+            types = f"enum{bits}" if bits in ("8", "16", "32") else "enum8, enum16 or enum32"
+            raise IcdError(f"{where}: `enum` needs type {types}, not {model.type}")
         if model.map is None:
             return (self._definitions.enum_of(model.enumeration, where) if named else None), {}
         if model.enumeration is not None:
@@ -213,14 +217,17 @@ class Layout:
         suffix: str,
         number: int | None,
     ) -> Field:
-        keys = self._keys(bit, where, suffix, number, unit="", named=bit.enumeration is not None)
+        keys = self._keys(bit, where, suffix, number, unit=bit.unit, named=bit.enumeration is not None)
+        self._check_numbers(bit, where, f"u{bit.width}", (0, 2**bit.width - 1))
         enum = keys["enum"]
         if enum is not None and max(enum.values.values()) >= 2**bit.width:
             raise IcdError(f"{where}: enumeration {enum.name} does not fit {bit.width} bits")
         if bit.const is not None and not (isinstance(bit.const, int) and 0 <= bit.const < 2**bit.width):
             raise IcdError(f"{where}: const {bit.const:g} does not fit {bit.width} bits")
         kind: FieldKind = "enum" if enum is not None else "flag" if bit.width == 1 else "bits"
-        keys |= {"provenance": model.provenance, "shift": shift, "width": bit.width}
+        if kind != "bits" and (bit.scale, bit.bias) != (1.0, 0.0):
+            raise IcdError(f"{where}: scale and offset need a number of at least 2 bits")
+        keys |= {"provenance": bit.provenance or model.provenance, "shift": shift, "width": bit.width}
         return self._placed(bit, slot, keys, kind)
 
     def _placed(
@@ -252,21 +259,23 @@ class Layout:
         self._names |= {item.name} - {""}
 
     @staticmethod
-    def _check_numbers(model: FieldModel, where: str) -> None:
+    def _check_numbers(
+        model: FieldModel | BitModel, where: str, type_: str, limits: tuple[int, int] | None
+    ) -> None:
         if model.scale == 0.0:
             raise IcdError(f"{where}: scale is 0")
         if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
             raise IcdError(f"{where}: min {model.minimum:g} is above max {model.maximum:g}")
-        if model.wrap and not str(model.type).startswith("u"):
+        if model.wrap and not type_.startswith("u"):
             raise IcdError(f"{where}: wrap: only unsigned integers wrap")
         if model.wrap and (model.minimum, model.maximum) != (None, None):
             raise IcdError(f"{where}: wrap: a field that wraps has no min and max")
-        limits = INTEGER_RANGES.get(str(model.type))
         if limits is None:
             return
+        described = f"type {type_}" if isinstance(model, FieldModel) else f"{type_[1:]} bits"
         for name, value in (("min", model.minimum), ("max", model.maximum), ("const", model.const)):
             if value is not None and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]:
-                raise IcdError(f"{where}: {name} {value:g} does not fit type {model.type} with its scale")
+                raise IcdError(f"{where}: {name} {value:g} does not fit {described} with its scale")
 
 
 def mapped(

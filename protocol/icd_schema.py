@@ -99,8 +99,8 @@ class _MappedModel(BitKeys):
     """Number on the wire → value of the quantity or argument, or a list of values that share the number."""
 
 
-class BitModel(_MappedModel):
-    """One bit or a group of bits; unused and sent as zeros if it has no name."""
+class BitModel(_MappedModel, FieldKeys):
+    """One bit or a group of bits, an unsigned number; unused and sent as zeros if it has no name."""
 
     width: Annotated[int, Field(ge=1, le=31)] = 1
     """Width in bits."""
@@ -142,6 +142,10 @@ class FieldModel(_MappedModel, FieldKeys):
         return {"text": given} if isinstance(given, str) else given
 
 
+Event = Literal["start", "frame", "mode", "error", "validity"]
+"""What a unit may report unsolicited; described in `RowKeys.unsolicited`."""
+
+
 class RowKeys(DefinitionModel):
     """Keys that a row keeps."""
 
@@ -160,6 +164,13 @@ class RowKeys(DefinitionModel):
     """Action that a telecommand performs, or that follows each reading of a telemetry row."""
     arguments: dict[Name, Scalar] = {}
     """Fixed arguments of the action; the text `[n]` is the number of an expanded row."""
+    unsolicited: (
+        Annotated[float, Field(gt=0, le=100)] | Annotated[list[Event], Field(min_length=1)] | None
+    ) = None
+    """Sends a telemetry row without a request, from the start on: at a rate in Hz, or after each of the listed
+    events. `start`: the unit has started; `frame`: there is a new measurement; `mode`: the mode has changed; `error`:
+    the unit has entered the error mode, or its error has changed; `validity`: the attitude has become valid or
+    invalid."""
 
 
 class RowModel(RowKeys):

@@ -27,6 +27,7 @@ Role = Literal[
     "status", "ack", "final", "flags", "ticks", "time",
 ]  # fmt: skip
 """Meaning of a header field; described in `HeaderFieldModel`."""
+CountedMessage = Literal["reply", "unsolicited"]
 
 
 class MessageClass(DefinitionModel):
@@ -239,6 +240,8 @@ class HeaderBitModel(DefinitionModel):
     """Value that is sent, and required on reception."""
     default: Annotated[int, Field(ge=0)] | None = None
     """Value that is sent if the message sets none; not checked on reception, except for an address."""
+    counts: list[CountedMessage] = []
+    """Messages that a `sequence` numbers, beginning with 0 after a start, instead of repeating a request's number."""
 
 
 class HeaderFieldModel(DefinitionModel):
@@ -246,7 +249,7 @@ class HeaderFieldModel(DefinitionModel):
 
     Roles: `address` is the address of the device, in both directions; `source` (in a request) and
     `destination` (in a reply) are the address of the OBC. `class`, `id` and `status` are the codes of class,
-    row and error. `length` counts the parts in `includes`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
+    row and error. `length` is the number of bytes of the parts in `includes`, plus `offset`. `ack` is 0 in a refusal, otherwise 1; `final` is 1 in
     the last reply to a request. A reply repeats the `sequence` and `flags` of its request. `ticks` is the
     time since start, `time` the time of the unit's clock.
     """
@@ -259,12 +262,16 @@ class HeaderFieldModel(DefinitionModel):
     """Value that is sent, and required on reception."""
     default: int | None = None
     """Value that is sent if the message sets none; not checked on reception, except for an address."""
+    counts: list[CountedMessage] = []
+    """Messages that a `sequence` numbers, beginning with 0 after a start, instead of repeating a request's number."""
     order: Order | None = None
     """Byte order; default: the unit's."""
     scale: Annotated[float, Field(gt=0)] = 1.0
     """Seconds per count of `ticks` or `time`."""
     includes: list[SizedPart] = ["data"]
     """Parts of the message that a `length` counts; `header` includes the length field itself."""
+    offset: int = 0
+    """Number added to a `length` (CCSDS packets: -1)."""
     classes: list[str] | None = None
     """Classes whose messages have the field; default: all."""
     bits: list[HeaderBitModel] = []

@@ -271,6 +271,8 @@ class SerialStack:
                     raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
             if isinstance(self.link.framing, LengthFraming) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
+        if self.request_header.counts:
+            raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
         if "id" not in self.request_header.roles:
             raise IcdError("link.serial.request_header: needs a field with role id")
         for role in ("source", "destination"):
@@ -289,6 +291,14 @@ class SerialStack:
     def supports_unsolicited(self, dialect: Dialect | None = None) -> bool:
         """Return whether this dialect has unsolicited telemetry."""
         return ReplyKind.UNSOLICITED in self.format(dialect).headers
+
+    def counts(self, kind: ReplyKind) -> bool:
+        """Return whether the device numbers messages of this kind itself."""
+        unsolicited = kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT)
+        return (
+            kind is not ReplyKind.ECHO
+            and ("unsolicited" if unsolicited else "reply") in self.reply_header.counts
+        )
 
     def device(self) -> Deframer[Request]:
         """Return a receiver for the device's end."""

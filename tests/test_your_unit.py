@@ -74,14 +74,17 @@ def test_the_framing_of_the_page_carries_every_message(tmp_path):
     folder = written(tmp_path / "lynx")
     file = folder / "unit.toml"
     text = file.read_text(encoding="utf-8").replace(
-        'framing = { kind = "length", start = [0xEB, 0x90] }', 'framing = { kind = "custom", name = "cobs" }'
+        'framing = { kind = "length", start = [0x1A, 0xCF, 0xFC, 0x1D] }',
+        'framing = { kind = "custom", name = "cobs" }',
     )
     file.write_text(text.replace("[unit]", '[unit]\nplugin = "unit.py"'), encoding="utf-8")
     (source,) = [block.text for block in blocks(PAGE, "python") if block.heading == PYTHON]
     (folder / "unit.py").write_text(source, encoding="utf-8")
     result = CliRunner().invoke(build_app(), ["unit", "check", str(folder)])
     assert result.exit_code == 0, result.output
-    assert "  > 01 02 0B 0B 01 10 01 02 03 04" in result.stdout  # length 11, sequence 0, group 1, ID 16
+    assert (
+        "  > 01 03 0B C0 0B 01 10 01 02 03 04" in result.stdout
+    )  # length 12 - 1, sequence 0, group 1, ID 16
     stack = build_serial_stack(load_unit(folder))
     request = load_unit(folder).request_of(0x10, "command", bytes(6))
     line = stack.encode_request(request)
@@ -110,7 +113,7 @@ def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
 
     def listen(port: str) -> bytes:
         with serial.Serial(port, timeout=10.0) as line:
-            return line.read(200)
+            return line.read(400)
 
     async def read() -> bytes:
         emulator = Emulator([profile], RunOptions())
@@ -121,5 +124,9 @@ def test_the_unit_of_the_page_streams_by_itself(tmp_path, monkeypatch):
         finally:
             await emulator.close()
 
-    found = re.findall(rb"\xeb\x90\x00\x24(.)\xc2\x41\x00", asyncio.run(read()), re.DOTALL)
-    assert len(found) >= 3
+    stream = asyncio.run(read())
+    heads = re.findall(rb"\x1a\xcf\xfc\x1d..(..)(\xc2[\x40\x41]|\xc3\x50)\x00", stream, re.DOTALL)
+    assert {kind.hex() for _number, kind in heads} == {"c241", "c240", "c350"}
+    numbers = [int.from_bytes(number) for number, _kind in heads]
+    assert numbers == list(range(numbers[0], numbers[0] + len(heads)))
+    assert numbers[0] >= 0xC000

@@ -1,4 +1,4 @@
-"""Unsolicited telemetry: lists of rows, each sent at a rate or with each frame."""
+"""Unsolicited telemetry: lists of rows, each sent at a rate or with each frame, and rows sent after events."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Final
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.measurement import Measurement
+from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.device.signals import Signals
@@ -27,9 +28,10 @@ class Subscription:
 
 
 class Subscriptions:
-    """Schedule of the rows that are sent unsolicited, by telecommand and by two parameters.
+    """Schedule of the rows that are sent unsolicited: by the definition, by telecommand and by two parameters.
 
-    The parameters `unsolicited_selection` and `unsolicited_rate` select a row of their own.
+    The parameters `unsolicited_selection` and `unsolicited_rate` select a row of their own. The rows that the
+    definition sends at a rate, or after events, are sent whatever the telecommands and parameters select.
     """
 
     def __init__(
@@ -47,7 +49,13 @@ class Subscriptions:
         self._send = signals.row_due.emit
         self._lists: dict[str, Sequence[Subscription]] = {}
         self._events: dict[tuple[str, int], Event] = {}
+        self._valid = False
+        """Whether there is a valid attitude."""
+        sent = [(row, row.unsolicited) for row in icd.telemetry.values() if row.unsolicited is not None]
+        self._streamed = [Subscription(row, rate) for row, rate in sent if isinstance(rate, float)]
+        self._reports = [(row, frozenset(events)) for row, events in sent if not isinstance(events, float)]
         signals.frame_published.connect(self._frame_published)
+        signals.mode_changed.connect(self._mode_changed)
         signals.parameters_changed.connect(self._parameters_changed)
         signals.started.connect(self._restart)
 
@@ -58,7 +66,29 @@ class Subscriptions:
     def _restart(self, _cause: str) -> None:
         for origin in list(self._lists):
             self.replace(origin, ())
+        self._valid = False
+        self.replace("definition", self._streamed)
         self._subscribe_by_parameters()
+        self._report("start")
+
+    def _report(self, event: str) -> None:
+        """Send the rows that report an event."""
+        for row, events in self._reports:
+            if event in events:
+                self._send(row)
+
+    def _mode_changed(self, change: Transition) -> None:
+        if change.before is not change.after:
+            self._report("mode")
+        if change.after is Mode.ERROR:
+            self._report("error")
+        if not change.after.makes_frames:
+            self._set_valid(valid=False)
+
+    def _set_valid(self, *, valid: bool) -> None:
+        changed, self._valid = valid is not self._valid, valid
+        if changed:
+            self._report("validity")
 
     def _subscribe_by_parameters(self) -> None:
         rate_hz = float(self._parameters["unsolicited_rate"])
@@ -74,8 +104,10 @@ class Subscriptions:
             if subscription.rate_hz is not None:
                 self._schedule((origin, number), subscription.row, subscription.rate_hz, self._now_ns())
 
-    def _frame_published(self, _measurement: Measurement) -> None:
+    def _frame_published(self, measurement: Measurement) -> None:
         """Send the rows that are due with each frame."""
+        self._report("frame")
+        self._set_valid(valid=measurement.valid)
         for subscriptions in list(self._lists.values()):
             for subscription in subscriptions:
                 if subscription.rate_hz is None:

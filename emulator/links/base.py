@@ -84,6 +84,9 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
         self._held_input: deque[Request | LinkFault] = deque()
         """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
         self._pending: PendingAnswer[list[Reply]] | None = None
+        self._executing = False
+        self._caused: list[Reply] = []
+        """Unsolicited messages that the request being executed has caused; they follow its replies."""
         self._device.signals.unsolicited.connect(self._send_unsolicited)
         self._device.signals.restarted.connect(self._reset_receiver)
 
@@ -101,7 +104,10 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
 
     def _send_unsolicited(self, reply: Reply) -> None:
         """Send unsolicited telemetry."""
-        self._send(reply, self._reply_style())
+        if self._executing:
+            self._caused.append(reply)
+        else:
+            self._send(reply, self._reply_style())
 
     def _receive(self, item: Item) -> None:
         self._held_input.extend(self._receiver.feed(item, self._now()))
@@ -117,13 +123,20 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
             self._requests.count_fault(event)
             return
         style = self._reply_style()  # a change of format is answered in the old format
-        answer = self._requests.handle(event)
+        self._executing = True
+        try:
+            answer = self._requests.handle(event)
+        finally:
+            self._executing = False
         if isinstance(answer, PendingAnswer):
             self._pending = answer
             answer.when_done(partial(self._answer_later, answer, style))
-            return
-        for reply in answer:
-            self._answer(reply, style)
+        else:
+            for reply in answer:
+                self._answer(reply, style)
+        caused, self._caused = self._caused, []
+        for reply in caused:
+            self._send_unsolicited(reply)
 
     def _answer_later(self, answer: PendingAnswer[list[Reply]], style: Style, replies: list[Reply]) -> None:
         for reply in replies:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
@@ -47,7 +48,13 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
         self._baud = self._wanted_baud()
+        self._numbered = 0
+        """Messages that the device has numbered since its start."""
+        self._device.signals.started.connect(self._restart_numbers)
         self._device.signals.parameters_changed.connect(self._parameters_changed)
+
+    def _restart_numbers(self, _cause: str) -> None:
+        self._numbered = 0
 
     def _wanted_baud(self) -> int:
         return int(self._device.parameters["serial_baud"])
@@ -75,8 +82,12 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         return self.dialect
 
     def _send(self, reply: Reply, style: Dialect | None) -> None:
+        numbered = self._stack.counts(reply.kind)
+        if numbered:
+            reply = replace(reply, sequence=self._numbered)
         data = self._stack.encode_reply(reply, style)
         if data:  # the unit may have no such reply
+            self._numbered += numbered
             self.wire.send(data)
 
     def _send_unsolicited(self, reply: Reply) -> None:

@@ -75,8 +75,18 @@ class AttitudeRow:
         return str(seen[self.names["attitude.valid"]]).lower() in ("true", "1")
 
     def becomes_valid(self, access: RowAccess) -> None:
-        """Have the unit identify stars, and check the first attitude that is valid."""
+        """Have the unit identify stars, and check the first attitude that is valid; before, in standby, none is."""
+        rest, search = mode_command(access, STANDBY), mode_command(access, SEARCHING)
         with identifying_stars(access):
+            if rest is not None and search is not None:
+                rest()
+                seen = access.values(self.row)
+                check(
+                    not self.is_valid(seen),
+                    "no valid attitude in standby (R11, docs/rules.md)",
+                    "a valid one",
+                )
+                search()
             end = access.now() + ATTITUDE_S
             while not self.is_valid(seen := access.values(self.row)):
                 if access.now() > end:

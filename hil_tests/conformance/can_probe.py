@@ -89,10 +89,10 @@ class CanProbe(LinkProbe):
         self.sleep(quiet_s)
         return self.next_answer(0.0) if self._frames else Answer("none")
 
-    def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that arrive within a time."""
+    def _clear_unsolicited(self) -> None:
         self.unsolicited.clear()
-        self.sleep(seconds)
+
+    def _unsolicited_answers(self) -> list[Answer]:
         return can.unsolicited(list(self.unsolicited))
 
     def next_frame(self, timeout_s: float | None = None) -> CanFrame | None:

@@ -6,7 +6,7 @@ The judge (`starhil.hil_tests.judge`) encodes and decodes; a probe adds the port
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Protocol
@@ -106,6 +106,8 @@ class LinkProbe(ABC):
     link: str
     """`serial` or `can`."""
     has_unsolicited = True
+    numbers = 0
+    """How many numbers the header has for messages; 0 if it has none."""
     has_codes = True
     """Whether a refusal carries a code."""
 
@@ -158,9 +160,27 @@ class LinkProbe(ABC):
     def unexpected_answer(self, quiet_s: float) -> Answer:
         """Return an unexpected answer within a time."""
 
+    def receive_unsolicited(self, seconds: float, after: Callable[[], None] | None = None) -> list[Answer]:
+        """Return the messages of unsolicited telemetry that arrive within a time, counted from the end of an action."""
+        self._clear_unsolicited()
+        if after is not None:
+            after()
+        self.sleep(seconds)
+        return self._unsolicited_answers()
+
     @abstractmethod
-    def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that arrive within a time."""
+    def _clear_unsolicited(self) -> None:
+        """Discard the messages of unsolicited telemetry."""
+
+    @abstractmethod
+    def _unsolicited_answers(self) -> list[Answer]:
+        """Return the messages of unsolicited telemetry since they were discarded."""
+
+    def check_numbers(self, answers: Sequence[Answer]) -> None:
+        """Fail the case unless the numbers that the unit has given successive messages are successive."""
+        seen = [answer.number for answer in answers if answer.number is not None]
+        if seen:
+            check_equal(seen, [(seen[0] + step) % self.numbers for step in range(len(seen))], "the numbers")
 
     @abstractmethod
     def _receive(self, timeout_s: float) -> bool:

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Final
 
-from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, changes_mode, identifying_stars
-from starhil.hil_tests.conformance.case import Case, case_in, check, check_equal, rule
+from starhil.hil_tests.conformance.attitude_cases import (
+    SEARCHING,
+    STANDBY,
+    AttitudeRow,
+    changes_mode,
+    identifying_stars,
+    mode_command,
+)
+from starhil.hil_tests.conformance.case import Case, CaseSkipped, case_in, check, check_equal, rule
 from starhil.hil_tests.conformance.link_probe import (
     INVALID_ID,
     INVALID_LENGTH,
@@ -16,10 +24,16 @@ from starhil.hil_tests.conformance.link_probe import (
     checked_values,
 )
 from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.rows import Field, Row
 
 FLOOD: Final = 200
 SUBSCRIBED_S: Final = 3.0
+STREAMED: Final = 6
+"""Number of messages from which a rate is computed, at least."""
+RATE_TOLERANCE: Final = 0.2
+CAUSED: Final = frozenset({"frame", "mode", "validity"})
+"""Events that a telecommand of the mode causes."""
 SETTLING_S: Final = 1.0
 """Time after which a unit that identifies stars has an attitude."""
 RESTING: Final = 5
@@ -52,6 +66,7 @@ def row_cases(
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
+    yield from _unsolicited(unit)
     yield from _subscriptions(unit)
     yield case_in(
         "recovery", "flood", "a flood of requests is answered completely and in order", _flood, rule(10)
@@ -243,14 +258,76 @@ def _read_back(command: Row, row: Row, marks: bytes) -> Run:
     return run
 
 
-# --- subscriptions and floods ---
+# --- unsolicited telemetry, subscriptions and floods ---
+
+
+def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
+    """Yield a case for each row that the unit sends without a request, if a request can cause its event."""
+    for row in unit.telemetry.values():
+        if isinstance(row.unsolicited, float):
+            title = f"{row.name} is sent {row.unsolicited:g} times a second without a request"
+            yield case_in("unsolicited", row.name, title, _streamed(row, row.unsolicited), row)
+        elif row.unsolicited is not None and not CAUSED.isdisjoint(row.unsolicited):
+            title = f"{row.name} is sent without a request after {' or '.join(row.unsolicited)}"
+            yield case_in("unsolicited", row.name, title, _reported(row), row, intrusive=True)
+
+
+def _of_row(row: Row, answers: list[Answer]) -> list[Answer]:
+    """Return the messages of a row, whose values must be within their limits."""
+    found = [answer for answer in answers if (answer.row_id, answer.klass) == (row.id, row.klass)]
+    for answer in found:
+        check_equal(len(answer.data), row.size, f"bytes of {row.name}")
+        checked_values(row, answer.data)
+    return found
+
+
+def _streamed(row: Row, rate_hz: float) -> Run:
+    def run(probe: LinkProbe) -> None:
+        _check_carried(probe)
+        seconds = max(SUBSCRIBED_S, STREAMED / rate_hz)
+        answers = probe.receive_unsolicited(seconds)
+        probe.check_numbers(answers)
+        wanted, seen = rate_hz * seconds, len(_of_row(row, answers))
+        check(abs(seen - wanted) <= 1 + RATE_TOLERANCE * wanted, f"about {wanted:.0f} messages", seen)
+
+    return run
+
+
+def _reported(row: Row) -> Run:
+    def run(probe: LinkProbe) -> None:
+        _check_carried(probe)
+        rest, search = mode_command(probe, STANDBY), mode_command(probe, SEARCHING)
+        if rest is None or search is None:
+            raise CaseSkipped("no telecommand starts and ends the identification of stars")
+        with identifying_stars(probe):
+            rest()
+            probe.sleep(SETTLING_S)
+            answers = probe.receive_unsolicited(SUBSCRIBED_S, search)
+        probe.check_numbers(answers)
+        found = _of_row(row, answers)
+        check(bool(found), f"{row.name} within {SUBSCRIBED_S:g} s of a telecommand for {SEARCHING}", "none")
+        modes = [name for name, item in row.named.items() if item.value == "mode"]
+        if row.unsolicited == ["mode"] and modes and SEARCHING not in row.named[modes[0]].shared:
+            seen = [row.decode(answer.data)[modes[0]] for answer in found]
+            check_equal(seen[0], SEARCHING, "mode in the first message")
+            changes = all(one != other for one, other in pairwise(seen))
+            check(changes, "another mode in each message", seen)
+
+    return run
+
+
+def _check_carried(probe: LinkProbe) -> None:
+    if not probe.has_unsolicited:
+        raise CaseSkipped("the line has no unsolicited telemetry")
 
 
 def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         fields = [name for name, item in row.named.items() if (item.argument or "").startswith("telemetry[")]
         klass = str(row.arguments.get("class", ""))
-        offered = [item for item in unit.telemetry.values() if klass in ("", item.klass)][:2]
+        offered = [
+            item for item in unit.telemetry.values() if klass in ("", item.klass) and item.unsolicited is None
+        ][:2]
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
             yield case_in(
@@ -261,10 +338,17 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
 def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
     none = dict.fromkeys(fields, 0)
 
+    def of_list(probe: LinkProbe, seconds: float) -> list[Answer]:
+        """Return the messages that the list has caused, not those that the unit always sends."""
+        seen = probe.receive_unsolicited(seconds)
+        probe.check_numbers(seen)
+        always = {(row.id, row.klass) for row in probe.unit.telemetry.values() if row.unsolicited is not None}
+        return [answer for answer in seen if (answer.row_id, answer.klass) not in always]
+
     def run(probe: LinkProbe) -> None:
         chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
         probe.send_command(command, command.encode(chosen))
-        seen = probe.receive_unsolicited(SUBSCRIBED_S)
+        seen = of_list(probe, SUBSCRIBED_S)
         probe.send_command(command, command.encode(none))
         probe.sleep(0.5)
         wanted = {(row.id, row.size) for row in offered[: len(fields)]}
@@ -275,7 +359,7 @@ def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
         )
         for answer in seen:
             checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
-        check_equal(len(probe.receive_unsolicited(2.0)), 0, "messages after the end of the subscription")
+        check_equal(len(of_list(probe, 2.0)), 0, "messages after the end of the subscription")
 
     return run
 

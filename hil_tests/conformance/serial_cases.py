@@ -296,6 +296,14 @@ def _header(unit: Unit, envelope: Headed) -> Iterator[Case[SerialProbe]]:
             yield _silent_header(envelope, "class", item, values, "a class that the unit does not have")
         elif item.role is None and item.const is not None:
             yield _silent_header(envelope, "constant", item, [item.const ^ 1], "another constant")
+    if "reply" in envelope.replies.counted():
+        yield case_in("header", "numbers", "replies are numbered in the order of sending", _numbers, CLAUSE)
+
+
+def _numbers(probe: SerialProbe) -> None:
+    for _ in range(5):
+        probe.expect_alive()
+    probe.check_numbers(probe.numbered)
 
 
 def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], what: str) -> Case[SerialProbe]:

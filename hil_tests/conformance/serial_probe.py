@@ -18,6 +18,8 @@ DEFAULT_BAUD: Final = 115200
 BITS_A_BYTE: Final = 10
 PAUSE: Final = 1.6
 """Silence after which a message has certainly timed out, as a multiple of the time-out."""
+GAP_S: Final = 0.05
+"""Silence after which a message that has begun has no more bytes."""
 SHOWN_BYTES: Final = 48
 """Number of bytes shown in a line of the log."""
 
@@ -30,7 +32,9 @@ class SerialProbe(LinkProbe):
     Attributes
     ----------
     raw, sent
-        All bytes received since the last drain, and those sent last.
+        All bytes received since the last drain, without unsolicited telemetry, and those sent last.
+    numbered
+        Messages since the last drain to which the unit has given a number.
     """
 
     link = "serial"
@@ -51,11 +55,13 @@ class SerialProbe(LinkProbe):
         self.baud = baud
         self.has_unsolicited = self.line.envelope.has_unsolicited
         self.has_codes = self.line.envelope.has_codes
+        self.numbers = self.line.envelope.numbers
         self.raw = b""
         self.sent = b""
         self._line_free = 0.0
         self._answers: deque[Answer] = deque()
         self._unsolicited: list[Answer] = []
+        self.numbered: list[Answer] = []
 
     # --- the line ---
 
@@ -82,16 +88,30 @@ class SerialProbe(LinkProbe):
         self._note("<-", data)
         self.raw += data
         for answer in self.line.feed(data):
-            (self._unsolicited if answer.kind == "unsolicited" else self._answers).append(answer)
+            if answer.number is not None:
+                self.numbered.append(answer)
+            if answer.kind == "unsolicited":
+                self._unsolicited.append(answer)
+                self.raw = self.raw.replace(self.line.telemetry_frame(answer.body), b"", 1)
+            else:
+                self._answers.append(answer)
         return True
+
+    def _complete(self) -> None:
+        """Wait for the rest of a message that has begun, such as unsolicited telemetry."""
+        while self.line.received and self._receive(GAP_S):
+            pass
 
     def drain(self) -> None:
         """Discard everything received and expected."""
-        super().drain()
+        while self._receive(0.0):
+            pass
+        self._complete()
         self.raw = b""
         self.line.clear()
         self._answers.clear()
         self._unsolicited.clear()
+        self.numbered.clear()
 
     def sleep_past_timeout(self) -> None:
         """Wait until what was sent has passed the line, and an incomplete message has timed out."""
@@ -136,6 +156,7 @@ class SerialProbe(LinkProbe):
         end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
         while not self._answers and (left := end - self.now()) > 0:
             self._receive(left)
+        self._complete()
         return self._answers.popleft() if self._answers else self._rest()
 
     def _rest(self) -> Answer:
@@ -147,12 +168,14 @@ class SerialProbe(LinkProbe):
     def unexpected_answer(self, quiet_s: float) -> Answer:
         """Return an unexpected answer."""
         self.sleep(quiet_s)
+        self._complete()
         if self._answers:
             return self._answers.popleft()
         return self._rest() if self.line.received else Answer("none")
 
-    def receive_unsolicited(self, seconds: float) -> list[Answer]:
-        """Return the messages of unsolicited telemetry that arrive within a time."""
+    def _clear_unsolicited(self) -> None:
         self._unsolicited.clear()
-        self.sleep(seconds)
+
+    def _unsolicited_answers(self) -> list[Answer]:
+        self._complete()
         return list(self._unsolicited)

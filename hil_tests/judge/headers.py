@@ -5,7 +5,8 @@
 
 Source: docs/units.md, which defines the roles; the headers of Sagitta (c2a-aobc sagitta.c), NSP (cosmos-core
 sinclair_lib.cpp) and NOS3 are such lists. Bits are listed from the lowest. A `length` counts the parts that its
-`includes` names. A constant, an address and a length in an answer must be exactly what the definition says.
+`includes` names, plus its `offset`. A `sequence` repeats that of the request, or numbers the messages that its
+`counts` names, from 0 on and modulo its range. A constant, an address and a length in an answer must be exactly what the definition says.
 """
 
 from __future__ import annotations
@@ -50,6 +51,10 @@ class Header:
         """Return the roles in messages of a class, or of any."""
         models = self._models if klass is None else self._in(klass)
         return {part.role for model in models for part in (model, *model.bits) if part.role is not None}
+
+    def counted(self) -> set[str]:
+        """Return the kinds of messages that the sender numbers itself: `reply`, `unsolicited`."""
+        return {kind for model in self._models for part in (model, *model.bits) for kind in part.counts}
 
     def width(self, role: str) -> int:
         """Return the bits that hold a role; 0 if the header does not have it."""
@@ -124,7 +129,7 @@ class Header:
 
     def _counted(self, model: Any, header: int, data: int) -> int:
         sizes = {**self._sizes, "header": header, "data": data}
-        return sum(sizes[part] for part in model.includes)
+        return sum(sizes[part] for part in model.includes) + int(model.offset)
 
     def seconds(self, role: str, count: int) -> float:
         """Return a number of counts of `ticks` or `time` in seconds."""

@@ -63,6 +63,8 @@ class Answer:
         Time of the unit's clock in the header, s.
     body
         Header, data and check, without framing (serial).
+    number
+        Number that the unit gives its messages; None if it does not number such a message.
     """
 
     kind: AnswerKind
@@ -74,6 +76,7 @@ class Answer:
     final: bool = True
     time_s: float = 0.0
     body: bytes = b""
+    number: int | None = None
 
     def __str__(self) -> str:
         where = "" if self.row_id is None else f" of {self.klass} {self.row_id}".replace("  ", " ")

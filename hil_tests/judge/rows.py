@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import random
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Literal
@@ -238,6 +238,8 @@ class Row:
         Action that a telecommand performs, and its fixed arguments.
     answers
         Answers in order: `echo`, `reply`.
+    unsolicited
+        Rate in Hz at which it is sent without a request, or events after which it is sent; None if it is not.
     """
 
     kind: RowKind
@@ -250,6 +252,7 @@ class Row:
     action: str | None = None
     arguments: Mapping[str, Value] = field(default_factory=dict)
     answers: tuple[str, ...] = ("reply",)
+    unsolicited: float | Sequence[str] | None = None
 
     def __repr__(self) -> str:
         return f"Row({self.kind} {self.id} {self.name})"
@@ -311,6 +314,12 @@ class Row:
         def placed(piece: bytes) -> bytes:
             return good[: item.offset] + piece + good[item.offset + item.size :]
 
+        def with_raw(raw: int) -> bytes:
+            if item.width:
+                whole = int.from_bytes(good[item.offset : item.offset + item.size], item.order)
+                raw = whole & ~((1 << item.width) - 1 << item.shift) | raw << item.shift
+            return placed(item.bytes_of_raw(raw))
+
         if item.kind == "float":
             low, high = item.limits
             step = 0.1 * max(abs(low), abs(high), 1.0)
@@ -323,9 +332,9 @@ class Row:
         elif item.kind == "enum" and not item.width:
             known = set((item.enum or {}).values())
             yield "unknown", placed(item.bytes_of_raw(next(n for n in range(255, -1, -1) if n not in known)))
-        elif item.kind == "integer":
+        elif item.kind in ("integer", "bits"):
             (low_raw, high_raw), (least, greatest) = item.raw_limits, item.type_limits
             if low_raw > least:
-                yield "low", placed(item.bytes_of_raw(low_raw - 1))
+                yield "low", with_raw(low_raw - 1)
             if high_raw < greatest:
-                yield "high", placed(item.bytes_of_raw(high_raw + 1))
+                yield "high", with_raw(high_raw + 1)

@@ -60,7 +60,9 @@ class Envelope(Protocol):
         """Return whether answers of a class can express a refusal."""
 
     sequence_bits: int
-    """Bits of the number that an answer repeats; 0 if there is none."""
+    """Bits of the number of a request; 0 if there is none."""
+    numbers: int
+    """How many numbers an answer may have."""
     has_codes: bool
     """Whether a refusal carries a code."""
     has_unsolicited: bool
@@ -202,6 +204,8 @@ class Headed:
         self._codes = dict(requests)
         self.has_codes = "status" in self.replies.roles()
         self.sequence_bits = self.requests.width("sequence")
+        self.numbers = 1 << self.replies.width("sequence")
+        self._numbered = self.replies.counted()
 
     def body(self, request: Request) -> bytes:
         """Return header, data and check of a request."""
@@ -251,9 +255,11 @@ class Headed:
             return Answer("malformed", data=taken.body)
         values = opened.values
         asynchronous = values.get("class") in self._unsolicited
+        numbered = ("unsolicited" if asynchronous else "reply") in self._numbered
         if (
             asked is not None
             and not asynchronous
+            and not numbered
             and values.get("sequence", asked.sequence) != asked.sequence
         ):
             return Answer("malformed", data=taken.body)
@@ -268,7 +274,8 @@ class Headed:
         time_s = self.replies.seconds("time", values["time"]) if "time" in values else 0.0
         final = bool(values.get("final", 1))
         code = values.get("status", 0)
-        return Answer(kind, code, data, request.id, klass, 0, final, time_s, taken.body)
+        number = values["sequence"] if numbered else None
+        return Answer(kind, code, data, request.id, klass, 0, final, time_s, taken.body, number)
 
     def can_refuse(self, klass: str) -> bool:
         """Return whether the header of a class has a status or an acknowledge bit."""
@@ -284,6 +291,7 @@ class Dialect:
 
     has_codes = True
     sequence_bits = 0
+    numbers = 0
 
     def __init__(self, unit: Unit, dialect: str) -> None:
         self._unit, self._dialect = unit, dialect

@@ -8,7 +8,7 @@ tests/protocol/canopen/test_conformance_of_library_node.py and test_conformance_
 """
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Application, GreyImage, StandInApplication, check_status
+from starhil.protocol.canopen.application import Application, GreyImage, check_status
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, NmtState, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -34,7 +34,6 @@ __all__ = [
     "ParameterStorage",
     "SdoAbortError",
     "SlaveEvent",
-    "StandInApplication",
     "StorageError",
     "build_dictionary",
     "build_eds",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
@@ -48,9 +49,19 @@ def check_can_id(cob_id: int) -> None:
         raise SdoAbortError(AbortCode.VALUE_RANGE, f"CAN ID 0x{can_id:03X} is restricted")
 
 
-def check_replacement(old: int, new: int, *, enabled_before: bool, enabled_after: bool) -> None:
-    """Reject a change of the CAN ID of a communication object that stays enabled."""
-    if enabled_before and enabled_after and (old ^ new) & (ID_MASK | EXTENDED):
+def check_change(old: int, new: int, *, enabled: Callable[[int], bool], always: bool = False) -> None:
+    """Reject a change of the CAN ID of a communication object that stays enabled, and an ID that it may not have.
+
+    The ID of an object that is not enabled is free, unless it is checked `always`.
+    """
+    if always or enabled(new):
+        check_can_id(new)
+    if enabled(old) and enabled(new) and (old ^ new) & (ID_MASK | EXTENDED):
         raise SdoAbortError(
             AbortCode.VALUE_RANGE, "disable the communication object before changing its CAN ID"
         )
+
+
+def exists(cob_id: int) -> bool:
+    """Return whether a PDO or EMCY with this COB-ID exists."""
+    return not cob_id & INVALID

@@ -2,27 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, Final
 
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
-from starhil.protocol.canopen.cob import BIT_30, EMERGENCY, INVALID, SDO_RECEIVE, SDO_TRANSMIT, SYNC, TIME
+from starhil.protocol.canopen.cob import BIT_30, INVALID
 from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING
 from starhil.protocol.canopen_schema import CanopenModel, PdoModel
 
 U8: Final = datatypes.UNSIGNED8
 U16: Final = datatypes.UNSIGNED16
 U32: Final = datatypes.UNSIGNED32
-TEXT: Final = datatypes.VISIBLE_STRING
-DOMAIN: Final = datatypes.DOMAIN
-
-VERSION: Final = "1"
-"""Hardware and software version of the node."""
-SERIAL_NUMBER: Final = 1
-HISTORY_LENGTH: Final = 8
-CONSUMERS: Final = 4
-HEARTBEAT_MS: Final = 1000
+DATA_TYPES: Final[dict[str, int]] = {
+    "u8": datatypes.UNSIGNED8,
+    "i8": datatypes.INTEGER8,
+    "u16": datatypes.UNSIGNED16,
+    "i16": datatypes.INTEGER16,
+    "u24": datatypes.UNSIGNED24,
+    "i24": datatypes.INTEGER24,
+    "u32": datatypes.UNSIGNED32,
+    "i32": datatypes.INTEGER32,
+    "u48": datatypes.UNSIGNED48,
+    "u64": datatypes.UNSIGNED64,
+    "i64": datatypes.INTEGER64,
+    "f32": datatypes.REAL32,
+    "f64": datatypes.REAL64,
+    "bool": datatypes.UNSIGNED8,
+    "enum8": datatypes.UNSIGNED8,
+    "bytes": datatypes.OCTET_STRING,
+    "text": datatypes.VISIBLE_STRING,
+    "domain": datatypes.DOMAIN,
+}
+"""Type in the interface definition → CANopen data type; bool is a byte, as BOOLEAN takes one bit in PDOs."""
 RPDO_CAN_IDS: Final = (0x200, 0x300, 0x400, 0x500)
 TPDO_CAN_IDS: Final = (0x180, 0x280, 0x380, 0x480)
 
@@ -103,90 +118,43 @@ def add_communication(
     information.product_name = layout.device_name
     information.product_number = layout.product_code
     information.revision_number = layout.revision
-    information.order_code = ""
-    information.simple_boot_up_master = False
-    information.simple_boot_up_slave = True
-    information.granularity = 8
-    information.dynamic_channels_supported = False
-    information.group_messaging = False
     information.nr_of_RXPDO = len(rpdos)  # type: ignore[assignment]
     information.nr_of_TXPDO = len(tpdos)  # type: ignore[assignment]
-    information.LSS_supported = True
     information.allowed_baudrates = set(layout.bit_rates)
-    _add_general(od, layout)
-    _add_messages(od)
-    _add_services(od, layout)
+    for item in _profile()["variables"]:
+        od.add_object(next(_members(layout, item)))
+    for item in _profile()["records"]:
+        count = (item["count"], 0) if "count" in item else None
+        add_record(
+            od, item["name"], list(_members(layout, item)), array=item.get("array", False), count=count
+        )
     for kind, pdos in (("RPDO", rpdos), ("TPDO", tpdos)):
         for number, (model, mapping) in enumerate(pdos):
             _add_pdo(od, kind, number, model, mapping)
 
 
-def _add_general(od: ObjectDictionary, layout: CanopenModel) -> None:
-    for item in (
-        variable("Device type", 0x1000, 0, U32, "ro", layout.device_type),
-        variable("Error register", 0x1001, 0, U8, "ro", 0, mappable=True),
-        variable("Manufacturer device name", 0x1008, 0, TEXT, "const", layout.device_name),
-        variable("Manufacturer hardware version", 0x1009, 0, TEXT, "const", VERSION),
-        variable("Manufacturer software version", 0x100A, 0, TEXT, "const", VERSION),
-    ):
-        od.add_object(item)
-    errors = [
-        variable(f"Standard error field {number}", 0x1003, number, U32, "ro", 0)
-        for number in range(1, HISTORY_LENGTH + 1)
-    ]
-    add_record(od, "Pre-defined error field", errors, array=True, count=("Number of errors", 0))
-    for index, name, verb in (
-        (0x1010, "Store parameters", "Store"),
-        (0x1011, "Restore default parameters", "Restore"),
-    ):
-        groups = [
-            variable(f"{verb} {group} parameters", index, subindex, U32, "rw", 1)
-            for subindex, group in enumerate(("all", "communication", "application"), 1)
-        ]
-        add_record(od, name, groups, array=True)
+@cache
+def _profile() -> dict[str, Any]:
+    return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
-def _add_messages(od: ObjectDictionary) -> None:
-    for item in (
-        variable("COB-ID SYNC message", 0x1005, 0, U32, "rw", SYNC),
-        variable("Communication cycle period", 0x1006, 0, U32, "rw", 0),
-        variable("Guard time", 0x100C, 0, U16, "rw", 0),
-        variable("Life time factor", 0x100D, 0, U8, "rw", 0),
-        variable("COB-ID time stamp message", 0x1012, 0, U32, "rw", INVALID | TIME),
-        variable("High resolution time stamp", 0x1013, 0, U32, "rw", mappable=True),
-        variable("COB-ID emergency message", 0x1014, 0, U32, "rw", EMERGENCY, relative=True),
-        variable("Inhibit time emergency", 0x1015, 0, U16, "rw", 0),
-        variable("Producer heartbeat time", 0x1017, 0, U16, "rw", HEARTBEAT_MS),
-        variable("Synchronous counter overflow value", 0x1019, 0, U8, "rw", 0),
-    ):
-        od.add_object(item)
-    consumers = [
-        variable(f"Consumer heartbeat time {number}", 0x1016, number, U32, "rw", 0)
-        for number in range(1, CONSUMERS + 1)
-    ]
-    add_record(od, "Consumer heartbeat time", consumers, array=True)
-    behaviour = variable("Communication error", 0x1029, 1, U8, "rw", 0, limits=(0, 2))
-    add_record(od, "Error behaviour", [behaviour], array=True)
-
-
-def _add_services(od: ObjectDictionary, layout: CanopenModel) -> None:
-    numbers = (layout.vendor_id, layout.product_code, layout.revision, SERIAL_NUMBER)
-    names = ("Vendor-ID", "Product code", "Revision number", "Serial number")
-    members = [
-        variable(name, 0x1018, subindex, U32, "ro", number)
-        for subindex, (name, number) in enumerate(zip(names, numbers, strict=True), 1)
-    ]
-    add_record(od, "Identity object", members)
-    od.add_object(variable("Store EDS", 0x1021, 0, DOMAIN, "ro"))
-    od.add_object(variable("Store format", 0x1022, 0, U8, "ro", 0))
-    add_record(
-        od,
-        "SDO server parameter",
-        [
-            variable("COB-ID client to server (receive)", 0x1200, 1, U32, "ro", SDO_RECEIVE, relative=True),
-            variable("COB-ID server to client (transmit)", 0x1200, 2, U32, "ro", SDO_TRANSMIT, relative=True),
-        ],
-    )
+def _members(layout: CanopenModel, record: Mapping[str, Any]) -> Iterator[ODVariable]:
+    """Yield the variables of a record of the profile, or the variable that stands alone."""
+    first = 1 if "members" in record else 0
+    for item in record.get("members", [record]):
+        for subindex in range(first, first + item.get("repeat", 1)):
+            yield variable(
+                item["name"].format(subindex),
+                record["index"],
+                subindex,
+                DATA_TYPES[item["type"]],
+                item["access"],
+                getattr(layout, item["from"]) if "from" in item else item.get("default"),
+                relative=item.get("relative", False),
+                mappable=item.get("mappable", False),
+                limits=item.get("limits"),
+            )
+        first = subindex + 1
 
 
 def _add_pdo(od: ObjectDictionary, kind: str, number: int, model: PdoModel, mapping: Sequence[int]) -> None:

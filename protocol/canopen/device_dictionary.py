@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NoReturn
+from typing import NoReturn, cast
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.application import Application, StandInApplication, abort_of
+from starhil.protocol.canopen.application import Application, abort_of
 from starhil.protocol.canopen.communication import (
+    DATA_TYPES,
     MappedPdo,
     add_communication,
     add_record,
@@ -27,26 +28,6 @@ from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel,
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, to_f32
-
-DATA_TYPES: Final[dict[str, int]] = {
-    "u8": datatypes.UNSIGNED8,
-    "i8": datatypes.INTEGER8,
-    "u16": datatypes.UNSIGNED16,
-    "i16": datatypes.INTEGER16,
-    "u24": datatypes.UNSIGNED24,
-    "i24": datatypes.INTEGER24,
-    "u32": datatypes.UNSIGNED32,
-    "i32": datatypes.INTEGER32,
-    "u48": datatypes.UNSIGNED48,
-    "u64": datatypes.UNSIGNED64,
-    "i64": datatypes.INTEGER64,
-    "f32": datatypes.REAL32,
-    "f64": datatypes.REAL64,
-    "bool": datatypes.UNSIGNED8,
-    "enum8": datatypes.UNSIGNED8,
-    "bytes": datatypes.OCTET_STRING,
-}
-"""Type in the interface definition → CANopen data type; bool is a byte, as BOOLEAN takes one bit in PDOs."""
 
 Key = tuple[int, int]
 
@@ -268,7 +249,7 @@ class DeviceDictionary(Dictionary):
     layout
         Indices of its rows, fields and parameters.
     application
-        Device behind the dictionary; by default it is a stand-in.
+        Device behind the dictionary; none for one that is only described, so that nothing reads it.
 
     Attributes
     ----------
@@ -285,7 +266,7 @@ class DeviceDictionary(Dictionary):
     ) -> None:
         self.icd = icd
         self.layout = layout
-        self.application: Application = application or StandInApplication(icd)
+        self.application = cast("Application", application)
         self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
         self.parameters: dict[str, Key] = {}

@@ -5,14 +5,13 @@
 
 from __future__ import annotations
 
-import datetime as dt
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import Final
 
 from canopen.objectdictionary import ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.dictionary import Dictionary, encode
-from starhil.protocol.canopen.pdo_mapping import FIRST_DUMMY, LAST_DUMMY
 from starhil.protocol.quoting import Scope, eds_text
 
 MANDATORY: Final = (0x1000, 0x1001, 0x1018)
@@ -22,8 +21,7 @@ VARIABLE: Final = 0x7
 DOMAIN: Final = 0x2
 ARRAY: Final = 0x8
 RECORD: Final = 0x9
-EDS_DATE: Final = dt.date(2026, 1, 1)
-"""Date of the EDS: the same dictionary always yields the same text."""
+HEAD: Final = Path(__file__).with_name("head.eds")
 
 Section = list[tuple[str, str]]
 
@@ -34,23 +32,7 @@ def build_eds(dictionary: Dictionary) -> str:
     Raises IcdError for two objects, or two entries of an object, with the same name.
     """
     scope = Scope("EDS")
-    sections: list[tuple[str, Section, str]] = [
-        ("FileInfo", _file_info(dictionary), ""),
-        ("DeviceInfo", _device_info(dictionary), ""),
-        (
-            "DummyUsage",
-            [
-                (f"Dummy{index:04X}", str(int(FIRST_DUMMY <= index <= LAST_DUMMY)))
-                for index in range(1, LAST_DUMMY + 1)
-            ],
-            "",
-        ),
-        (
-            "Comments",
-            [("Lines", "1"), ("Line1", "Generated from the interface definition; do not edit.")],
-            "",
-        ),
-    ]
+    sections: list[tuple[str, Section, str]] = []
     indices = sorted(dictionary.od.indices)
     lists: dict[str, list[int]] = {"MandatoryObjects": [], "OptionalObjects": [], "ManufacturerObjects": []}
     for index in indices:
@@ -63,7 +45,23 @@ def build_eds(dictionary: Dictionary) -> str:
             item = dictionary.od.indices[index]
             scope.claim(eds_text(item.name), f"object {index:04X}h")
             sections.extend(_object(item))
-    return "\n".join(_text(sections)) + "\n"
+    return _head(dictionary) + "\n".join(_text(sections)) + "\n"
+
+
+def _head(dictionary: Dictionary) -> str:
+    """Return the sections about file and device, whose date is constant: a dictionary always yields the same text."""
+    information = dictionary.od.device_information
+    rates = {rate // 1000 for rate in information.allowed_baudrates}
+    return HEAD.read_text(encoding="ascii").format(
+        vendor=eds_text(information.vendor_name or ""),
+        vendor_number=information.vendor_number,
+        product=eds_text(information.product_name or ""),
+        product_number=information.product_number,
+        revision=information.revision_number,
+        rpdos=information.nr_of_RXPDO,
+        tpdos=information.nr_of_TXPDO,
+        **{f"baud_{rate}": int(rate in rates) for rate in BIT_RATES_KBIT},
+    )
 
 
 def _text(sections: Iterable[tuple[str, Section, str]]) -> Iterator[str]:
@@ -74,45 +72,6 @@ def _text(sections: Iterable[tuple[str, Section, str]]) -> Iterator[str]:
         for key, value in entries:
             yield f"{key}={eds_text(value)}"
         yield ""
-
-
-def _file_info(dictionary: Dictionary) -> Section:
-    day = EDS_DATE.strftime("%m-%d-%Y")
-    return [
-        ("FileName", "star-sensor.eds"),
-        ("FileVersion", "1"),
-        ("FileRevision", "0"),
-        ("EDSVersion", "4.0"),
-        ("Description", dictionary.od.device_information.product_name or ""),
-        ("CreationTime", "12:00AM"),
-        ("CreationDate", day),
-        ("CreatedBy", dictionary.od.device_information.vendor_name or ""),
-        ("ModificationTime", "12:00AM"),
-        ("ModificationDate", day),
-        ("ModifiedBy", dictionary.od.device_information.vendor_name or ""),
-    ]
-
-
-def _device_info(dictionary: Dictionary) -> Section:
-    information = dictionary.od.device_information
-    rates = {rate // 1000 for rate in information.allowed_baudrates}
-    return [
-        ("VendorName", information.vendor_name or ""),
-        ("VendorNumber", f"0x{information.vendor_number or 0:08X}"),
-        ("ProductName", information.product_name or ""),
-        ("ProductNumber", f"0x{information.product_number or 0:08X}"),
-        ("RevisionNumber", f"0x{information.revision_number or 0:08X}"),
-        ("OrderCode", information.order_code or ""),
-        *((f"BaudRate_{rate}", str(int(rate in rates))) for rate in BIT_RATES_KBIT),
-        ("SimpleBootUpMaster", str(int(information.simple_boot_up_master or 0))),
-        ("SimpleBootUpSlave", str(int(information.simple_boot_up_slave or 0))),
-        ("Granularity", str(int(information.granularity or 0))),
-        ("DynamicChannelsSupported", str(int(information.dynamic_channels_supported or 0))),
-        ("GroupMessaging", str(int(information.group_messaging or 0))),
-        ("NrOfRXPDO", str(int(information.nr_of_RXPDO or 0))),
-        ("NrOfTXPDO", str(int(information.nr_of_TXPDO or 0))),
-        ("LSS_Supported", str(int(information.LSS_supported or 0))),
-    ]
 
 
 def _object(item: ODVariable | ODRecord | ODArray) -> Iterator[tuple[str, Section, str]]:

@@ -10,7 +10,7 @@ from typing import Final
 import construct
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import ID_MASK, INVALID, check_can_id, check_replacement
+from starhil.protocol.canopen.cob import ID_MASK, check_change, exists
 from starhil.protocol.canopen.context import Context, EventKind
 
 ERROR_REGISTER: Final = (0x1001, 0)
@@ -122,6 +122,15 @@ class EmergencyProducer:
         self._enqueue(code, data)
         return True
 
+    def communication_error(
+        self, code: EmergencyCode, data: bytes = b"", *, key: bytes = b"", active: bool = True
+    ) -> None:
+        """Report an error of communication, or that it is cleared."""
+        if active:
+            self.raise_error(code, ErrorRegister.COMMUNICATION, data, key=key)
+        else:
+            self.clear_error(code, key=key)
+
     def clear_error(self, code: int, *, key: bytes = b"") -> bool:
         """Report a cleared error: code 0, and its code in the manufacturer-specific bytes."""
         if self._active.pop((code, key), None) is None:
@@ -139,7 +148,7 @@ class EmergencyProducer:
         """Send waiting messages, as state and inhibit time allow."""
         while self._queue and self._context.communicates and self._context.now >= self._free_at:
             message = self._queue.popleft()
-            if not self._cob_id.number() & INVALID:
+            if exists(self._cob_id.number()):
                 self._context.send(self._cob_id.number() & ID_MASK, message)
                 self._free_at = self._context.now + self._inhibit.number() * INHIBIT_UNIT_S
 
@@ -165,7 +174,4 @@ class EmergencyProducer:
         self._history.clear()
 
     def _check_cob_id(self, data: bytes) -> None:
-        old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_replacement(old, new, enabled_before=not old & INVALID, enabled_after=not new & INVALID)
-        if not new & INVALID:
-            check_can_id(new)
+        check_change(self._cob_id.number(), int.from_bytes(data, "little"), enabled=exists)

@@ -10,7 +10,7 @@ from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.cob import ERROR_CONTROL
 from starhil.protocol.canopen.context import Context, EventKind, NmtState
 from starhil.protocol.canopen.dictionary import Entry
-from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer
 
 GUARD_TIME: Final = (0x100C, 0)
 LIFE_FACTOR: Final = (0x100D, 0)
@@ -127,7 +127,7 @@ class ErrorControl:
             self._failed(GUARDING_KEY, b"")
 
     def _failed(self, key: bytes, data: bytes) -> None:
-        self._emergency.raise_error(EmergencyCode.HEARTBEAT, ErrorRegister.COMMUNICATION, data, key=key)
+        self._emergency.communication_error(EmergencyCode.HEARTBEAT, data, key=key)
         self._on_failure()
 
     def _schedule(self, period_ms: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, Protocol
 
@@ -67,9 +68,6 @@ class LssHost(Protocol):
     def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
         """Change the bit rate: silence for `delay_s` before and after."""
 
-    def store_lss(self, node_id: int, bit_rate: int) -> None:
-        """Save node ID and bit rate; raise `ProtocolError` if that fails."""
-
 
 class LssSlave:
     """Answers the LSS master.
@@ -80,6 +78,8 @@ class LssSlave:
         Shared by the node.
     host
         The node itself.
+    store
+        Saves node ID and bit rate; raises `ProtocolError` if that fails.
     bit_rate
         Current bit rate, bit/s.
     allowed_bit_rates
@@ -90,11 +90,13 @@ class LssSlave:
         self,
         context: Context,
         host: LssHost,
+        store: Callable[[int, int], None],
         bit_rate: int,
         allowed_bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
     ) -> None:
         self._context = context
         self._host = host
+        self._store = store
         self._allowed = allowed_bit_rates
         self.pending_node_id = context.node_id
         self.pending_bit_rate = bit_rate
@@ -218,12 +220,10 @@ class LssSlave:
         elif command == Command.ACTIVATE_BIT_TIMING:
             self._host.activate_bit_rate(self.pending_bit_rate, int.from_bytes(data[1:3], "little") * 1e-3)
         elif command == Command.STORE:
-            self._send(command, bytes([self._store()]))
-
-    def _store(self) -> int:
-        try:
-            self._host.store_lss(self.pending_node_id, self.pending_bit_rate)
-        except ProtocolError as error:
-            self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
-            return STORAGE_FAILED
-        return OK
+            result = OK
+            try:
+                self._store(self.pending_node_id, self.pending_bit_rate)
+            except ProtocolError as error:
+                self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+                result = STORAGE_FAILED
+            self._send(command, bytes([result]))

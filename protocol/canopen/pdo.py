@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.context import Context, EventKind, NmtState
 from starhil.protocol.canopen.dictionary import check_value
-from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer
 from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedObject, PdoRecords
 
 
@@ -16,9 +17,9 @@ class ReceivePdo:
 
     def __init__(self, context: Context, emergency: EmergencyProducer, number: int) -> None:
         self._context = context
-        self._emergency = emergency
         self.records = PdoRecords(context.dictionary, Direction.RECEIVE, number)
         self._key = bytes([number + 1])
+        self._error = partial(emergency.communication_error, key=self._key)
         self._objects: list[MappedObject] = []
         self._size = 0
         self._pending: bytes | None = None
@@ -39,22 +40,14 @@ class ReceivePdo:
 
     def receive(self, data: bytes) -> None:
         """Process a message; report a wrong length and drop a message that is too short."""
+        detail = bytes([*self._key, len(data)])
         if len(data) < self._size:
-            detail = bytes([*self._key, len(data)])
-            self._emergency.clear_error(EmergencyCode.PDO_LENGTH_HIGH, key=self._key)
-            self._emergency.raise_error(
-                EmergencyCode.PDO_LENGTH_LOW, ErrorRegister.COMMUNICATION, detail, key=self._key
-            )
+            self._error(EmergencyCode.PDO_LENGTH_HIGH, active=False)
+            self._error(EmergencyCode.PDO_LENGTH_LOW, detail)
             return
-        self._emergency.clear_error(EmergencyCode.PDO_LENGTH_LOW, key=self._key)
-        self._emergency.clear_error(EmergencyCode.RPDO_TIMEOUT, key=self._key)
-        if len(data) > self._size:
-            detail = bytes([*self._key, len(data)])
-            self._emergency.raise_error(
-                EmergencyCode.PDO_LENGTH_HIGH, ErrorRegister.COMMUNICATION, detail, key=self._key
-            )
-        else:
-            self._emergency.clear_error(EmergencyCode.PDO_LENGTH_HIGH, key=self._key)
+        self._error(EmergencyCode.PDO_LENGTH_LOW, active=False)
+        self._error(EmergencyCode.RPDO_TIMEOUT, active=False)
+        self._error(EmergencyCode.PDO_LENGTH_HIGH, detail, active=len(data) > self._size)
         self.next_deadline = self._context.now + self.records.event_s if self.records.event_s else None
         if self.records.transmission_type <= LAST_CYCLIC:
             self._pending = data
@@ -71,9 +64,7 @@ class ReceivePdo:
         """Report that the next message did not arrive in time."""
         if self.next_deadline is not None and self._context.now >= self.next_deadline:
             self.next_deadline = None
-            self._emergency.raise_error(
-                EmergencyCode.RPDO_TIMEOUT, ErrorRegister.COMMUNICATION, self._key, key=self._key
-            )
+            self._error(EmergencyCode.RPDO_TIMEOUT, self._key)
 
     def _apply(self, data: bytes) -> None:
         """Write all objects, or none if one value is outside its limits.
@@ -93,14 +84,9 @@ class ReceivePdo:
                 self._context.dictionary.write(index, subindex, value)
         except SdoAbortError as refusal:
             self._context.report(EventKind.REFUSED, self.records.number + 1, f"RPDO: {refusal}")
-            self._emergency.raise_error(
-                EmergencyCode.PROTOCOL,
-                ErrorRegister.COMMUNICATION,
-                self._key + refusal.code.to_bytes(4, "little"),
-                key=self._key,
-            )
+            self._error(EmergencyCode.PROTOCOL, self._key + refusal.code.to_bytes(4, "little"))
             return
-        self._emergency.clear_error(EmergencyCode.PROTOCOL, key=self._key)
+        self._error(EmergencyCode.PROTOCOL, active=False)
 
 
 class TransmitPdo:
@@ -209,27 +195,16 @@ class PdoService:
 
     def __init__(self, context: Context, emergency: EmergencyProducer) -> None:
         self._context = context
-        indices = {index for index, _ in context.dictionary.entries}
-        self.receiving = [
-            ReceivePdo(context, emergency, number)
-            for number in range(0x200)
-            if Direction.RECEIVE.communication + number in indices
-        ]
-        self.transmitting = [
-            TransmitPdo(context, number)
-            for number in range(0x200)
-            if Direction.TRANSMIT.communication + number in indices
-        ]
-        self._all: list[ReceivePdo | TransmitPdo] = [*self.receiving, *self.transmitting]
+        numbers = partial(Direction.numbers, indices=context.dictionary.od.indices)
+        self.receiving = [ReceivePdo(context, emergency, number) for number in numbers(Direction.RECEIVE)]
+        self.transmitting = [TransmitPdo(context, number) for number in numbers(Direction.TRANSMIT)]
+        self._all: list[ReceivePdo | TransmitPdo] = [*self.transmitting, *self.receiving]
 
-    def configure(self, *, everything: bool = False) -> bool:
-        """Configure the PDOs whose records have changed; return whether there were any."""
-        changed = False
+    def configure(self, *, everything: bool = False) -> None:
+        """Configure the PDOs whose records have changed, or all."""
         for pdo in self._all:
             if everything or pdo.records.changed:
                 pdo.configure()
-                changed = True
-        return changed
 
     @property
     def next_deadline(self) -> float | None:
@@ -244,10 +219,7 @@ class PdoService:
 
     def stop(self) -> None:
         """Leave OPERATIONAL: drop all pending messages."""
-        for receiving in self.receiving:
-            receiving.configure()
-        for transmitting in self.transmitting:
-            transmitting.configure()
+        self.configure(everything=True)
 
     def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
         """Trigger the TPDOs that map one of these objects."""
@@ -264,7 +236,5 @@ class PdoService:
 
     def tick(self) -> None:
         """Act on the timers."""
-        for transmitting in self.transmitting:
-            transmitting.tick()
-        for receiving in self.receiving:
-            receiving.tick()
+        for pdo in self._all:
+            pdo.tick()

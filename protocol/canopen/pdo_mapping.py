@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
 from enum import Enum
 from typing import Final
@@ -9,7 +10,7 @@ from typing import Final
 import construct
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import BIT_30, ID_MASK, INVALID, check_can_id, check_replacement
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_change, exists
 from starhil.protocol.canopen.dictionary import Dictionary, Entry, type_size
 
 LARGEST_MAPPING: Final = 8
@@ -45,6 +46,10 @@ class Direction(Enum):
     def mapping(self) -> int:
         """Index of the first mapping record."""
         return self.value[1]
+
+    def numbers(self, indices: Container[int]) -> list[int]:
+        """Return the PDOs of this direction that a dictionary with these indices has; the first is 0."""
+        return [number for number in range(0x200) if self.communication + number in indices]
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,7 @@ class PdoRecords:
     @property
     def valid(self) -> bool:
         """Whether the PDO is enabled."""
-        return not self._cob_id.number() & INVALID
+        return exists(self._cob_id.number())
 
     @property
     def can_id(self) -> int:
@@ -164,14 +169,12 @@ class PdoRecords:
         return [resolve(self._dictionary, slot.number(), self.direction) for slot in self._slots[:count]]
 
     def _write_cob_id(self, data: bytes) -> None:
-        old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_replacement(old, new, enabled_before=not old & INVALID, enabled_after=not new & INVALID)
+        new = int.from_bytes(data, "little")
         if self.direction is Direction.TRANSMIT and not new & BIT_30:
             raise SdoAbortError(
                 AbortCode.VALUE_RANGE, "remote requests are not supported: bit 30 must be set"
             )
-        if not new & INVALID:
-            check_can_id(new)
+        check_change(self._cob_id.number(), new, enabled=exists)
         self.changed = True
 
     def _write_type(self, data: bytes) -> None:

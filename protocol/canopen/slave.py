@@ -7,6 +7,7 @@ returned frames in order, and collects the events. The slave does not block, rea
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from starhil.protocol.can_framing import CanFrame
@@ -18,8 +19,9 @@ from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.emergency import EmergencyProducer
 from starhil.protocol.canopen.error_control import ErrorControl
 from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
-from starhil.protocol.canopen.pdo import PdoService
+from starhil.protocol.canopen.pdo import PdoService, ReceivePdo
 from starhil.protocol.canopen.sdo import SdoServer
+from starhil.protocol.canopen.sdo_transfer import Answers
 from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, MemoryStorage, ParameterStorage
 from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
 from starhil.protocol.canopen.sync import SyncService
@@ -35,7 +37,7 @@ ERROR_BEHAVIOUR: Final = (0x1029, 1)
 HIGH_RESOLUTION: Final = (0x1013, 0)
 STORED_EDS: Final = (0x1021, 0)
 
-Handler = Callable[[CanFrame], None]
+Handler = Callable[[bytes], None]
 
 
 class CanopenSlave:
@@ -88,7 +90,7 @@ class CanopenSlave:
         if stored is not None:
             context.node_id, bit_rate = stored
         self.bit_rate = bit_rate
-        self.lss = LssSlave(context, self, bit_rate, bit_rates)
+        self.lss = LssSlave(context, self, self.store.save_lss, bit_rate, bit_rates)
         self.emergency = EmergencyProducer(context)
         self.sdo = SdoServer(dictionary, sdo_timeout_s)
         self.sync = SyncService(context, self.emergency)
@@ -119,22 +121,24 @@ class CanopenSlave:
         return self._collect_frames()
 
     def receive(self, frame: CanFrame, now: float) -> list[CanFrame]:
-        """Process a frame from the bus; ignore extended frames and unknown CAN IDs."""
-        handlers = self._routes.get(frame.id)
-        if frame.extended or handlers is None:
+        """Process a frame from the bus; ignore extended and remote frames, except guarding, and unknown CAN IDs."""
+        guarding = frame.id == ERROR_CONTROL + self.node_id
+        handlers = self._routes.get(frame.id, [])
+        if frame.extended or frame.remote is not guarding or not (guarding or handlers):
             return []
         self._begin_instant(now)
         if self._silence is None:
+            if guarding:
+                self.error_control.receive_guarding()
             for handler in tuple(handlers):
-                handler(frame)
+                handler(frame.data)
         return self._collect_frames()
 
     def tick(self, now: float) -> list[CanFrame]:
         """Act on the timers that have expired."""
         self._begin_instant(now)
         if self._context.state is not NmtState.INITIALISING and self._silence is None:
-            for data in self.sdo.tick(now):
-                self._context.send(SDO_TRANSMIT + self.node_id, data)
+            self._answer_sdo(self.sdo.tick(now))
             self.error_control.tick()
             counter = self.sync.tick()
             if counter is not None:
@@ -170,8 +174,7 @@ class CanopenSlave:
     ) -> list[CanFrame]:
         """Report the result of a deferred write: success, or a refusal."""
         self._begin_instant(now)
-        for data in self.sdo.finish(deferred, refusal):
-            self._context.send(SDO_TRANSMIT + self.node_id, data)
+        self._answer_sdo(self.sdo.finish(deferred, refusal))
         return self._collect_frames()
 
     def raise_emergency(
@@ -213,10 +216,6 @@ class CanopenSlave:
         now = self._context.now
         self._pending_bit_rate = bit_rate
         self._silence = (now + delay_s, now + 2 * delay_s)
-
-    def store_lss(self, node_id: int, bit_rate: int) -> None:
-        """Save node ID and bit rate (LSS)."""
-        self.store.save_lss(node_id, bit_rate)
 
     def _bind(self) -> None:
         clock = self.dictionary.find(*HIGH_RESOLUTION)
@@ -264,69 +263,51 @@ class CanopenSlave:
             self._silence = None
 
     def _route(self) -> None:
-        """Assign a handler to each CAN ID; all services except LSS need a node ID."""
-        routes: dict[int, list[Handler]] = {}
-
-        def add(can_id: int | None, handler: Handler) -> None:
-            if can_id is not None:
-                routes.setdefault(can_id, []).append(handler)
-
-        add(LSS_MASTER, self._on_lss)
-        if self.node_id != UNCONFIGURED:
-            add(NMT, self._on_nmt)
-            add(self.sync.can_id, self._on_sync)
-            add(self.time.can_id, self._on_time)
-            add(SDO_RECEIVE + self.node_id, self._on_sdo)
-            for other in range(1, 128):
-                add(ERROR_CONTROL + other, self._on_error_control)
-            for pdo in self.pdos.receiving:
-                add(pdo.can_id, self._pdo_handler(pdo.receive))
-        self._routes = routes
-
-    def _pdo_handler(self, receive: Callable[[bytes], None]) -> Handler:
-        def handle(frame: CanFrame) -> None:
-            if self.state is NmtState.OPERATIONAL and not frame.remote:
-                receive(frame.data)
-
-        return handle
-
-    def _on_nmt(self, frame: CanFrame) -> None:
-        if frame.remote or len(frame.data) != 2 or frame.data[1] not in {0, self.node_id}:
+        """Assign a handler of data to each CAN ID; all services except LSS need a node ID."""
+        self._routes = {LSS_MASTER: [self.lss.receive]}
+        if self.node_id == UNCONFIGURED:
             return
-        command = frame.data[0]
+        handlers: list[tuple[int | None, Handler]] = [
+            (NMT, self._on_nmt),
+            (self.sync.can_id, self._on_sync),
+            (self.time.can_id, self.time.receive),
+            (SDO_RECEIVE + self.node_id, self._on_sdo),
+            *((ERROR_CONTROL + other, partial(self._on_heartbeat, other)) for other in range(1, 128)),
+            *((pdo.can_id, partial(self._on_pdo, pdo)) for pdo in self.pdos.receiving),
+        ]
+        for can_id, handler in handlers:
+            if can_id is not None:
+                self._routes.setdefault(can_id, []).append(handler)
+
+    def _on_pdo(self, pdo: ReceivePdo, data: bytes) -> None:
+        if self.state is NmtState.OPERATIONAL:
+            pdo.receive(data)
+
+    def _on_nmt(self, data: bytes) -> None:
+        if len(data) != 2 or data[1] not in {0, self.node_id}:
+            return
+        command = data[0]
         if command in STATE_COMMANDS:
             self._enter(STATE_COMMANDS[command])
         elif command in {RESET_NODE, RESET_COMMUNICATION}:
             self._reset(application=command == RESET_NODE)
 
-    def _on_sdo(self, frame: CanFrame) -> None:
-        if frame.remote or not self._context.communicates:
-            return
-        for data in self.sdo.receive(frame.data, self._context.now):
+    def _on_sdo(self, data: bytes) -> None:
+        if self._context.communicates:
+            self._answer_sdo(self.sdo.receive(data, self._context.now))
+
+    def _answer_sdo(self, answers: Answers) -> None:
+        for data in answers:
             self._context.send(SDO_TRANSMIT + self.node_id, data)
 
-    def _on_sync(self, frame: CanFrame) -> None:
-        if frame.remote:
-            return
-        counter = self.sync.receive(frame.data)
+    def _on_sync(self, data: bytes) -> None:
+        counter = self.sync.receive(data)
         if counter is not None:
             self.pdos.synchronise(counter)
 
-    def _on_time(self, frame: CanFrame) -> None:
-        if not frame.remote:
-            self.time.receive(frame.data)
-
-    def _on_error_control(self, frame: CanFrame) -> None:
-        node_id = frame.id - ERROR_CONTROL
-        if node_id != self.node_id:
-            if not frame.remote and self.state is not NmtState.INITIALISING:
-                self.error_control.receive_heartbeat(node_id, frame.data)
-        elif frame.remote:
-            self.error_control.receive_guarding()
-
-    def _on_lss(self, frame: CanFrame) -> None:
-        if not frame.remote:
-            self.lss.receive(frame.data)
+    def _on_heartbeat(self, node_id: int, data: bytes) -> None:
+        if node_id != self.node_id and self.state is not NmtState.INITIALISING:
+            self.error_control.receive_heartbeat(node_id, data)
 
     def _on_communication_error(self) -> None:
         behaviour = self.dictionary.find(*ERROR_BEHAVIOUR).number()

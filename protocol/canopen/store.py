@@ -107,13 +107,31 @@ class ParameterStore:
     def _store(self, subindex: int, data: bytes) -> Deferred | None:
         if data != SAVE:
             raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'save'")
+        deferred = self._for_groups(subindex, self._save, self._on_save)
+        self._context.report(EventKind.STORED, subindex)
+        return deferred
+
+    def _restore(self, subindex: int, data: bytes) -> Deferred | None:
+        if data != LOAD:
+            raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
+        deferred = self._for_groups(subindex, self._storage.clear, self._on_restore)
+        self._context.report(EventKind.RESTORED, subindex)
+        return deferred
+
+    def _for_groups(
+        self, subindex: int, action: Callable[[str], None], application: ApplicationStore | None
+    ) -> Deferred | None:
+        """Save or clear the groups of a sub-index, then those of the application."""
         deferred = None
         for number, group in GROUPS.items():
             if subindex in {ALL, number}:
-                self._save(group)
-                if group == APPLICATION and self._on_save is not None:
-                    deferred = self._on_save()
-        self._context.report(EventKind.STORED, subindex)
+                try:
+                    action(group)
+                except StorageError as error:
+                    self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
+                    raise SdoAbortError(AbortCode.HARDWARE, str(error)) from None
+                if group == APPLICATION and application is not None:
+                    deferred = application()
         return deferred
 
     def _save(self, group: str) -> None:
@@ -124,26 +142,4 @@ class ParameterStore:
             if self._belongs(entry, group)
             and entry.value != default_bytes(entry.variable, self._context.node_id)
         }
-        try:
-            self._storage.save(group, values)
-        except StorageError as error:
-            self._abort_on_storage_error(error)
-
-    def _restore(self, subindex: int, data: bytes) -> Deferred | None:
-        if data != LOAD:
-            raise SdoAbortError(AbortCode.NOT_STORED, "the signature is 'load'")
-        deferred = None
-        for number, group in GROUPS.items():
-            if subindex in {ALL, number}:
-                try:
-                    self._storage.clear(group)
-                except StorageError as error:
-                    self._abort_on_storage_error(error)
-                if group == APPLICATION and self._on_restore is not None:
-                    deferred = self._on_restore()
-        self._context.report(EventKind.RESTORED, subindex)
-        return deferred
-
-    def _abort_on_storage_error(self, error: StorageError) -> None:
-        self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
-        raise SdoAbortError(AbortCode.HARDWARE, str(error))
+        self._storage.save(group, values)

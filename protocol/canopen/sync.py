@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_can_id, check_replacement
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_change
 from starhil.protocol.canopen.context import Context
-from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer, ErrorRegister
+from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer
 
 COB_ID: Final = (0x1005, 0)
 PERIOD: Final = (0x1006, 0)
@@ -48,11 +48,10 @@ class SyncService:
         """
         if not self._context.communicates:
             return None
-        if len(data) != (1 if self._overflow.number() else 0):
-            detail = bytes([len(data)])
-            self._emergency.raise_error(EmergencyCode.SYNC_LENGTH, ErrorRegister.COMMUNICATION, detail)
+        wrong = len(data) != (1 if self._overflow.number() else 0)
+        self._emergency.communication_error(EmergencyCode.SYNC_LENGTH, bytes([len(data)]), active=wrong)
+        if wrong:
             return None
-        self._emergency.clear_error(EmergencyCode.SYNC_LENGTH)
         return data[0] if data else 0
 
     def tick(self) -> int | None:
@@ -80,8 +79,7 @@ class SyncService:
 
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_can_id(new)
-        check_replacement(old, new, enabled_before=bool(old & BIT_30), enabled_after=bool(new & BIT_30))
+        check_change(old, new, enabled=lambda value: bool(value & BIT_30), always=True)
         self._counter = 0
         self._schedule(new, self._period.number())
 

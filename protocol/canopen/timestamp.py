@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_can_id, check_replacement
+from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_change
 from starhil.protocol.canopen.context import Context, EventKind
 
 COB_ID: Final = (0x1012, 0)
@@ -54,7 +54,6 @@ class TimeConsumer:
 
     def _check_cob_id(self, data: bytes) -> None:
         old, new = self._cob_id.number(), int.from_bytes(data, "little")
-        check_can_id(new)
         if new & BIT_30:
             raise SdoAbortError(AbortCode.VALUE_RANGE, "this node does not produce TIME messages")
-        check_replacement(old, new, enabled_before=bool(old & CONSUMES), enabled_after=bool(new & CONSUMES))
+        check_change(old, new, enabled=lambda value: bool(value & CONSUMES), always=True)

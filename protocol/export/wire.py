@@ -14,7 +14,12 @@ from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.templates import text_of
-from starhil.protocol.link_schema import CubeSpaceFraming, HeaderFieldModel, SerialLinkModel
+from starhil.protocol.link_schema import (
+    CountedMessage,
+    CubeSpaceFraming,
+    HeaderFieldModel,
+    SerialLinkModel,
+)
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import SerialStack, serial_answers
@@ -161,16 +166,24 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
             bit.role or "constant",
             f"{type_}, bits {bits} to {bits + bit.width - 1}",
             _fixed_value(bit.const, bit.default),
-            _text("role").get(bit.role or "", ""),
+            _counter(bit.counts) or _text("role").get(bit.role or "", ""),
         )
         bits += bit.width
     if not field.bits:
         meaning = _text("role").get(field.role or "", "")
         if field.role == "length":
-            meaning = f"number of bytes of {', '.join(field.includes) or 'nothing'}"
+            offset = f" {'+' if field.offset > 0 else '−'} {abs(field.offset)}" if field.offset else ""
+            meaning = f"number of bytes of {', '.join(field.includes) or 'nothing'}{offset}"
+        elif field.counts:
+            meaning = _counter(field.counts)
         elif field.role in ("ticks", "time"):
             meaning = f"{meaning}, in units of {field.scale:g} s"
         yield field.role or "constant", type_ + only, _fixed_value(field.const, field.default), meaning
+
+
+def _counter(counts: list[CountedMessage]) -> str:
+    """Describe a number that counts messages."""
+    return str(_text("counted")["".join(sorted(set(counts)))]) if counts else ""
 
 
 def _fixed_value(const: int | None, default: int | None) -> str:

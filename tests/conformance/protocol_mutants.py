@@ -28,7 +28,7 @@ class LostAimError(Exception):
 
 @dataclass(frozen=True)
 class Edit:
-    """A change: in the function `at` (`module:Qualified.name`), `before` becomes `after`."""
+    """A change: in the function `at` (`module:Qualified.name`, of `starhil.protocol` by default), `before` becomes `after`."""
 
     at: str
     before: str
@@ -42,7 +42,8 @@ class ProtocolMutant:
     Attributes
     ----------
     unit
-        Bundled unit, or a link of `tests.conformance.links` with `link:` before its name.
+        Bundled unit, `tutorial` for that of docs/your-unit.md, or a link of `tests.conformance.links` with `link:`
+        before its name.
     link
         `serial`, `can` or `canopen`.
     hidden
@@ -104,7 +105,8 @@ def _aims(edits: tuple[Edit, ...]) -> Iterator[tuple[Edit, types.FunctionType]]:
 def _function(at: str) -> types.FunctionType:
     module, _, path = at.partition(":")
     try:
-        found: object = importlib.import_module(f"starhil.protocol.{module}")
+        whole = module if module.startswith("starhil.") else f"starhil.protocol.{module}"
+        found: object = importlib.import_module(whole)
         for part in path.split("."):
             found = inspect.getattr_static(found, part)
     except (ImportError, AttributeError) as error:

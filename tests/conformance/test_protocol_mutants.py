@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from starhil.hil_tests.conformance.canopen_suite import canopen_suite
-from starhil.hil_tests.conformance.runner import run_case
+from starhil.hil_tests.conformance.runner import Outcome, run_case
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.unit_examples import check_unit
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_unit
+from starhil.protocol.unit_examples import check_unit, exchanges
 from tests.conformance.links import LINKS, write_unit
 from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutant, read_mutants
 from tests.conformance.simulated import SimulatedUnit
+from tests.test_your_unit import written
 
 MUTANTS = read_mutants()
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 MECHANISMS = (
     "checks", "framings", "headers", "scalar types", "scaling", "bits", "enumerations", "lengths", "segmentation",
-    "PDO mapping",
+    "PDO mapping", "unsolicited telemetry",
 )  # fmt: skip
 
 
 def unit_of(name: str, folder: Path) -> str | Path:
-    """Return a bundled unit, or a unit with another link, in little-endian order if the name ends in `-le`."""
+    """Return a bundled unit, the unit of the tutorial, or one with another link, little-endian if the name ends in `-le`."""
+    if name == "tutorial":
+        return folder if folder.exists() else written(folder)
     if not name.startswith("link:"):
         return name
     link, _, order = name.removeprefix("link:").partition("-")
@@ -53,6 +59,41 @@ def test_an_error_of_both_ends_fails_a_case(mutant: ProtocolMutant, tmp_path: Pa
                 failed += [outcome] if outcome.status == "failed" else []
     assert [outcome.id for outcome in failed] == [f"{mutant.link}.{case}" for case in mutant.cases]
     assert all(outcome.expected and outcome.seen for outcome in failed)
+
+
+def outcomes(unit: str | Path) -> Iterator[Outcome]:
+    """Yield the outcomes of the cases on the serial line."""
+    with SimulatedUnit("serial", unit=unit) as simulated:
+        for case in serial_suite(read_unit(unit)):
+            yield run_case(simulated.probe, case)
+
+
+def messages(unit: Path) -> list[object]:
+    """Return an example of each message of a unit."""
+    try:
+        return [(item.request, item.answers) for item in exchanges(load_unit(unit))]
+    except ProtocolError as error:
+        return [str(error)]
+
+
+def test_the_unit_of_the_tutorial_passes_every_case(tmp_path: Path) -> None:
+    found = list(outcomes(unit_of("tutorial", tmp_path / "lynx")))
+    assert [(o.id, o.expected, o.seen) for o in found if o.status != "passed"] == []
+    assert len(found) >= 45
+
+
+def test_every_error_that_changes_a_message_of_the_tutorial_fails_a_case(tmp_path: Path) -> None:
+    unit = written(tmp_path / "lynx")
+    healthy = messages(unit)
+    missed, found = [], 0
+    for mutant in MUTANTS:
+        with mutant.planted():
+            if mutant.unit == "tutorial" or messages(unit) != healthy:
+                found += 1
+                if all(outcome.status != "failed" for outcome in outcomes(unit)):
+                    missed.append(mutant.name)
+    assert missed == []
+    assert found >= 20
 
 
 @pytest.mark.parametrize("link", LINKS)

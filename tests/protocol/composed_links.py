@@ -102,12 +102,12 @@ LENGTH = stack_of(
         "framing": {"kind": "length", "start": [0xAA, 0x55]},
         "check": {"kind": "sum", "complement": "twos", "covers": ["header", "data"]},
         "request_header": [
-            {"role": "length", "type": "u16", "includes": ["header", "data", "check"]},
+            {"role": "length", "type": "u16", "includes": ["header", "data", "check"], "offset": -1},
             {"role": "id", "type": "u8"},
             {"role": "sequence", "type": "u8"},
         ],
         "reply_header": [
-            {"role": "length", "type": "u16", "includes": ["header", "data", "check"]},
+            {"role": "length", "type": "u16", "includes": ["header", "data", "check"], "offset": -1},
             {"role": "id", "type": "u8"},
             {"role": "sequence", "type": "u8"},
             {"role": "status", "type": "u8"},

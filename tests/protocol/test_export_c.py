@@ -20,6 +20,7 @@ from tests.emulator.units.clients import Emulated, with_unit
 from tests.protocol.c_driver import CDriver, c_words, hex_or_none
 from tests.protocol.composed_links import CUBESPACE
 from tests.protocol.test_export import by_name, packets
+from tests.test_your_unit import written
 
 ICD = load_unit()
 ROWS = [row for row in ICD.rows if row.named_fields]
@@ -263,9 +264,9 @@ def test_every_row_is_answered_by_the_emulated_unit_on_can(c: CDriver) -> None:
 # -- other units -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", ["sagitta", "nos3", "st16", "cubestar-gen2"])
+@pytest.mark.parametrize("name", ["sagitta", "nos3", "st16", "cubestar-gen2", "tutorial"])
 def test_the_rows_of_a_unit_have_the_same_bytes_and_values_both_ways(name: str, tmp_path: Path) -> None:
-    icd = load_unit(name)
+    icd = load_unit(written(tmp_path / "lynx") if name == "tutorial" else name)
     rng = random.Random(name)
     with CDriver(icd, tmp_path) as driver:
         for row in (row for row in icd.rows if row.named_fields):

@@ -162,7 +162,11 @@ def _length(header: Header) -> str:
     sizes = {"header": "header", "data": "size"}
     sizes |= {part: str(size) for part, size in header.overhead.items()}
     fields = [field for field in header.fields if field.role == "length"]
-    return " + ".join(sizes[part] for part in sorted(fields[0].includes)) if fields else "0u"
+    if not fields:
+        return "0u"
+    counted = " + ".join(sizes[part] for part in sorted(fields[0].includes)) or "0u"
+    offset = fields[0].offset
+    return f"{counted} {'-' if offset < 0 else '+'} {abs(offset)}u" if offset else counted
 
 
 def _check(stack: SerialStack) -> dict[str, Any]:

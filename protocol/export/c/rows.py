@@ -208,8 +208,18 @@ def _encode(row: Row, slot: Slot) -> Iterator[str]:
         yield f"memset({where}, 0, {slot.size}u);"
         return
     if fields[0].width:
-        bits = " | ".join(f"(uint64_t)values->{c_member(field.name)} << {field.shift}" for field in fields)
-        yield _put_statement(slot, bits)
+        plain = " | ".join(
+            f"(uint64_t)values->{c_member(field.name)} << {field.shift}"
+            for field in fields
+            if not field.scaled
+        )
+        scaled = [field for field in fields if field.scaled]
+        if scaled:
+            yield f"bits = {plain or '0u'};"
+        for field in scaled:
+            yield f"(void){_to_raw(field, f'values->{c_member(field.name)}')};"
+            yield f"bits |= raw << {field.shift};"
+        yield _put_statement(slot, "bits" if scaled else plain)
         return
     (field,) = fields
     value = f"values->{c_member(field.name)}"
@@ -249,7 +259,7 @@ def _decode(field: Field) -> str:
         raw = f"to_float({raw})" if field.type == "f32" else f"to_double({raw})"
         return f"{value} = {_scaled(field, raw)};"
     if field.width:
-        raw = f"({raw} >> {field.shift}) & {2**field.width - 1:#x}u"
+        raw = f"(({raw} >> {field.shift}) & {2**field.width - 1:#x}u)"
     if field.kind == "flag":
         return f"{value} = ({raw}) != 0u;"
     if _signed(field):

@@ -114,6 +114,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
         "REPLY_CLASSES": reply | unsolicited,
         "UNSOLICITED": sorted(unsolicited),
         "LENGTH_INCLUDES": sorted(length[0].includes) if length else [],
+        "LENGTH_OFFSET": length[0].offset if length else 0,
         "REQUEST_HEADER": list(_fields(stack.request_header, codes)),
         "REPLY_HEADER": list(_fields(stack.reply_header, codes)),
     }
@@ -129,6 +130,7 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
             "default": 0 if field.bits else field.default,
             "classes": None if field.classes is None else sorted(codes[name] for name in field.classes),
             "includes": sorted(field.includes) if field.role == "length" else [],
+            "offset": field.offset,
             "bits": [(bit.role, bit.mask.bit_length(), bit.default) for bit in field.bits],
         }
 

@@ -382,7 +382,7 @@ def test_storage_in_the_folder_of_the_state(make_bench, tmp_path):
         requests = make_bench().start().requests
         link = open_canopen(requests, PaperTransport(), tmp_path, 1)
         await link.start()
-        link.slave.store_lss(60, 500_000)
+        link.slave.store.save_lss(60, 500_000)
         await link.close()
 
     asyncio.run(within())

@@ -23,11 +23,11 @@ from starhil.protocol.canopen import (
     CanopenSlave,
     DeviceDictionary,
     GreyImage,
-    StandInApplication,
     build_dictionary,
 )
 from starhil.protocol.canopen.storage import ParameterStorage
 from starhil.protocol.icd import load_unit
+from tests.protocol.canopen.stand_in import StandInApplication
 
 NODE = 0x2C
 
@@ -199,7 +199,7 @@ def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
     """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
     dictionary = package.build_dictionary(load_unit())
 
-    class RestlessApplication(package.StandInApplication):
+    class RestlessApplication(StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""
 
         reads = 0
@@ -210,7 +210,7 @@ def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
                 self.rows[row.name] = {"frame_counter": self.reads}
             return super().telemetry(row)
 
-    dictionary.application = RestlessApplication(dictionary.icd)
+    dictionary.application = RestlessApplication(dictionary.icd, package)
     slave = package.CanopenSlave(dictionary, NODE)
     eds = package.build_eds(dictionary)
     return CanopenProbe(SimulatedBus(slave), NODE, import_eds(eds, NODE), eds)

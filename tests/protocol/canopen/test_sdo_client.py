@@ -9,12 +9,12 @@ from starhil.protocol.canopen import (
     AbortCode,
     CanopenSlave,
     SdoAbortError,
-    StandInApplication,
     build_dictionary,
 )
 from starhil.protocol.canopen.sdo_client import download, requests_of, row_transfer
 from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError
+from tests.protocol.canopen.stand_in import StandInApplication
 
 NODE = 0x2C
 
