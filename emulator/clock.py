@@ -16,7 +16,6 @@ from starhil.emulator.errors import EmulatorError
 from starid.files import read_number
 
 NANOSECONDS: Final = 1_000_000_000
-"""Nanoseconds in a second."""
 
 MAX_SCALE: Final = 1000.0
 
@@ -139,7 +138,6 @@ class DeviceTime:
     """Unix time of the device: simulation time plus an offset, which telecommand 2 sets."""
 
     clock: Clock
-    """Source of the simulation time."""
     offset_ns: int = 0
     """Unix time at simulation time zero, nanoseconds."""
     was_set: bool = False

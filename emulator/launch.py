@@ -72,7 +72,6 @@ class Emulator:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
             wiring = Recorder(options.record, wiring or Wiring(make_clock(profiles[0].run.clock)))
         self.run = Run(profiles, wiring, worker, previews=options.watched)
-        """Clock, truth and heads."""
         self.ended = asyncio.Event()
         """Set to end the run."""
         self.control: ControlServer | None = None

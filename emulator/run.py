@@ -57,7 +57,6 @@ class Run:
         self.wiring = wiring or Wiring(make_clock(self.profile.run.clock))
         self.clock = self.wiring.clock
         self.recorder = self.wiring if isinstance(self.wiring, Recorder) else None
-        """Records the run; None if it is not recorded."""
         self.stepper: StepPump | None = None
         """Advances the stepped clock, once the run has begun; None with another clock."""
         self.time_passes = asyncio.Event()

@@ -89,7 +89,6 @@ class Recorder(Wiring):
         self._inner = inner
         self.folder = folder
         self.file: OutputFile | None = None
-        """The tape; None before it is opened."""
         self.output = Output(f"recording {folder}")
         """All files of the recording."""
         self._held: list[Callable[[], None]] | None = []

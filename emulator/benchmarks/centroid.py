@@ -55,7 +55,6 @@ class CentroidRow:
     bound_px: float
     """Cramér–Rao bound per axis, root mean square over the same stars."""
     ratio: float
-    """`rms_px` divided by `bound_px`."""
     predicted_px: float
     """Error predicted by the detection, root mean square."""
     normalised_squared_error: float

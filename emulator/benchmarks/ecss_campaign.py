@@ -64,11 +64,8 @@ class EcssPlan:
     """A performance campaign; equal plans give equal results."""
 
     profile: str
-    """Name or path of the device profile."""
     overrides: tuple[str, ...] = ()
-    """Overrides of the profile, `section.key=value`."""
     seed: int = 1
-    """Seed of attitudes and noise."""
     fields: int = 80
     positions: int = 4
     repeats: int = 4

@@ -42,7 +42,6 @@ class Outcomes:
 
     influence: str
     value: float
-    """The varied influence, and its value."""
     frames: int
     correct: int
     wrong: int
@@ -66,11 +65,8 @@ class EcssReport:
     """Figures of a campaign."""
 
     plan: EcssPlan
-    """The campaign."""
     confidence: float
-    """Confidence level of the errors."""
     lines: tuple[ErrorLine, ...]
-    """Errors by kind."""
     measured_arcsec: np.ndarray
     """Quantile of the errors at rest about x, y and z at the confidence level, over sky and orbit."""
     outcomes: tuple[Outcomes, ...]

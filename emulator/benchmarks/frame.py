@@ -41,7 +41,6 @@ class StageRow:
     stage: str
     """`render`, `detect`, `identify`, or `all`."""
     frames: int
-    """Number of measured frames."""
     median_ms: float
     p99_ms: float
     least_ms: float
@@ -100,12 +99,9 @@ class BodiesRow:
     stage: str
     """`render` or, with detection and identification, `all`."""
     frames: int
-    """Number of measured frames of each kind."""
     without_ms: float
     with_ms: float
-    """Medians, milliseconds."""
     ratio: float
-    """`with_ms` divided by `without_ms`."""
 
 
 def measure_bodies(

@@ -27,7 +27,6 @@ IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made t
 RENDERED_STEPS: Final = 40
 """Steps of a life whose images are rendered."""
 LONG_STEPS: Final = 150
-"""Steps of a long life."""
 SIGMA_ARCSEC: Final = {False: (10.0, 33.0), True: (60.0, 300.0)}
 """Largest standard deviations across and about the boresight of the error model, and of rendered images."""
 YEAR_S: Final = 365.25 * 86_400.0

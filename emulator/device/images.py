@@ -41,7 +41,6 @@ class StoredImage:
     pixels: bytes
     """Edge in pixels, and the pixels row by row from the top."""
     frame: int
-    """Index of its exposure."""
     number: int
     """Number of the image since start-up, from 1 to 255 and again from 1; the counter of its file."""
     unix_ns: int = 0

@@ -27,13 +27,11 @@ class FrameTiming:
     """Timing of the frames."""
 
     running: bool
-    """Whether frames are taken."""
     start_ns: int
     """Start of the last exposure, simulation time."""
     busy_s: float
     """Time from the start of an exposure to the end of its processing, seconds."""
     period_s: float
-    """Time from exposure to exposure, seconds."""
 
 
 class PowerModel:

@@ -35,7 +35,6 @@ class Surroundings:
     ) -> None:
         self.truth = truth
         self.has_aberration = profile.images.used or bool(has_aberration(profile.sky))
-        """Whether the sky has aberration."""
         self.faults: dict[str, Any] = {}
         """Optical faults: fields of the sky objects that differ from the profile's."""
         self._radiation = profile.radiation

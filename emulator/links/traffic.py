@@ -20,7 +20,6 @@ from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
 from starhil.protocol.values import Value
 
 SHOWN_VALUES: Final = 8
-"""Maximum number of values in a line."""
 
 CONSOLE_ADDRESS: Final = 253
 """CAN address of the OBC of console and recording, by which its own requests are recognised."""
@@ -51,9 +50,7 @@ class WireItem:
     bus: str
     """`serial` or `can`."""
     outgoing: bool
-    """True if the device sent it."""
     item: bytes | CanFrame
-    """Bytes, or a CAN frame."""
 
 
 class Traffic:

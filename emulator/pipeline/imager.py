@@ -66,7 +66,6 @@ class WorkerImager:
         """Viewers of the frames; frames come with a preview unless this is empty."""
         self._setup = setup
         self._waiting: deque[ReplyCallback] = deque()
-        """Callbacks of pending requests, in order."""
         self._idle = asyncio.Event()
         self._idle.set()
         self._started: asyncio.Future[PipelineReady] = asyncio.get_running_loop().create_future()

@@ -58,9 +58,7 @@ class PipelineSetup:
     epoch: float
     """Catalogue file (empty: the installed one) and the Julian year of the star positions."""
     algorithm: str
-    """`geometric`, `lsi` or `rsi`."""
     seed: int
-    """Seed of all noise."""
     build_in_background: bool = False
     """Whether frames are solved with the current star index while another is being built. If false, frames wait for
     the new index, so that a run on the stepped clock is reproducible byte for byte."""
@@ -114,7 +112,6 @@ class CatalogUpset:
     """A bit flipped in the unit's star catalogue."""
 
     hip: int
-    """Hipparcos number of the star."""
     component: int
     """Component of the direction: 0, 1 or 2 for x, y or z."""
     bit: int
@@ -131,13 +128,11 @@ class FrameRequest:
     """Truth of the sensor at mid-exposure; without a date, only typed bodies are rendered."""
     exposure_s: float
     gain: float
-    """Exposure in seconds and analog gain."""
     solve: bool = True
     """Whether to detect and identify stars; if false, the image is only rendered and kept for download."""
     predicted: Attitude | None = None
     """Predicted attitude at mid-exposure, for tracking; None: lost in space."""
     settings: SolverSettings = field(default_factory=SolverSettings)
-    """Parameters of detection and identification."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Fields of the sky objects that are overridden by the control channel."""
     temperature_c: float | None = None
@@ -168,13 +163,11 @@ class MatchedStar:
     """An identified star."""
 
     hip: int
-    """Hipparcos number."""
     x: float
     y: float
     """Position, pixels."""
     magnitude: float
     snr: float
-    """Measured magnitude and signal-to-noise ratio."""
     vector: Triple
     """Measured direction in the sensor frame, by the camera of the profile."""
     icrs: Triple
@@ -220,7 +213,6 @@ class FrameResult:
     identify_s: float = 0.0
     """Wall time of each step, for the log but not for telemetry."""
     preview: Preview | None = field(default=None, repr=False, compare=False)
-    """The image, if requested."""
 
 
 @dataclass(frozen=True)
@@ -247,9 +239,7 @@ class PipelineReady:
     camera: dict[str, Any]
     """Fields of the camera, with derived constants."""
     stars: int
-    """Number of stars in the catalogue."""
     seconds: float
-    """Wall time of the start."""
 
 
 @dataclass(frozen=True)

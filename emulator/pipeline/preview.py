@@ -51,7 +51,6 @@ class Overlay:
 
     width: int
     height: int
-    """Size of the image, pixels."""
     detections: list[tuple[float, float, float, float]]
     """Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first."""
     hips: list[int]
@@ -61,7 +60,6 @@ class Overlay:
     false_stars: list[tuple[float, float]]
     """Positions of the false stars in the image."""
     bodies: list[Body]
-    """Sun, Moon, Earth and planets."""
     covered: list[list[tuple[float, float]]]
     """Polygons, pixels, of the areas that are covered by something near the lens."""
 

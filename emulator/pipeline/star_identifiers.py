@@ -40,7 +40,6 @@ class StarIdentifierSetup:
     """Everything a star identifier depends on."""
 
     algorithm: str
-    """`geometric`, `lsi` or `rsi`."""
     camera: Camera
     """Camera as calibrated in the device's parameters."""
     margin: float
@@ -118,7 +117,6 @@ class StarIdentifiers:
         self._current: tuple[StarIdentifierSetup, StarIdentifier] | None = None
         self._failed: tuple[StarIdentifierSetup, EmulatorError | StaridError] | None = None
         self._build: tuple[StarIdentifierSetup, Future[StarIdentifier]] | None = None
-        """The build in the background."""
 
     def get(self, setup: StarIdentifierSetup) -> tuple[StarIdentifier, bool]:
         """Return the current star identifier, and whether it is the one for this setup."""

@@ -23,7 +23,6 @@ class DarkMap:
     """The dark signal of each pixel above the typical dark signal."""
 
     sensor: SensorModel
-    """The sensor."""
     rate_dn_s: Array32
     """Counts/s at gain 1 and the sensor's `reference_c`, (h, w), float32."""
 

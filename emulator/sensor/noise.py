@@ -38,15 +38,10 @@ class Digitizer:
     """Parameters of a sensor's noise and converter, from electrons to counts."""
 
     read_noise_e: float
-    """Standard deviation of the read noise, electrons."""
     full_well_e: float
-    """Full-well capacity, electrons."""
     gain_e_per_dn: float
-    """Electrons per count."""
     offset_dn: float
-    """Black level, counts."""
     max_dn: int
-    """Largest count of the converter."""
 
 
 def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:

@@ -85,16 +85,12 @@ class Frame:
     image: GreyImage
     """Counts, (h, w), uint8 or uint16."""
     stars: StarTruth
-    """Catalogue stars in the image."""
     attitude: Attitude
-    """Attitude at mid-exposure."""
     rate_rad_s: tuple[float, float, float]
     """Body rate during the exposure, sensor frame."""
     exposure_s: float
-    """Length of the exposure, seconds."""
     seed: int
     frame_index: int
-    """Seeds of the noise."""
     objects: ObjectTruth | None = None
     """Other objects in the image, if the sky has any."""
 

@@ -60,7 +60,6 @@ class Observer:
     """Date, place and velocity of the sensor."""
 
     unix_s: float
-    """Unix time."""
     offset_m: Vector | None = None
     relative_velocity_m_s: Vector | None = None
     """Position and velocity relative to the Earth's centre, GCRS, (3,); None: at the centre, without an Earth."""

@@ -57,7 +57,6 @@ class Patch:
     """Light and shadow in part of an image."""
 
     box: Box
-    """Its rows and columns."""
     light: Image
     """Electrons/s in a pixel of mean sensitivity, (h', w'), float32."""
     passed: Image
@@ -81,7 +80,6 @@ class AreaLight:
     """Light of extended objects, and the fraction of the sky's light that passes them."""
 
     size: tuple[int, int]
-    """Width and height of the image, pixels."""
     glare: Image | None = None
     """Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row, (gh, gw)."""
     near: tuple[NearGlare, ...] = ()

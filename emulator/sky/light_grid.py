@@ -44,7 +44,6 @@ class Backdrop:
     sky_e_s: float
     """Light of the sky, electrons/s in a pixel of mean sensitivity."""
     exposure_s: float
-    """Length of the exposure."""
     min_glare_e: float = 0.0
     """Glare of fewer electrons everywhere is left out."""
     saturated_e: float = math.inf

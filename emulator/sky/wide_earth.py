@@ -50,7 +50,6 @@ class WideEarth:
     brightness: float
     """Electrons/s per pixel where the Sun is in the zenith."""
     step_rad: float
-    """Angle between points of the grid."""
 
     def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) of the atmosphere at positions (n, 2)."""

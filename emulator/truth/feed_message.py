@@ -55,9 +55,7 @@ class FeedMessage:
     rate_rad_s: Vector | None = None
     """Body rate (3,), rad/s, body frame, or None."""
     orbit: OrbitState | None = None
-    """Position and velocity, GCRS, or None."""
     unix_s: float | None = None
-    """Date as Unix time, or None."""
 
 
 @dataclass(frozen=True)

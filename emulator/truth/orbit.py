@@ -47,10 +47,8 @@ class KeplerOrbit:
     """An elliptic orbit about the Earth."""
 
     epoch_unix_s: float
-    """Unix time of the elements."""
     semi_major_axis_m: float
     eccentricity: float = 0.0
-    """Size and shape."""
     inclination_rad: float = 0.0
     raan_rad: float = 0.0
     argument_of_perigee_rad: float = 0.0

@@ -63,7 +63,6 @@ class TruthState:
     orbit: OrbitState | None = None
     """Position and velocity relative to the Earth's centre, GCRS."""
     unix_s: float | None = None
-    """Date as Unix time (UTC), seconds."""
 
     def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
         """Return the state with the date and orbit of the run if the source has none."""

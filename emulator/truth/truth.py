@@ -32,7 +32,6 @@ class TruthHost:
     """The run, as its truth sees it."""
 
     clock: Clock
-    """Clock of the run."""
     clock_name: str
     """Configured clock: that of a replay differs."""
     time_passes: asyncio.Event
@@ -57,13 +56,11 @@ class Truth:
 
     def __init__(self, config: TruthConfig, folder: Path, host: TruthHost) -> None:
         self.configured = config
-        """The configured truth."""
         self.source: TruthSource = FixedTruth(Attitude.identity())
         """Truth of the body: attitude ICRS→body, rate in the body frame."""
         self.mount: Attitude | None = None
         """Mount in the configuration that has replaced the first one; None: each head has that of its profile."""
         self.feed: LiveFeed | None = None
-        """The live feed, or None."""
         self.address = ""
         """Address of the live feed; empty if there is none."""
         self._wanted_address = ""
