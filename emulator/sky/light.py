@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
 
-from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Line, fill
 from starhil.emulator.sky.light_kernels import (
     Box,
@@ -31,6 +30,7 @@ from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import Camera
 
+_BORDER_SAMPLES: Final = 33
 _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
@@ -136,6 +136,23 @@ class AreaLight:
             refine_glare(mean, backdrop.sensitivity, near, backdrop.unit * backdrop.exposure_s)
         for layer in self._layers:
             layer.cover(mean, backdrop)
+
+
+def disc_in_field(centre: Array, radius_rad: float, camera: Camera) -> bool:
+    """Return whether any part of a disc around a direction (3,) of the sensor frame is in the field."""
+    if math.acos(max(min(float(centre[2]), 1.0), -1.0)) > camera.field_radius_rad + radius_rad:
+        return False
+    if camera.project(centre[None, :])[1][0]:
+        return True
+    nearest = float(np.max(_border_of(camera) @ centre, initial=-1.0))
+    return nearest >= math.cos(min(radius_rad, math.pi))
+
+
+@lru_cache(maxsize=4)
+def _border_of(camera: Camera) -> Array:
+    """Directions (n, 3) of the outer edge of the pixel array, where it sees any."""
+    border = camera.back_project(camera.border(_BORDER_SAMPLES))
+    return border[~np.isnan(border).any(axis=1)]
 
 
 def through_baffle(objects: SkyObjects, attitude: Attitude) -> tuple[str, ...]:

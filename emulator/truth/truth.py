@@ -19,9 +19,8 @@ from pathlib import Path
 from starhil.emulator.clock import NANOSECONDS, Clock, make_clock
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
-from starhil.emulator.truth.feed import LiveFeed
+from starhil.emulator.truth.feed import LiveFeed, Step
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth.lock_step import Step
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
