@@ -107,14 +107,12 @@ class Faults:
             if request.device.error is not None:
                 device.modes.fail(request.device.error)
             if request.device.upset is not None:
-                self._upset(request.device.upset)
+                upset = request.device.upset
+                if upset.parameter is not None:
+                    device.upset_parameter(upset.parameter, upset.bit)
+                elif upset.star is not None:
+                    device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
         device.signals.faults_changed.emit(request.model_dump(mode="json", exclude_unset=True))
-
-    def _upset(self, upset: UpsetFault) -> None:
-        if upset.parameter is not None:
-            self._device.upset_parameter(upset.parameter, upset.bit)
-        elif upset.star is not None:
-            self._device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starhil.emulator.clock import make_clock
-from starhil.emulator.console.obc import MakeClient, ObcClient
+from starhil.emulator.console.obc import MakeClient
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError
@@ -182,39 +182,31 @@ class Emulator:
         make_client = self.options.make_client
         clients = [await open_obc(head, make_client, self._closers) for head in self.run.heads]
         if self.options.mcap is not None:
-            self._open_recorders(self.options.mcap, clients)
+            from starhil.emulator.console.recorder import McapRecorder
+
+            for head, client in zip(self.run.heads, clients, strict=True):
+                path = path_of_head(self.options.mcap, head.number)
+                recorder = McapRecorder(head, client, path, overwrite=self.options.overwrite)
+                self._closers.append(recorder.close)
+                self._files.append(recorder.file)
+                recorder.start()
         if self.options.view != "off":
-            await self._open_server(control, clients)
+            from starhil.emulator.console.console import Console
+            from starhil.emulator.console.runs import Runs
+            from starhil.emulator.console.server import ConsoleServer
+            from starhil.emulator.console.stepping import StepRunner
 
-    def _open_recorders(self, path: Path, clients: Sequence[ObcClient]) -> None:
-        """Start recording each head to its own MCAP file."""
-        from starhil.emulator.console.recorder import McapRecorder
-
-        for head, client in zip(self.run.heads, clients, strict=True):
-            own_path = path_of_head(path, head.number)
-            recorder = McapRecorder(head, client, own_path, overwrite=self.options.overwrite)
-            self._closers.append(recorder.close)
-            self._files.append(recorder.file)
-            recorder.start()
-
-    async def _open_server(self, control: ControlServer, clients: Sequence[ObcClient]) -> None:
-        """Serve a console for each head."""
-        from starhil.emulator.console.console import Console
-        from starhil.emulator.console.runs import Runs
-        from starhil.emulator.console.server import ConsoleServer
-        from starhil.emulator.console.stepping import StepRunner
-
-        stepping, runs = StepRunner(control.execute), Runs()
-        self._closers.append(stepping.pause)
-        consoles = []
-        for head, client in zip(self.run.heads, clients, strict=True):
-            console = Console(self.run, head, client, stepping, runs)
-            self._closers.append(console.close)
-            console.start()
-            consoles.append(console)
-        server = ConsoleServer(consoles)
-        self._closers.append(server.close)
-        self.ready_fields["view"] = await server.start(self.options.view)
+            stepping, runs = StepRunner(control.execute), Runs()
+            self._closers.append(stepping.pause)
+            consoles = []
+            for head, client in zip(self.run.heads, clients, strict=True):
+                console = Console(self.run, head, client, stepping, runs)
+                self._closers.append(console.close)
+                console.start()
+                consoles.append(console)
+            server = ConsoleServer(consoles)
+            self._closers.append(server.close)
+            self.ready_fields["view"] = await server.start(self.options.view)
 
 
 def path_of_head(path: Path, number: int) -> Path:

@@ -175,16 +175,13 @@ class EcssDevice:
             particles_s=shot.particles_s,
         )
         if shot.unix_s is not None:
-            request = self._dated(request, shot.unix_s)
+            truth = request.truth.completed(shot.unix_s, self.orbit)
+            assumed = observer_velocity(self.parameters, shot.unix_s)  # by the device
+            request = replace(request, truth=truth, observer_velocity=assumed)
         result = self.pipeline.handle(request)
         if not isinstance(result, FrameResult):
             raise EmulatorError(f"campaign: profile {self.plan.profile}: {getattr(result, 'text', result)}")
         return shot, result
-
-    def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
-        """Return the request for a frame at a date, with the orbit and the velocity assumed by the device."""
-        truth = request.truth.completed(unix_s, self.orbit)
-        return replace(request, truth=truth, observer_velocity=observer_velocity(self.parameters, unix_s))
 
     def field_attitude(self, condition: Condition, number: int) -> Attitude:
         """Return the attitude of a field, the same for all its frames."""

@@ -81,6 +81,7 @@ class DeviceOptions:
         from starhil.emulator.profile import load_profile
 
         state_dir, symlink = self.state_dir, self.symlink
+        own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
         values = {
             "unit": None if self.unit is None else _absolute_folder(self.unit),
             "links.serial.port": self.serial,
@@ -89,7 +90,7 @@ class DeviceOptions:
             "links.canopen.node": self.canopen,
             "run.clock": self.clock,
             "run.seed": self.seed,
-            "run.state_dir": None if state_dir is None else str(_folder_of_head(state_dir.resolve(), number)),
+            "run.state_dir": None if state_dir is None else str(state_dir.resolve() / own_folder),
             "links.serial.symlink": None
             if symlink is None
             else str(path_of_head(symlink.absolute(), number)),
@@ -274,11 +275,6 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
         kind = "MCAP file" if mcap else "folder"
         raise EmulatorError(f"--record {found[1]}: one {kind} per run, and {found[0]} is one already")
     return found[0] if found else None
-
-
-def _folder_of_head(folder: Path, number: int) -> Path:
-    """Return the state folder of a head; the second head uses `head-2` in the folder of the first."""
-    return folder if number == 1 else folder / f"head-{number}"
 
 
 def _as_toml(value: str | int) -> str:

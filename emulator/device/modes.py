@@ -77,13 +77,9 @@ class Modes:
         """Name in `device_error` of the error; empty in any other mode."""
         self._on_change = on_change
 
-    def allows(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Return whether a mode can be commanded; tracking needs an attitude to start from."""
-        return wanted in COMMANDED[self.mode] and (wanted is not Mode.TRACKING or has_attitude)
-
     def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Change the mode by telecommand; return False if this is not allowed."""
-        if not self.allows(wanted, has_attitude=has_attitude):
+        """Change the mode by telecommand; return False if this is not allowed. Tracking needs an attitude to start from."""
+        if wanted not in COMMANDED[self.mode] or (wanted is Mode.TRACKING and not has_attitude):
             return False
         self._enter(wanted, Cause.COMMAND)
         return True

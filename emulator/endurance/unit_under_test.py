@@ -24,7 +24,7 @@ from starhil.emulator.pipeline.error_model import ErrorModelImager
 from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
-from starhil.emulator.pump import MAX_STEP_S, StepPump
+from starhil.emulator.pump import MAX_STEP_S
 from starhil.emulator.run import Run
 from starhil.emulator.tape import Wiring
 from starhil.emulator.truth.config import TruthConfig
@@ -147,7 +147,9 @@ class UnitUnderTest:
         channels: dict[str, Any] = {
             "serial": {"port": "auto" if "serial" in links else "off"},
             "can": {"channel": "auto" if "can" in links or icd.canopen_only else "off"},
-            "canopen": {"node": node_of(icd) if "canopen" in links else 0},
+            "canopen": {
+                "node": int(icd.device_parameters["canopen_node"].default) if "canopen" in links else 0
+            },
         }
         self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
         self._folder = folder
@@ -218,7 +220,9 @@ class UnitUnderTest:
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
         """Let simulation time pass, and the same time of the event loop; end early after about `most` events in the unit."""
-        stepper = self._stepper
+        stepper = self.run.stepper
+        if stepper is None:
+            raise EmulatorError("endurance: the clock is not stepped")
         left, chunk, done = seconds, seconds if most is None else 1.0, 0
         while left > 0.0:
             chunk = min(left, chunk, MAX_STEP_S)
@@ -228,13 +232,6 @@ class UnitUnderTest:
             if most is not None and done >= most:
                 break
             chunk *= 2.0 if most is None or done < most // 4 else 1.0
-
-    @property
-    def _stepper(self) -> StepPump:
-        stepper = self.run.stepper
-        if stepper is None:
-            raise EmulatorError("endurance: the clock is not stepped")
-        return stepper
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
         """Pass bytes or a frame to the device."""
@@ -321,8 +318,3 @@ def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:
     there = {"serial": icd.link.serial is not None, "can": icd.link.can is not None}
     there["canopen"] = icd.canopen is not None
     return tuple(name for name, present in there.items() if present)
-
-
-def node_of(icd: InterfaceDefinition) -> int:
-    """Return the CANopen node ID of a unit."""
-    return int(icd.device_parameters["canopen_node"].default)

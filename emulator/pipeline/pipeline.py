@@ -256,7 +256,9 @@ class Pipeline:
                 flux,
                 np.array(request.predicted.quaternion_xyzw),
                 sigma,
-                window_px=tracking_window(settings),
+                window_px=min(
+                    settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0
+                ),
                 observer_velocity=request.observer_velocity,
             )
         if solution.valid and _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
@@ -289,6 +291,7 @@ class Pipeline:
         times: tuple[float, float, float, float],
     ) -> FrameResult:
         begin, rendered, detected, solved = times
+        zero_e = sensor.zero_magnitude_e_s * sensor.exposure_s
         measured = self.camera.back_project(found.xy_px[solution.detection_index])
         stars = sorted(
             (
@@ -296,7 +299,7 @@ class Pipeline:
                     hip=int(hip),
                     x=float(found.xy_px[row, 0]),
                     y=float(found.xy_px[row, 1]),
-                    magnitude=measured_magnitude(float(found.flux[row]), sensor),
+                    magnitude=-2.5 * math.log10(max(float(found.flux[row]), 1.0) / zero_e),
                     snr=float(found.flux[row] / found.flux_sigma[row]),
                     vector=as_triple(direction),
                     icrs=as_triple(icrs),
@@ -374,16 +377,6 @@ def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
         optics.model,
         (settings.k1, settings.k2, settings.p1, settings.p2, optics.distortion[4]),
     )
-
-
-def tracking_window(settings: SolverSettings) -> float:
-    """Return the largest distance of a star from its prediction, pixels, limited by the windows."""
-    return float(min(settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0))
-
-
-def measured_magnitude(electrons: float, sensor: SensorModel) -> float:
-    """Return the magnitude of a star from its electrons in one exposure."""
-    return -2.5 * math.log10(max(electrons, 1.0) / (sensor.zero_magnitude_e_s * sensor.exposure_s))
 
 
 def eight_bits(image: NDArray[Any], bits: int) -> NDArray[np.uint8]:

@@ -126,7 +126,8 @@ class Renderer:
         self.seed = _whole_number("seed", seed)
         self.objects = objects
         self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
-        brightness = self.sensor_magnitudes()
+        colour = np.nan_to_num(catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
+        brightness = np.asarray(catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
         limit = self.sensor.limiting_magnitude
         near = companions(catalog, limit, min(_COMPANION_PX * camera.pixel_scale_rad, _COMPANION_RAD))
         rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
@@ -156,11 +157,6 @@ class Renderer:
         step = max(math.sqrt(float(self._pattern.dark_e_s.max())), 1e-3) / np.iinfo(np.uint16).max
         roots = np.sqrt(np.maximum(self._pattern.dark_e_s, 0.0)) / np.float32(step)
         return np.rint(roots).astype(np.uint16), step**2
-
-    def sensor_magnitudes(self) -> Array:
-        """Magnitudes (n,) of all catalogue stars in the sensor's band."""
-        colour = np.nan_to_num(self.catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
-        return np.asarray(self.catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
 
     def with_sensor(self, sensor: SensorModel) -> Renderer:
         """Return a renderer with another sensor; this one if the sensor is equal."""

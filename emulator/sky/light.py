@@ -235,30 +235,30 @@ class AreaPainter:
         """Return light and transmission of all extended objects at one attitude."""
         if not objects.blank and through_baffle(objects, attitude):
             return AreaLight(self._size, flooded=True)
-        lights = [body for body in (objects.sun, self._sun_disc(objects.sun, attitude), objects.moon) if body]
+        sun, earth = objects.sun, objects.earth
+        disc = sun.disc if sun and self._in_field(sun, sun.radius_rad, attitude) else None
+        lights = [body for body in (sun, disc, objects.moon) if body]
         glare, near = self._glare(lights, attitude)
         behind = tuple(
             patch for body in lights if isinstance(body, Moon) for patch in self._disc_patch(body, attitude)
         )
-        earth: WideEarth | None = None
+        wide_earth: WideEarth | None = None
         in_front: list[Patch] = []
-        if objects.earth is not None and self._in_reach(objects.earth, attitude):
-            if objects.earth.radius_deg >= _WIDE_EARTH_DEG:
-                earth = self._wide_earth(objects.earth, attitude)
+        if earth is not None and self._in_field(earth, self._reach_rad(earth), attitude):
+            if earth.radius_deg >= _WIDE_EARTH_DEG:
+                wide_earth = self._wide_earth(earth, attitude)
             else:
-                in_front = self._small_earth(objects.earth, attitude)
+                in_front = self._small_earth(earth, attitude)
         covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
         everything = (0, self._camera.height, 0, self._camera.width)
         in_front += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
-        return AreaLight(self._size, glare, near, earth, behind, tuple(in_front))
+        return AreaLight(self._size, glare, near, wide_earth, behind, tuple(in_front))
 
-    def _sun_disc(self, sun: SunGlare | None, attitude: Attitude) -> Moon | None:
-        """Return the disc of the Sun if any part of it is in the field."""
-        if sun is None or not disc_in_field(attitude.to_sensor(sun.direction), sun.radius_rad, self._camera):
-            return None
-        return sun.disc
+    def _in_field(self, body: CelestialBody, radius_rad: float, attitude: Attitude) -> bool:
+        """Whether any part of a disc around a body is in the field."""
+        return disc_in_field(attitude.to_sensor(body.direction), radius_rad, self._camera)
 
     def _glare(
         self, lights: Sequence[SunGlare | Moon], attitude: Attitude
@@ -367,10 +367,6 @@ class AreaPainter:
     def _reach_rad(self, earth: EarthLimb) -> float:
         """Return the angle from the Earth's centre to which the glow of its limb reaches."""
         return earth.radius_rad + GLOW_HEIGHTS * self._atmosphere_rad(earth)
-
-    def _in_reach(self, earth: EarthLimb, attitude: Attitude) -> bool:
-        """Whether the Earth or the glow of its limb reaches into the field."""
-        return disc_in_field(attitude.to_sensor(earth.direction), self._reach_rad(earth), self._camera)
 
     def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
         """Return the transmission (h, w) of an obstruction."""

@@ -281,15 +281,14 @@ def _check_fields(where: str, body: Any) -> None:
                 raise EmulatorError(f"sky {where} {name}: must be {kind} {low:g}…{high:g}, not {number!r}")
 
 
-def _field_rules(kind: Any) -> tuple[tuple[str, Any, float, float, bool], ...]:
-    """Name, default and limits of each field of a class, and whether it is a whole number; from above to below is no limit."""
-    limits = [
-        (field, *field.metadata.get("limits", (math.inf, -math.inf))) for field in dataclasses.fields(kind)
+_NO_LIMITS: Final = (math.inf, -math.inf)
+
+_RULES: Final[dict[type, list[tuple[str, Any, float, float, bool]]]] = {
+    kind: [
+        (field.name, field.default, low, high, isinstance(low, int))
+        for field in dataclasses.fields(kind)
+        for low, high in (field.metadata.get("limits", _NO_LIMITS),)
     ]
-    return tuple((field.name, field.default, low, high, isinstance(low, int)) for field, low, high in limits)
-
-
-_RULES: Final = {
-    kind: _field_rules(kind) for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
+    for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
 }
-"""Rules of the fields of each class of objects."""
+"""Name, default and limits of each field of a class of objects, and whether it is a whole number."""
