@@ -251,14 +251,13 @@ class Pipeline:
         if request.predicted is None:
             solution = identifier.identify(xy, flux, sigma, observer_velocity=request.observer_velocity)
         else:
+            windows_px = (settings.search_width / 2.0, settings.window_width / 2.0)
             solution = identifier.track(
                 xy,
                 flux,
                 np.array(request.predicted.quaternion_xyzw),
                 sigma,
-                window_px=min(
-                    settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0
-                ),
+                window_px=float(min(settings.tracking_margin, *windows_px)),
                 observer_velocity=request.observer_velocity,
             )
         if solution.valid and _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
