@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, RootModel, ValidationError, model_validat
 from starhil.emulator.clock import NANOSECONDS, SteppedClock
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.device.device import Background, outcome
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.head import Head
@@ -136,19 +136,17 @@ class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
     """Make the folder of a recording, with copies of all inputs of the run that may change later."""
-    try:
+    failed, remedy = f"--record {folder}: cannot be used", "choose another folder"
+    with explained(failed, remedy):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise EmulatorError(f"--record {folder}: not empty; choose another folder")
-    except OSError as error:
-        raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+            raise EmulatorError(f"--record {folder}: not empty; {remedy}")
     try:
-        _copy_inputs(folder, profile, scenario)
-    except (EmulatorError, OSError) as error:
+        with explained(failed, remedy):
+            _copy_inputs(folder, profile, scenario)
+    except EmulatorError:
         shutil.rmtree(folder, ignore_errors=True)  # everything in it is from here
-        if isinstance(error, EmulatorError):
-            raise
-        raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+        raise
 
 
 def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
@@ -308,12 +306,9 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
 
 def _read(path: Path) -> str:
     """Read a file of a recording; an error names it."""
-    try:
-        return read_text(path)
-    except OSError as error:
-        raise EmulatorError(f"replay {path}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise EmulatorError(f"replay {path}: damaged ({error.reason})") from None
+    with explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError)):
+        text = read_text(path)
+    return text  # noqa: RET504 (mypy expects that the block may be left without a result)
 
 
 def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
@@ -327,15 +322,12 @@ def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
     """Yield the entries of a tape, each with file and line."""
     path = folder / EVENTS_FILE
-    try:
-        with open_regular(path) as file:
-            for number, line in enumerate(file, start=1):
-                if not line.endswith(b"\n"):
-                    return  # the run was killed while it wrote
-                where = f"{path}: line {number}"
-                yield where, _validated(_Line, line, where).root
-    except OSError as error:
-        raise EmulatorError(f"replay {path}: {error.strerror}") from None
+    with explained(f"replay {path}: cannot be read"), open_regular(path) as file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                return  # the run was killed while it wrote
+            where = f"{path}: line {number}"
+            yield where, _validated(_Line, line, where).root
 
 
 async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
@@ -542,10 +534,7 @@ def _compare_truth(recorded: Path, now: Path, report: ReplayReport, *, to_the_en
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    try:
-        with TextIOWrapper(open_regular(path), encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
-    except OSError as error:
-        raise EmulatorError(f"replay {path}: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise EmulatorError(f"replay {path}: damaged ({error})") from None
+    unreadable = explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError, csv.Error))
+    with unreadable, TextIOWrapper(open_regular(path), encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return rows  # noqa: RET504 (as above)

@@ -7,7 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from starhil.emulator.errors import EmulatorError, explained
+from starhil.protocol.names import Kind, find, not_found
 from starid.files import read_text
+
+
+def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path:
+    """Return the path of a file given by the name of a bundled one, or by a path."""
+    failed = f"{kind} {name_or_path!r}: cannot be read"  # RuntimeError: the home folder of an unknown user
+    with explained(failed, "give another path", errors=(OSError, RuntimeError)):
+        path = relative_to / find(kind, name_or_path)
+        found = path.exists()
+    if not found:
+        raise EmulatorError(not_found(kind, name_or_path))
+    return path
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:

@@ -17,13 +17,12 @@ from typing import Final
 
 import numpy as np
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.sensor.renderer import Frame, Renderer, SensorModel
 from starid.arrays import Array
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.files import write_atomically
 from starid.imaging.centroid import star_model
 from starid.imaging.detection import Detections, detect
 
@@ -196,40 +195,22 @@ def _rms(values: Array) -> float:
 
 def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
     """Plot error and bound against magnitude, one panel per rate, to an image or PDF file."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from starid.plots import figure, save
 
     rates = sorted({row.rate_deg_s for row in rows})
-    figure, panels = plt.subplots(
-        1, len(rates), figsize=(3.4 * len(rates) + 0.8, 4.2), sharey=True, squeeze=False, layout="constrained"
-    )
+    plot, panels = figure(1, len(rates), width=3.4 * len(rates) + 0.8, sharey=True, squeeze=False)
     for panel, rate in zip(panels[0], rates, strict=True):
         chosen = [row for row in rows if row.rate_deg_s == rate]
         middle = [0.5 * (max(row.v_low, _BRIGHTEST_COMPLETE) + row.v_high) for row in chosen]
-        panel.semilogy(middle, [row.bound_px for row in chosen], "k-", lw=1.5, label="Cramér–Rao bound")
-        panel.semilogy(
-            middle, [row.rms_px for row in chosen], "o", color="tab:blue", ms=6, label="measured error"
-        )
-        panel.semilogy(
-            middle,
-            [row.predicted_px for row in chosen],
-            "_",
-            color="tab:orange",
-            ms=14,
-            mew=2,
-            label="error stated",
-        )
+        for name, style, size, label in (
+            ("bound_px", "k-", 0, "Cramér–Rao bound"),
+            ("rms_px", "o", 6, "measured error"),
+            ("predicted_px", "_", 14, "error stated"),
+        ):
+            panel.semilogy(middle, [getattr(row, name) for row in chosen], style, ms=size, mew=2, label=label)
         panel.set_title(f"{rate:g} °/s")
         panel.set_xlabel("V magnitude")
-        panel.grid(visible=True, which="both", lw=0.3)
     panels[0, 0].set_ylabel("error per axis, px (root mean square)")
-    panels[0, 0].legend(loc="upper left", fontsize=8)
-    try:
-        form = path.suffix.removeprefix(".").lower() or "png"
-        write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=150, format=form))
-    except (OSError, ValueError) as error:
-        raise EmulatorError(f"{path}: cannot write the plot: {error}") from None
-    finally:
-        plt.close(figure)
+    panels[0, 0].legend(loc="upper left")
+    with explained(f"{path}: the plot cannot be written", errors=(OSError, ValueError)):
+        save(plot, path)

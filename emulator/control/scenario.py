@@ -26,14 +26,13 @@ from pydantic import Field, ValidationError, model_validator
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.scheduler import Action
-from starhil.emulator.errors import EmulatorError, explained
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
-from starhil.emulator.toml_file import read_toml
+from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.names import find, not_found
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
@@ -102,12 +101,7 @@ class Scenario(Strict):
 
 def load_scenario(name_or_path: str) -> Scenario:
     """Read a scenario from a path, or by the name of one in `configs/scenarios`."""
-    what = f"scenario {name_or_path!r}: cannot be read"  # RuntimeError: the home folder of an unknown user
-    with explained(what, "give another path", errors=(OSError, RuntimeError)):
-        path = find("scenario", name_or_path)
-        found = path.exists()
-    if not found:
-        raise EmulatorError(not_found("scenario", name_or_path))
+    path = find_toml("scenario", name_or_path)
     values = read_toml(path, "scenario")
     try:
         return Scenario.model_validate(values)
