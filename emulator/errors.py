@@ -23,4 +23,6 @@ def explained(
     try:
         yield
     except errors as error:
-        raise EmulatorError(f"{what} ({reason(error)})" + (f"; {remedy}" if remedy else "")) from None
+        is_of_file = isinstance(error, OSError) and error.filename is not None
+        why = getattr(error, "strerror", None) if is_of_file else reason(error)
+        raise EmulatorError(f"{what} ({why})" + (f"; {remedy}" if remedy else "")) from None
