@@ -63,20 +63,12 @@ SerialDialect: TypeAlias = Annotated[
     typer.Option("--dialect", help="Format of serial replies, if the unit has several: a, b (default) or c."),
 ]
 DeviceAddress: TypeAlias = Annotated[int, typer.Option("--device-address", help="CAN address of the device.")]
-Unit: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--unit",
-        help="Interface of the device: name of a bundled unit, or a folder of TOML files.",
-        autocompletion=names_of("unit"),
-    ),
-]
+_UNIT = "Interface of the device: name of a bundled unit, or a folder of TOML files."
+Unit: TypeAlias = Annotated[str, typer.Option("--unit", help=_UNIT, autocompletion=names_of("unit"))]
 UnitChoice: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        "--unit",
-        help="Interface of the device: name of a bundled unit, or a folder of TOML files. Default: the profile's (cubestar).",
-        autocompletion=names_of("unit"),
+        "--unit", help=_UNIT + " Default: the profile's (cubestar).", autocompletion=names_of("unit")
     ),
 ]
 Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]

@@ -1,11 +1,22 @@
-"""Previews: frames compressed for display, with an overlay of stars, bodies and covered areas."""
+"""Previews: frames compressed for display, with an overlay of stars, bodies and covered areas.
+
+The overlay is JSON; places in the image are pairs x, y, pixels:
+
+- ``width``, ``height`` of the image;
+- ``detections``: place, magnitude and signal-to-noise ratio of each, brightest first, and ``hips``: the Hipparcos number
+  of each, 0 if it was not identified;
+- ``catalogue``: Hipparcos number, place and V of the catalogue stars in the field, brightest first;
+- ``false_stars``: their places;
+- ``bodies``: ``name`` (`sun`, `moon`, `earth`, or that of a planet), ``ra_deg`` and ``dec_deg`` of the centre, ICRS, angular
+  ``radius_deg`` (0 for a point), and ``outline_px`` of the disc, null where the lens maps no direction;
+- ``covered``: polygons of the areas that are covered by something near the lens.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -30,40 +41,6 @@ KNEE_SIGMA: Final = 4.0
 OUTLINE_POINTS: Final = 96
 
 
-@dataclass(frozen=True)
-class Body:
-    """A body in the sky, for display."""
-
-    name: str
-    """`sun`, `moon`, `earth`, or the name of a planet."""
-    ra_deg: float
-    dec_deg: float
-    radius_deg: float
-    """Direction of the centre, ICRS, and angular radius; 0 for a point."""
-    outline_px: list[tuple[float, float] | None]
-    """Outline of the disc as pairs of pixel coordinates; None where the lens maps no direction. A point has one
-    pair."""
-
-
-@dataclass(frozen=True)
-class Overlay:
-    """Marks that are drawn over an image."""
-
-    width: int
-    height: int
-    detections: list[tuple[float, float, float, float]]
-    """Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first."""
-    hips: list[int]
-    """Hipparcos number of each detection; 0 if it was not identified."""
-    catalogue: list[tuple[int, float, float, float]]
-    """Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first."""
-    false_stars: list[tuple[float, float]]
-    """Positions of the false stars in the image."""
-    bodies: list[Body]
-    covered: list[list[tuple[float, float]]]
-    """Polygons, pixels, of the areas that are covered by something near the lens."""
-
-
 def make_preview(
     frame: Frame,
     camera: Camera,
@@ -75,20 +52,6 @@ def make_preview(
     """Make the preview of a frame, without detections if it was not solved."""
     background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
     noise = max(1.0, 0.0 if found is None else found.noise)
-    overlay = make_overlay(frame, camera, sensor, sky, found, solution)
-    content = json.dumps(overlay, default=vars, separators=(",", ":")).encode()
-    return Preview(compress(frame.image, background, noise, sensor.bits), content)
-
-
-def make_overlay(
-    frame: Frame,
-    camera: Camera,
-    sensor: SensorModel,
-    sky: SkyObjects,
-    found: Detections | None = None,
-    solution: Solution | None = None,
-) -> Overlay:
-    """Return the overlay of an image."""
     height, width = frame.image.shape
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
@@ -100,16 +63,18 @@ def make_overlay(
         strict=True,
     )
     detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
-    return Overlay(
-        width=width,
-        height=height,
-        detections=detections,
-        hips=hips,
-        catalogue=list(catalogue),
-        false_stars=[] if objects is None else [(x, y) for x, y in objects.false_xy_px.round(1).tolist()],
-        bodies=_bodies(sky, camera, frame.attitude),
-        covered=[_covered(obstruction, width, height) for obstruction in sky.obstructions],
-    )
+    overlay = {
+        "width": width,
+        "height": height,
+        "detections": detections,
+        "hips": hips,
+        "catalogue": list(catalogue),
+        "false_stars": [] if objects is None else objects.false_xy_px.round(1).tolist(),
+        "bodies": _bodies(sky, camera, frame.attitude),
+        "covered": [_covered(obstruction, width, height) for obstruction in sky.obstructions],
+    }
+    content = json.dumps(overlay, separators=(",", ":")).encode()
+    return Preview(compress(frame.image, background, noise, sensor.bits), content)
 
 
 def compress(image: GreyImage, background: float, noise: float, bits: int) -> bytes:
@@ -142,14 +107,14 @@ def _detections(
     return list(rows), hips.tolist()
 
 
-def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:
+def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[dict[str, Any]]:
     """Return the bodies in a sky, inside or outside the image."""
     planets = ((planet.name or f"planet {number}", planet) for number, planet in enumerate(sky.planets, 1))
     bodies = (("sun", sky.sun), ("moon", sky.moon), ("earth", sky.earth), *planets)
     return [_body(name, body, camera, attitude) for name, body in bodies if body is not None]
 
 
-def _body(name: str, body: CelestialBody, camera: Camera, attitude: Attitude) -> Body:
+def _body(name: str, body: CelestialBody, camera: Camera, attitude: Attitude) -> dict[str, Any]:
     """Return a body with the outline of its disc in the image."""
     centre, radius = body.direction, body.radius_rad
     across = np.cross(centre, (0.0, 0.0, 1.0) if abs(centre[2]) < 0.9 else (1.0, 0.0, 0.0))
@@ -163,7 +128,8 @@ def _body(name: str, body: CelestialBody, camera: Camera, attitude: Attitude) ->
     outline = [
         (x, y) if there else None for (x, y), there in zip(xy.round(1).tolist(), mapped.tolist(), strict=True)
     ]
-    return Body(name, body.ra_deg, body.dec_deg, math.degrees(radius), outline)
+    place = {"ra_deg": body.ra_deg, "dec_deg": body.dec_deg, "radius_deg": math.degrees(radius)}
+    return {"name": name, **place, "outline_px": outline}
 
 
 def _covered(obstruction: Obstruction, width: int, height: int) -> list[tuple[float, float]]:
