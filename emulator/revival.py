@@ -62,12 +62,8 @@ class PipelineRevival:
         while self._lost and self._attempts < len(PAUSES_S):
             pause_s = PAUSES_S[self._attempts]
             self._attempts += 1
-            log.warning(
-                "image pipeline: restarting in %g s (attempt %d of %d)",
-                pause_s,
-                self._attempts,
-                len(PAUSES_S),
-            )
+            progress = f"attempt {self._attempts} of {len(PAUSES_S)}"
+            log.warning("image pipeline: restarting in %g s (%s)", pause_s, progress)
             await asyncio.sleep(pause_s)
             await self._restart()
         if self._lost:

@@ -8,16 +8,22 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import Jobs, Seed, Settings, names_of
 from starid.cli.options import AsJson
+from starid.cli.output import Column, print_table
 
 if TYPE_CHECKING:
     from starhil.emulator.benchmarks.campaign import CampaignPlan
+
+_COLUMNS: Final[tuple[Column, ...]] = (
+    ("figure", lambda row: row[0]),
+    ("value", lambda row: f"{row[1]:.4g}" if isinstance(row[1], float) else str(row[1])),
+)
 
 group = typer.Typer(
     help="Measure the accuracy and reliability of attitudes over many rendered images (for speed and solvers, see bench).",
@@ -193,7 +199,7 @@ def lost_in_space(
     if as_json:
         print(json.dumps(figures))
     else:
-        _print_table(figures)
+        print_table(_COLUMNS, figures.items())
     if figures["wrong"] or figures["valid_pct"] < require_valid:
         raise typer.Exit(1)
 
@@ -238,13 +244,3 @@ def _with_progress(chunks: Any, total: int) -> Any:
     from rich.progress import track
 
     return track(chunks, "campaign", total=total, console=Console(stderr=True))
-
-
-def _print_table(figures: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("figure", "value", title="lost in space, full images")
-    for name, value in figures.items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(table)
