@@ -41,6 +41,8 @@ class RunOptions:
     """Folder of a recording of the run, for a replay."""
     view: str = "off"
     """Address of the console: `off`, `auto` (the loopback interface, a free port) or HOST:PORT."""
+    view_token: str = ""
+    """Token of pages that may look but not command; empty for none."""
     mcap: Path | None = None
     """MCAP file of images, truth, telemetry and events; one file per head (`path_of_head`)."""
     make_client: MakeClient | None = None
@@ -204,9 +206,9 @@ class Emulator:
                 self._closers.append(console.close)
                 console.start()
                 consoles.append(console)
-            server = ConsoleServer(consoles)
+            server = ConsoleServer(consoles, self.options.view_token)
             self._closers.append(server.close)
-            self.ready_fields["view"] = await server.start(self.options.view)
+            self.ready_fields |= await server.start(self.options.view)
 
 
 def path_of_head(path: Path, number: int) -> Path:

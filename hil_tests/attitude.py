@@ -60,13 +60,13 @@ def from_vector_part(x: float, y: float, z: float) -> Quaternion:
 
 
 def product(p: Sequence[float], q: Sequence[float]) -> Quaternion:
-    """Return the Hamilton product p ⊗ q."""
+    """Return the Hamilton product p ⊗ q; terms are grouped so that q ⊗ q* has no vector part, not even by rounding."""
     a, b, c, d = p
     x, y, z, w = q
     return Quaternion(
-        d * x + a * w + b * z - c * y,
-        d * y - a * z + b * w + c * x,
-        d * z + a * y - b * x + c * w,
+        (d * x + a * w) + (b * z - c * y),
+        (d * y + b * w) + (c * x - a * z),
+        (d * z + c * w) + (a * y - b * x),
         d * w - a * x - b * y - c * z,
     )
 

@@ -24,11 +24,8 @@ SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 class LinkOptions:
     """Options of the links and of the clients.
 
-    Attributes
-    ----------
-    serial, can : str or None
-        Port and channel; None if the link is not used. `auto` means those on the ready line of the emulator
-        that the bench started.
+    `serial` and `can` are port and channel, None if the link is not used, `auto` for those on the ready line of the emulator
+    that the bench started.
     """
 
     serial: str | None = None
@@ -61,8 +58,7 @@ class Bench:
         self.icd = icd
         self.emulator = emulator
         self.log_folder = log_folder
-        self.logs: list[WireLog] = []
-        self._log_of: dict[str, WireLog] = {}
+        self.logs: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
         self._started = False
 
@@ -107,13 +103,12 @@ class Bench:
     def _log(self, link: str) -> WireLog | None:
         if self.log_folder is None:
             return None
-        if link not in self._log_of:
+        if link not in self.logs:
             path = self.log_folder / f"{link}.log"
-            self._log_of[link] = (
+            self.logs[link] = (
                 SerialLog(path) if link == "serial" else CandumpLog(path, bus_name(self._spec(link)))
             )
-            self.logs.append(self._log_of[link])
-        return self._log_of[link]
+        return self.logs[link]
 
     def close_clients(self) -> None:
         """Close all clients; they are opened again on next use."""
@@ -145,7 +140,7 @@ class Bench:
         try:
             self.close_clients()
         finally:
-            for log in self.logs:
+            for log in self.logs.values():
                 log.close()
             self._end_emulator(kind)
 

@@ -130,7 +130,6 @@ class EmulatorProcess:
         Raises EmulatorProcessError: the process ended or was not ready in time; the text quotes the last
         lines of stderr.
         """
-        begin = time.monotonic()
         self._lines = queue.Queue()
         self.errors = []
         try:
@@ -152,7 +151,7 @@ class EmulatorProcess:
         for reader in self._readers:
             reader.start()
         try:
-            self.ready = self._wait_for_ready(begin + self._ready_within_s)
+            self.ready = self._wait_for_ready()
         except (
             BaseException
         ):  # on interruption too: the process has its own session, so it receives no signal
@@ -160,7 +159,8 @@ class EmulatorProcess:
             raise
         return self
 
-    def _wait_for_ready(self, deadline: float) -> dict[str, str]:
+    def _wait_for_ready(self) -> dict[str, str]:
+        deadline, compiled = time.monotonic() + self._ready_within_s, ""
         while True:
             try:
                 line = self._lines.get(timeout=max(0.0, deadline - time.monotonic()))
@@ -174,6 +174,9 @@ class EmulatorProcess:
                 )
             if line.startswith("ready"):
                 return parse_ready_line(line)
+            if line.startswith(PROGRESS) and line.partition(",")[2] != compiled:
+                # a slow machine compiles kernels for longer than that, at the first start
+                deadline, compiled = time.monotonic() + self._ready_within_s, line.partition(",")[2]
 
     def _read_output(self, stream: IO[str]) -> None:
         for line in stream:
@@ -184,6 +187,7 @@ class EmulatorProcess:
         for line in stream:
             if line.startswith(PROGRESS):
                 print(line.rstrip(), file=sys.stderr, flush=True)
+                self._lines.put(line)
             else:
                 self.errors.append(line.rstrip())
 

@@ -22,16 +22,9 @@ class DeviceError(BenchError):
 
 
 class NackError(DeviceError):
-    """The device refused a request with a published error code.
+    """The device refused a request, a telecommand or telemetry row given by name, with a published error code.
 
-    Attributes
-    ----------
-    request : str
-        Name of the telecommand or telemetry row.
-    code : int
-        The error code on the wire.
-    code_name : str
-        Its name in the interface definition.
+    `code` is the number on the wire, `code_name` its name in the interface definition.
     """
 
     def __init__(self, request: str, code: int, code_name: str) -> None:

@@ -61,26 +61,18 @@ BURST_SILENCE_S: Final = 0.5
 
 @dataclass(frozen=True)
 class Image:
-    """A downloaded grey image of 8 bits per pixel.
-
-    Attributes
-    ----------
-    pixels : bytes
-        `width * height` bytes, row by row from the top.
-    bytes_received : int
-        Payload bytes received, including repeats.
-    repeats : int
-        Frames or bursts that were requested again.
-    seconds : float
-        Duration of the download, without the capture.
-    """
+    """A downloaded grey image of 8 bits per pixel."""
 
     pixels: bytes
+    """`width * height` bytes, row by row from the top."""
     width: int
     height: int
     bytes_received: int
+    """Payload bytes received, including repeats."""
     repeats: int
+    """Frames or bursts that were requested again."""
     seconds: float
+    """Duration of the download, without the capture."""
 
 
 async def save_image(client: Downloader, size: str, *, within_s: float) -> None:

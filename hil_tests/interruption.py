@@ -13,15 +13,7 @@ ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Interrupted(KeyboardInterrupt):
-    """A termination signal has arrived.
-
-    Attributes
-    ----------
-    reason
-        `interrupted by SIGTERM`.
-    exit_status
-        128 plus the number of the signal, as in a shell.
-    """
+    """A termination signal has arrived; `exit_status` is 128 plus its number, as in a shell."""
 
     def __init__(self, number: int) -> None:
         self.reason = f"interrupted by {signal.Signals(number).name}"

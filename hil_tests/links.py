@@ -30,16 +30,9 @@ Item = TypeVar("Item", bytes, CanFrame)
 
 
 class HostLink(ABC, Generic[Item]):
-    """Sends requests, and passes on replies, faults and raw items.
+    """Sends requests; calls `on_reply` with each reply, also an unsolicited one, and `on_fault` for invalid input.
 
-    Attributes
-    ----------
-    on_reply : callable
-        Called with each reply, including unsolicited ones.
-    on_fault : callable
-        Called for invalid input.
-    on_raw : callable or None
-        Called with each item before it is decoded: bytes on serial, frames on CAN.
+    Each item, bytes on serial or a frame on CAN, is passed to `on_raw` before it is decoded.
     """
 
     name: str

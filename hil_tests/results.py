@@ -29,33 +29,23 @@ SHOWN_VALUES: Final = 6
 
 @dataclass(frozen=True)
 class StepResult:
-    """Result of one step on one link.
-
-    Attributes
-    ----------
-    status : str
-        `passed`, `failed` or `skipped`.
-    detail : str
-        What was observed, or the problem.
-    seconds : float
-        Duration of the step, including repeats and waits.
-    latency_s : float or None
-        Largest latency of its transactions.
-    values : mapping
-        The telemetry read last.
-    figures : mapping
-        Numbers that the step computed, such as the attitude error.
-    """
+    """Result of one step on one link."""
 
     number: int
     name: str
     link: str
     status: str
+    """`passed`, `failed` or `skipped`."""
     detail: str
+    """What was observed, or the problem."""
     seconds: float
+    """Duration of the step, including repeats and waits."""
     latency_s: float | None = None
+    """Largest latency of its transactions."""
     values: Mapping[str, Value] = field(default_factory=dict)
+    """The telemetry read last."""
     figures: Mapping[str, float] = field(default_factory=dict)
+    """Numbers that the step computed, such as the attitude error."""
 
     def to_json(self) -> dict[str, Any]:
         """Return the result as JSON data."""

@@ -38,7 +38,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 
-from pydantic import AfterValidator, Field, PlainValidator, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    ConfigDict,
+    Field,
+    PlainValidator,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
 from starhil.hil_tests.errors import BenchError, ScriptError
@@ -90,48 +98,30 @@ def _texts(value: Any) -> tuple[str, ...]:
     return tuple(values)
 
 
-def _telemetry(value: Any, info: ValidationInfo) -> Row:
-    return _row(
-        _text(value),
-        "telemetry row",
-        _icd(info).telemetry,
-        _icd(info).telecommands,
-        "a telecommand: use command",
-    )
+def _known(kind: str, table: str, others: str = "", remedy: str = "") -> PlainValidator:
+    """Return a reader of names in a table of the definition; `remedy` for a name that is in another one."""
+
+    def read(value: Any, info: ValidationInfo) -> Any:
+        known = getattr(_icd(info), table)
+        if _text(value) not in known:
+            elsewhere = others and value in getattr(_icd(info), others)
+            hint = f"; it is {remedy}" if elsewhere else did_you_mean(value, known) or LISTED
+            raise ValueError(f"unknown {kind} '{value}'{hint}")
+        return known[value]
+
+    return PlainValidator(read)
 
 
-def _telecommand(value: Any, info: ValidationInfo) -> Row:
-    return _row(
-        _text(value), "telecommand", _icd(info).telecommands, _icd(info).telemetry, "telemetry: use read"
-    )
+def _member(enum: str) -> PlainValidator:
+    """Return a reader of the names of an enumeration of the definition."""
 
+    def read(value: Any, info: ValidationInfo) -> str:
+        known = sorted(_icd(info).enums[enum].values)
+        if _text(value) not in known:
+            raise ValueError(f"must be one of {', '.join(known)}, not '{value}'{did_you_mean(value, known)}")
+        return str(value)
 
-def _row(name: str, kind: str, rows: Mapping[str, Row], others: Mapping[str, Row], remedy: str) -> Row:
-    if name not in rows:
-        hint = f"; it is {remedy}" if name in others else did_you_mean(name, rows) or LISTED
-        raise ValueError(f"unknown {kind} '{name}'{hint}")
-    return rows[name]
-
-
-def _parameter(value: Any, info: ValidationInfo) -> Parameter:
-    known = _icd(info).parameters
-    if _text(value) not in known:
-        raise ValueError(f"unknown parameter '{value}'{did_you_mean(value, known) or LISTED}")
-    return known[value]
-
-
-def _one_of(names: Iterable[str], value: Any) -> str:
-    if _text(value) not in (known := sorted(names)):
-        raise ValueError(f"must be one of {', '.join(known)}, not '{value}'{did_you_mean(value, known)}")
-    return str(value)
-
-
-def _error_code(value: Any, info: ValidationInfo) -> str:
-    return _one_of(_icd(info).enums["error_code"].values, value)
-
-
-def _image_size(value: Any, info: ValidationInfo) -> str:
-    return _one_of(_icd(info).enums["image_size"].values, value)
+    return PlainValidator(read)
 
 
 def _hex_bytes(value: Any) -> bytes:
@@ -153,8 +143,12 @@ def _fraction(value: float) -> float:
     return value
 
 
-Telemetry = Annotated[Row, PlainValidator(_telemetry)]
-Refusal = Annotated[str, PlainValidator(_error_code)]
+Telemetry = Annotated[Row, _known("telemetry row", "telemetry", "telecommands", "a telecommand: use command")]
+Telecommand = Annotated[Row, _known("telecommand", "telecommands", "telemetry", "telemetry: use read")]
+ParameterName = Annotated[Parameter, _known("parameter", "parameters")]
+Refusal = Annotated[str, _member("error_code")]
+ImageSize = Annotated[str, _member("image_size")]
+HexBytes = Annotated[bytes, PlainValidator(_hex_bytes)]
 FileName = Annotated[str, AfterValidator(_file_name)]
 Texts = Annotated[tuple[str, ...], PlainValidator(_texts)]
 Positive = Annotated[float, Field(ge=0.001)]
@@ -231,9 +225,9 @@ class Command(Step):
     """Send a telecommand."""
 
     default_name = "command {self.row.name}"
-    row: Annotated[Row, PlainValidator(_telecommand)] = Field(alias="command")
+    row: Telecommand = Field(alias="command")
     values: dict[str, ReadOperand] = Field({}, alias="with")
-    raw: Annotated[bytes, PlainValidator(_hex_bytes)] | None = Field(None, alias="with_hex")
+    raw: HexBytes | None = Field(None, alias="with_hex")
     """Data as bytes instead of `values`, for malformed telecommands."""
     refused: Refusal | None = None
     """Name of the expected error code; None if the telecommand must be accepted."""
@@ -313,7 +307,7 @@ class SetParameter(Step):
     """Set a parameter by name and read it back."""
 
     default_name = "set parameter {self.parameter.name}"
-    parameter: Annotated[Parameter, PlainValidator(_parameter)] = Field(alias="set_parameter")
+    parameter: ParameterName = Field(alias="set_parameter")
     value: ReadOperand
     refused: Refusal | None = None
 
@@ -333,7 +327,7 @@ class GetParameter(Step):
     """Read a parameter by name; expectations refer to the fields of the row `parameter`."""
 
     default_name = "get parameter {self.parameter.name}"
-    parameter: Annotated[Parameter, PlainValidator(_parameter)] = Field(alias="get_parameter")
+    parameter: ParameterName = Field(alias="get_parameter")
     _row: Row | None = None
 
     @property
@@ -351,7 +345,7 @@ class DownloadImage(Step):
 
     default_name = "download image {self.file}"
     file: FileName = Field(alias="download_image")
-    size: Annotated[str, PlainValidator(_image_size)] = "size_128"
+    size: ImageSize = "size_128"
     method: Literal["frames", "burst"] = "frames"
     """`frames` of 128 bytes, or `burst` packets with hole maps."""
 
@@ -375,8 +369,8 @@ class Send(Step):
                     parse_frame(text)
                 else:
                     bytes.fromhex(text)
-            for text in self.answer or ():
-                pattern(text)
+            if self.answer is not None:
+                self.answer = tuple(pattern(text) for text in self.answer)
         except (BenchError, ValueError) as error:
             raise ValueError(f"'send' or 'answer': {error}") from None
         frames = {"#" in text for text in self.data}
@@ -452,13 +446,14 @@ class Defaults(Keys):
 class Script(Keys):
     """A validated session script."""
 
+    model_config = ConfigDict(populate_by_name=False)
+
     title: str = ""
     doc: str = ""
     truth: Truth = Truth()
     emulator: EmulatorRequest = EmulatorRequest()
     defaults: Defaults = Defaults()
-    steps: Any = Field((), alias="step")
-    """Tables; in a validated script a list of `Step`."""
+    steps: tuple[Step, ...] = Field((), alias="step")
 
 
 def load_script(path: Path, icd: InterfaceDefinition) -> Script:
@@ -474,8 +469,8 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         raise ScriptError(f"{path}: cannot be read: {reason}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ScriptError(f"{path}: not valid TOML: {error}") from None
+    tables = document.pop("step", [])
     script, problems = _checked(Script, {"title": path.stem.replace("_", " "), **document}, path.name)
-    tables = document.get("step", [])
     if not isinstance(tables, list) or not all(isinstance(table, dict) for table in tables):
         problems.append(f"{path.name}: 'step' must be an array of tables: write [[step]] before each")
         tables = []
@@ -483,7 +478,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         problems.append(f"{path.name}: has no steps: write [[step]] and one of the actions below it")
     captured: set[str] = set()
     context = {"icd": icd, "captured": captured, "has_truth": bool(document.get("truth"))}
-    steps = []
+    steps: list[Step | None] = []
     for number, table in enumerate(tables, 1):
         step, found = _step(f"{path.name}: step {number}", table, {**context, "number": number})
         steps.append(step)
@@ -492,7 +487,7 @@ def load_script(path: Path, icd: InterfaceDefinition) -> Script:
         captured.update(names if isinstance(names, dict) else ())  # also of a step with an error
     if problems or script is None:
         raise ScriptError(*problems)
-    return script.model_copy(update={"steps": steps})
+    return script.model_copy(update={"steps": tuple(steps)})
 
 
 def _step(location: str, table: dict[str, Any], context: dict[str, Any]) -> tuple[Step | None, list[str]]:

@@ -7,39 +7,20 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, TypeVar
 
+from starhil.hil_tests import script as scripts
 from starhil.hil_tests.bench import Bench
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BenchError, NackError
-from starhil.hil_tests.expect import resolve, show, show_angle
+from starhil.hil_tests.expect import AttitudeCheck, resolve, show, show_angle
 from starhil.hil_tests.images import write_png
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.load_figures import percentile
-from starhil.hil_tests.raw_traffic import matches, pattern, send_and_listen
-from starhil.hil_tests.results import (
-    FAILED,
-    PASSED,
-    SKIPPED,
-    SessionResult,
-    StepResult,
-    summarize,
-)
-from starhil.hil_tests.script import (
-    Command,
-    DownloadImage,
-    GetParameter,
-    Listen,
-    Read,
-    Restart,
-    Sample,
-    Script,
-    Send,
-    SetParameter,
-    Step,
-    Wait,
-)
-from starhil.hil_tests.transactions import Reading
+from starhil.hil_tests.raw_traffic import matches, send_and_listen
+from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, SessionResult, StepResult, summarize
+from starhil.hil_tests.script import Script, Step
+from starhil.hil_tests.transactions import Ack, Reading
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.values import Value
@@ -48,29 +29,22 @@ MS_PER_S: Final = 1e3
 CLOCK_GRAIN_S: Final = 1e-6
 
 
-@dataclass
-class Outcome:
-    """Outcome of one attempt of an step.
+Answer = TypeVar("Answer", Ack, Reading)
 
-    Attributes
-    ----------
-    problem : str or None
-        The problem; None if the attempt passed.
-    detail : str
-        What was observed.
-    values : mapping
-        Telemetry read.
-    figures : dict
-        Computed numbers.
-    latency_s : float or None
-        Largest latency.
-    """
+
+@dataclass
+class Attempt:
+    """Outcome of one attempt of a step; `problem` is None if it passed, otherwise what was wrong."""
 
     problem: str | None = None
     detail: str = ""
+    """What was observed."""
     values: Mapping[str, Value] = field(default_factory=dict)
+    """Telemetry read."""
     figures: dict[str, float] = field(default_factory=dict)
+    """Computed numbers."""
     latency_s: float | None = None
+    """Largest latency, s."""
 
 
 class SessionRunner:
@@ -130,7 +104,7 @@ class SessionRunner:
         return SessionResult(self._script.title, tuple(results), time.monotonic() - begin, interruption)
 
     def _links_of(self, step: Step) -> tuple[str, ...]:
-        if isinstance(step, Wait | Restart):
+        if isinstance(step, scripts.Wait | scripts.Restart):
             return ("",)
         wanted = step.link or self._script.defaults.link
         if wanted == "both":
@@ -144,180 +118,161 @@ class SessionRunner:
         if link and link not in self._bench.links:
             detail = f"needs a {link} link, the session has {' and '.join(self._bench.links)}"
             return StepResult(step.number, step.name, link, SKIPPED, detail, 0.0)
-        for log in self._bench.logs:
+        for log in self._bench.logs.values():
             log.note(f"step {step.number}: {step.name}")
-        outcome = Outcome()
+        attempt = Attempt()
         for turn in range(step.repeat):
             if turn:
                 time.sleep(step.every_s)
-            outcome = self._try_until_passed(step, link)
-            if outcome.problem is not None:
+            attempt = self._try_until_passed(step, link)
+            if attempt.problem is not None:
                 if step.repeat > 1:
-                    outcome.problem = f"time {turn + 1} of {step.repeat}: {outcome.problem}"
+                    attempt.problem = f"time {turn + 1} of {step.repeat}: {attempt.problem}"
                 break
         return StepResult(
             step.number,
             step.name,
             link,
-            PASSED if outcome.problem is None else FAILED,
-            outcome.detail if outcome.problem is None else outcome.problem,
+            PASSED if attempt.problem is None else FAILED,
+            attempt.detail if attempt.problem is None else attempt.problem,
             time.monotonic() - begin,
-            outcome.latency_s,
-            outcome.values,
-            outcome.figures,
+            attempt.latency_s,
+            attempt.values,
+            attempt.figures,
         )
 
-    def _try_until_passed(self, step: Step, link: str) -> Outcome:
+    def _try_until_passed(self, step: Step, link: str) -> Attempt:
         """Try an action once, or repeatedly until its expectations hold or its time is over."""
         deadline = None if step.within_s is None else time.monotonic() + step.within_s
         while True:
-            outcome = self._try_once(step, link)
-            if outcome.problem is None or deadline is None:
-                return outcome
+            attempt = self._try_once(step, link)
+            if attempt.problem is None or deadline is None:
+                return attempt
             if time.monotonic() >= deadline:
-                outcome.problem = f"not within {step.within_s:g} s: {outcome.problem}"
-                return outcome
+                attempt.problem = f"not within {step.within_s:g} s: {attempt.problem}"
+                return attempt
             time.sleep(min(step.every_s, max(0.0, deadline - time.monotonic())))
 
-    def _try_once(self, step: Step, link: str) -> Outcome:
+    def _try_once(self, step: Step, link: str) -> Attempt:
         try:
-            outcome = self._perform(step, link)
+            attempt = self._perform(step, link)
         except (BenchError, ProtocolError) as error:
-            return Outcome(problem=str(error))
+            return Attempt(problem=str(error))
         limit = step.max_latency_s
-        if outcome.problem is None and limit is not None and (outcome.latency_s or 0.0) > limit:
-            outcome.problem = f"latency {outcome.latency_s or 0.0:.4f} s, expected at most {limit:g} s"
-        if outcome.problem is None:
-            self._captured.update({name: outcome.values[key] for name, key in step.capture.items()})
-        return outcome
+        if attempt.problem is None and limit is not None and (attempt.latency_s or 0.0) > limit:
+            attempt.problem = f"latency {attempt.latency_s or 0.0:.4f} s, expected at most {limit:g} s"
+        if attempt.problem is None:
+            self._captured.update({name: attempt.values[key] for name, key in step.capture.items()})
+        return attempt
 
-    def _perform(self, step: Step, link: str) -> Outcome:
-        if isinstance(step, Wait):
-            time.sleep(step.seconds)
-            return Outcome()
-        if isinstance(step, Restart):
-            self._bench.restart(step.signal)
-            return Outcome(detail="ready again")
-        client = self._bench.client(link)
+    def _perform(self, step: Step, link: str) -> Attempt:
         match step:
-            case Command():
-                return self._command(step, client)
-            case Read():
-                return self._read(step, client)
-            case Listen():
-                return self._listen(step, client)
-            case Sample():
-                return self._sample(step, client)
-            case SetParameter():
-                return self._set_parameter(step, client)
-            case GetParameter():
-                return self._compare(step, client.read_parameter(step.parameter.name))
-            case DownloadImage():
-                return self._download(step, client)
-            case Send():
-                return self._send(step, client)
+            case scripts.Wait():
+                time.sleep(step.seconds)
+                return Attempt()
+            case scripts.Restart():
+                self._bench.restart(step.signal)
+                return Attempt(detail="ready again")
+            case scripts.Command():
+                return self._command(step, self._bench.client(link))
+            case scripts.Read():
+                return self._read(step, self._bench.client(link))
+            case scripts.Listen():
+                return self._listen(step, self._bench.client(link))
+            case scripts.Sample():
+                return self._sample(step, self._bench.client(link))
+            case scripts.SetParameter():
+                return self._set_parameter(step, self._bench.client(link))
+            case scripts.GetParameter():
+                return self._compare(step, self._bench.client(link).read_parameter(step.parameter.name))
+            case scripts.DownloadImage():
+                return self._download(step, self._bench.client(link))
+            case scripts.Send():
+                return self._send(step, self._bench.client(link))
             case _:
                 raise TypeError(f"{type(step).__name__}: no such step")
 
     # --- actions ---
 
-    def _command(self, step: Command, client: ObcClient) -> Outcome:
-        row = step.row
-        if step.raw is None:
+    def _command(self, step: scripts.Command, client: ObcClient) -> Attempt:
+        row, data = step.row, step.raw
+        if data is None:
             variables = self._variables()
             values = {
                 name: _whole_as_integer(resolve(value, variables)) for name, value in step.values.items()
             }
             data = row.encode(values, check=step.refused is None)
-        else:
-            data = step.raw
+        return self._exchange(step.refused, client.command_raw, row.name, data, **_patience(step))[0]
 
-        def send() -> float:
-            return client.command_raw(
-                row.name, data, timeout_s=step.timeout_s, retries=step.retries
-            ).latency_s
-
-        return self._expect_acceptance_or_refusal(send, step.refused)
-
-    def _set_parameter(self, step: SetParameter, client: ObcClient) -> Outcome:
+    def _set_parameter(self, step: scripts.SetParameter, client: ObcClient) -> Attempt:
         parameter = step.parameter
         value = resolve(step.value, self._variables())
-        accepted = step.refused is None
-
-        def send() -> float:
-            return client.set_parameter(
-                parameter.name, value, timeout_s=step.timeout_s, retries=step.retries, checked=accepted
-            ).latency_s
-
-        outcome = self._expect_acceptance_or_refusal(send, step.refused)
-        if outcome.problem is None and step.refused is None:
+        checked = step.refused is None
+        attempt, ack = self._exchange(
+            step.refused, client.set_parameter, parameter.name, value, **_patience(step), checked=checked
+        )
+        if ack is not None and checked:
             seen = client.get_parameter(parameter.name)
             wanted = parameter.check(value)
             if seen != wanted and not (
                 isinstance(seen, float) and abs(seen - float(wanted)) <= 1e-6 * abs(seen)
             ):
-                outcome.problem = f"{parameter.name} reads back as {show(seen)}, expected {show(wanted)}"
-            outcome.detail = f"{parameter.name}={show(seen)}"
-        return outcome
+                attempt.problem = f"{parameter.name} reads back as {show(seen)}, expected {show(wanted)}"
+            attempt.detail = f"{parameter.name}={show(seen)}"
+        return attempt
+
+    def _read(self, step: scripts.Read, client: ObcClient) -> Attempt:
+        attempt, reading = self._exchange(step.refused, client.read, step.row.name, **_patience(step))
+        return attempt if reading is None or attempt.problem else self._compare(step, reading)
 
     @staticmethod
-    def _expect_acceptance_or_refusal(act: Callable[[], float], refused: str | None) -> Outcome:
-        """Send a request that must be accepted, or refused with the code named by `refused`."""
+    def _exchange(
+        refused: str | None, send: Callable[..., Answer], *arguments: Any, **options: Any
+    ) -> tuple[Attempt, Answer | None]:
+        """Send a request that must be accepted, or refused with the code named by `refused`; return its answer too."""
         try:
-            latency = act()
+            answer = send(*arguments, **options)
         except NackError as error:
             if refused is None:
                 raise
             if error.code_name != refused:
-                return Outcome(problem=f"refused with {error.code} ({error.code_name}), expected {refused}")
-            return Outcome(detail=f"refused with {error.code} ({refused}), as expected")
+                problem = f"refused with {error.code} ({error.code_name}), expected {refused}"
+                return Attempt(problem=problem), None
+            return Attempt(detail=f"refused with {error.code} ({refused}), as expected"), None
         if refused is not None:
-            return Outcome(problem=f"accepted, expected to be refused with {refused}")
-        return Outcome(detail="accepted", latency_s=latency)
+            return Attempt(problem=f"accepted, expected to be refused with {refused}"), answer
+        return Attempt(detail="accepted", latency_s=answer.latency_s), answer
 
-    def _read(self, step: Read, client: ObcClient) -> Outcome:
-        readings: list[Reading] = []
-
-        def ask() -> float:
-            reading = client.read(step.row.name, timeout_s=step.timeout_s, retries=step.retries)
-            readings.append(reading)
-            return reading.latency_s
-
-        outcome = self._expect_acceptance_or_refusal(ask, step.refused)
-        if outcome.problem is not None or not readings:
-            return outcome
-        return self._compare(step, readings[0])
-
-    def _listen(self, step: Listen, client: ObcClient) -> Outcome:
-        outcome = Outcome()
+    def _listen(self, step: scripts.Listen, client: ObcClient) -> Attempt:
+        attempt = Attempt()
         times = [time.monotonic()]
         for _ in range(step.count):
             reading = client.wait_unsolicited(
                 step.row.name, timeout_s=step.timeout_s or self._script.defaults.timeout_s, since_s=times[0]
             )
             times.append(reading.received_s)
-            outcome = self._compare(step, reading)
-            if outcome.problem is not None:
-                return outcome
-        outcome.latency_s = None
+            attempt = self._compare(step, reading)
+            if attempt.problem is not None:
+                return attempt
+        attempt.latency_s = None
         if step.count > 1:  # without the wait for the first reading
-            outcome.figures["rate_hz"] = (step.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
-        return outcome
+            attempt.figures["rate_hz"] = (step.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
+        return attempt
 
-    def _sample(self, step: Sample, client: ObcClient) -> Outcome:
+    def _sample(self, step: scripts.Sample, client: ObcClient) -> Attempt:
         path = self._folder / step.file
         fields = list(step.row.named_fields)
         latencies: list[float] = []
         crosses: list[float] = []
         problems: list[str] = []
         count = 0
-        last = Outcome()
+        last = Attempt()
         begin = time.monotonic()
         with path.open("w", newline="", encoding="utf-8", buffering=1) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])
             while time.monotonic() - begin < step.for_s or count == 0:
-                reading = client.read(step.row.name, timeout_s=step.timeout_s, retries=step.retries)
+                reading = client.read(step.row.name, **_patience(step))
                 values = [_csv_text(reading[name]) for name in fields]
                 writer.writerow(
                     [f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}", *values]
@@ -347,9 +302,9 @@ class SessionRunner:
             problem = (
                 f"only {count} samples arrived in {step.for_s:g} s, expected at least {step.min_samples}"
             )
-        return Outcome(problem, detail, last.values, figures, max(latencies))
+        return Attempt(problem, detail, last.values, figures, max(latencies))
 
-    def _download(self, step: DownloadImage, client: ObcClient) -> Outcome:
+    def _download(self, step: scripts.DownloadImage, client: ObcClient) -> Attempt:
         image = client.download_image(step.size, method=step.method)
         write_png(self._folder / step.file, image.pixels, image.width, image.height)
         figures = {
@@ -360,25 +315,25 @@ class SessionRunner:
         levels = sorted(set(image.pixels))
         detail = f"{image.width}x{image.height} in {image.seconds:.2f} s → {step.file}"
         problem = None if len(levels) > 1 else f"{detail}: the image is blank (all pixels {levels[0]})"
-        return Outcome(problem, detail, {}, figures)
+        return Attempt(problem, detail, {}, figures)
 
     @staticmethod
-    def _send(step: Send, client: ObcClient) -> Outcome:
-        wanted = [pattern(text) for text in step.answer or ()]
-        seen = send_and_listen(client, step.data, step.listen_s, tuple(wanted), step.timeout_s)
+    def _send(step: scripts.Send, client: ObcClient) -> Attempt:
+        wanted = step.answer or ()
+        seen = send_and_listen(client, step.data, step.listen_s, wanted, step.timeout_s)
         shown = ", ".join(text for text in seen if text) or "nothing"
         if step.answer is None:
-            return Outcome(detail=f"came back: {shown}")
+            return Attempt(detail=f"came back: {shown}")
         if client.core.link.name == "serial":
-            wanted = ["".join(wanted)]
+            wanted = ("".join(wanted),)
         if len(seen) == len(wanted) and all(matches(a, b) for a, b in zip(wanted, seen, strict=True)):
-            return Outcome(detail=f"came back: {shown}, as expected")
-        return Outcome(problem=f"came back: {shown}, expected {', '.join(filter(None, wanted)) or 'nothing'}")
+            return Attempt(detail=f"came back: {shown}, as expected")
+        return Attempt(problem=f"came back: {shown}, expected {', '.join(filter(None, wanted)) or 'nothing'}")
 
     # --- judging ---
 
-    def _compare(self, step: Step, reading: Reading) -> Outcome:
-        outcome = Outcome(
+    def _compare(self, step: Step, reading: Reading) -> Attempt:
+        attempt = Attempt(
             detail=summarize(reading.values), values=reading.values, latency_s=reading.latency_s or None
         )
         variables = self._variables()
@@ -388,17 +343,15 @@ class SessionRunner:
             if (text := wanted.mismatch(field, reading[field], variables)) is not None
         ]
         if step.expect and not problems:
-            outcome.detail = " ".join(f"{field}={show(reading[field])}" for field in step.expect)
+            attempt.detail = " ".join(f"{field}={show(reading[field])}" for field in step.expect)
         if step.attitude is not None and not problems:
-            problems += self._judge_attitude(step, reading, outcome)
-        if problems:
-            outcome.problem = "; ".join(problems)
-        return outcome
+            problems += self._judge_attitude(step, step.attitude, reading, attempt)
+        attempt.problem = "; ".join(problems) or None
+        return attempt
 
-    def _judge_attitude(self, step: Step, reading: Reading, outcome: Outcome) -> list[str]:
-        check = step.attitude
-        if check is None:
-            return []
+    def _judge_attitude(
+        self, step: Step, check: AttitudeCheck, reading: Reading, attempt: Attempt
+    ) -> list[str]:
         truth = check.attitude or self._script.truth.attitude
         if truth is None:
             if self._truth_log is None:
@@ -408,17 +361,18 @@ class SessionRunner:
             truth = self._truth_log.at(float(reading["time_of_exposure"]))
         error, problem = check.judge(reading.values, truth)
         if error is not None:
-            outcome.figures.update(
-                cross_boresight_arcsec=error.cross_boresight_arcsec,
-                roll_arcsec=error.roll_arcsec,
-                total_arcsec=error.total_arcsec,
-            )
-            outcome.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"
+            attempt.figures.update(vars(error))
+            attempt.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"
         return [] if problem is None else [problem]
 
     def _variables(self) -> dict[str, Value]:
         now = time.time()
         return {**self._captured, "now": now, "now_s": int(now), "now_ms": int(now % 1.0 * MS_PER_S)}
+
+
+def _patience(step: Step) -> dict[str, Any]:
+    """Return how long and how often the client asks."""
+    return {"timeout_s": step.timeout_s, "retries": step.retries}
 
 
 def _whole_as_integer(value: Value) -> Value:

@@ -15,6 +15,7 @@ from starhil.protocol.link_schema import (
     CheckModel,
     CrcCheck,
     CustomCheck,
+    FletcherCheck,
     NoCheck,
     SumCheck,
     XorCheck,
@@ -53,8 +54,9 @@ def build_check(
         case SumCheck():
             compute = _sum_function(SCALAR_SIZES[model.type], model.complement, order)
         case XorCheck():
-            initial = model.init
-            return Check(1, frozenset(model.covers), lambda covered: bytes((reduce(xor, covered, initial),)))
+            compute = _xor_function(SCALAR_SIZES[model.type], model.init, order)
+        case FletcherCheck():
+            compute = _fletcher_function(model.modulus, order)
         case CrcCheck():
             compute = _crc_function(model, order)
         case XxHashCheck():
@@ -83,6 +85,25 @@ def _sum_function(width: int, complement: str, order: Order) -> CheckFunction:
         if complement != "none":
             total = ~total + (complement == "twos")
         return (total & mask).to_bytes(width, order)
+
+    return compute
+
+
+def _xor_function(width: int, initial: int, order: Order) -> CheckFunction:
+    if initial >= 1 << 8 * width:
+        raise IcdError(f"link.serial.check: init {initial:#x} does not fit u{8 * width}")
+    first = initial.to_bytes(width, order)
+    # words of either byte order: each byte of the checksum is the XOR of every second byte
+    return lambda covered: bytes(reduce(xor, covered[place::width], first[place]) for place in range(width))
+
+
+def _fletcher_function(modulus: int, order: Order) -> CheckFunction:
+    def compute(covered: bytes) -> bytes:
+        total = sums = 0
+        for byte in covered:
+            total = (total + byte) % modulus
+            sums = (sums + total) % modulus
+        return (sums << 8 | total).to_bytes(2, order)
 
     return compute
 

@@ -56,6 +56,11 @@ class Slot:
     order: Order = "little"
 
     @property
+    def bytewise(self) -> bool:
+        """Whether `struct` has no format for this number, whose bytes are therefore packed here."""
+        return self.type != "bytes" and self.type not in STRUCT_CODES
+
+    @property
     def code(self) -> str:
         """Format of the slot for `struct`, without the byte order."""
         return STRUCT_CODES.get(self.type) or f"{self.size}s"
@@ -379,6 +384,15 @@ class Row(RowKeys):
         return tuple(runs)
 
     @cached_property
+    def _bytewise(self) -> tuple[tuple[int, Slot], ...]:
+        """The slots that are packed here, each with its position among the packed values."""
+        return tuple(
+            (position, self.slots[index])
+            for position, index in enumerate(self._sent)
+            if self.slots[index].bytewise
+        )
+
+    @cached_property
     def _values(self) -> tuple[tuple[str, Field, int], ...]:
         """Name, field, and position of its slot among the packed values."""
         return tuple(
@@ -419,6 +433,8 @@ class Row(RowKeys):
                 value = item.empty
             packed: Any = item.to_raw(value, where, check=check, saturate=saturate, index=index)
             raw[position] = raw[position] | packed << item.shift if item.width else packed
+        for position, slot in self._bytewise:
+            raw[position] = raw[position].to_bytes(slot.size, slot.order, signed=slot.type.startswith("i"))
         numbers = iter(raw)
         return b"".join(packer.pack(*islice(numbers, count)) for packer, count in self._runs)
 
@@ -436,6 +452,8 @@ class Row(RowKeys):
         for packer, _ in self._runs:
             raw += packer.unpack_from(data, offset)
             offset += packer.size
+        for position, slot in self._bytewise:
+            raw[position] = int.from_bytes(raw[position], slot.order, signed=slot.type.startswith("i"))
         values: dict[str, Value] = {}
         for index, (name, item, position) in enumerate(self._values):
             number = raw[position]

@@ -145,8 +145,8 @@ class Slip(Framing):
 
     ::
 
-    [end]  body, end -> escape substitute 1, escape -> escape substitute 2  end
-      C0   01 DB DC 02 DB DD  (the body 01 C0 02 DB)                         C0
+        [end]  body, end -> escape substitute 1, escape -> escape substitute 2  end
+          C0   01 DB DC 02 DB DD  (the body 01 C0 02 DB)                         C0
     """
 
     def __init__(self, model: SlipFraming) -> None:

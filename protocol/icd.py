@@ -300,7 +300,7 @@ class _Reader:
         telemetry = self._build_rows("telemetry")
         for row in self._rows.values():
             self._attempt(self._check_answers, row)
-        self._attempt(self._check_errors, errors_file, errors)
+        self._attempt(self._check_errors, errors_file, errors, conventions)
         definition = InterfaceDefinition(
             name=self._unit.name,
             version=self._unit.version,
@@ -359,13 +359,17 @@ class _Reader:
         self._add(self._classes, item.name, item, where)
 
     @staticmethod
-    def _check_errors(file: Path, errors: Mapping[str, int]) -> None:
+    def _check_errors(file: Path, errors: Mapping[str, int], conventions: Conventions) -> None:
         known = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
         for name in errors:
             if name not in known:
                 raise IcdError(
                     f"{file}: errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
                 )
+        if "crc" in errors and not conventions.telecommand_crc:
+            raise IcdError(
+                f"{file}: errors.crc: never sent, because a message with a wrong checksum is not answered; remove it"
+            )
 
     def _check_link(self, file: Path, definition: InterfaceDefinition) -> None:
         """Check that the parts of the links are compatible with each other and with the rows."""

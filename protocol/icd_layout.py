@@ -26,6 +26,8 @@ NUMBER: Final = "[n]"
 _KINDS: Final[dict[str, FieldKind]] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
 _UNPLACED: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
 """The defaults of a field."""
+SMALLEST_SCALE: Final = 1e-100
+"""Smallest magnitude of a scale."""
 MAX_NAMES: Final = 256
 """Maximum number of fields that one text may expand to."""
 
@@ -262,8 +264,8 @@ class Layout:
     def _check_numbers(
         model: FieldModel | BitModel, where: str, type_: str, limits: tuple[int, int] | None
     ) -> None:
-        if model.scale == 0.0:
-            raise IcdError(f"{where}: scale is 0")
+        if abs(model.scale) < SMALLEST_SCALE:
+            raise IcdError(f"{where}: scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}")
         if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
             raise IcdError(f"{where}: min {model.minimum:g} is above max {model.maximum:g}")
         if model.wrap and not type_.startswith("u"):
@@ -273,8 +275,12 @@ class Layout:
         if limits is None:
             return
         described = f"type {type_}" if isinstance(model, FieldModel) else f"{type_[1:]} bits"
-        for name, value in (("min", model.minimum), ("max", model.maximum), ("const", model.const)):
-            if value is not None and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]:
+        numbers = {"min": model.minimum, "max": model.maximum, "const": model.const, "default": model.default}
+        for name, value in numbers.items():
+            if (
+                isinstance(value, int | float)
+                and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]
+            ):
                 raise IcdError(f"{where}: {name} {value:g} does not fit {described} with its scale")
 
 

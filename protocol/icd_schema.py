@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.conventions import Conventions, Order
@@ -18,14 +18,16 @@ from starhil.protocol.values import (
     DeviceParameter,
     EnumDefinition,
     Name,
+    Number,
     ParameterType,
     Scalar,
     Section,
+    bounded,
 )
 
 Provenance = Literal["confirmed", "proxy", "ours"]
 FieldType = Literal[
-    "u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64",
+    "u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "f32", "f64",
     "enum8", "enum16", "enum32", "bits8", "bits16", "bits32", "bytes", "text",
 ]  # fmt: skip
 
@@ -64,7 +66,7 @@ class BitKeys(DefinitionModel):
     """Quantity that a telemetry field reports."""
     argument: str | None = None
     """Argument of the row's action that a telecommand field sets."""
-    const: int | float | None = None
+    const: Annotated[int | float, AfterValidator(bounded)] | None = None
     """Value that is always sent, and required in a telecommand."""
     doc: str = ""
     """Description."""
@@ -76,13 +78,13 @@ class FieldKeys(BitKeys):
     unit: str = ""
     """Unit of the physical value, converted from or to the unit of the quantity or argument
     (s, ms, us, ns; rad, deg, arcmin, arcsec; rad/s, deg/s …)."""
-    scale: float = 1.0
+    scale: Number = 1.0
     """Physical = raw × scale + offset."""
-    bias: float = Field(default=0.0, alias="offset")
+    bias: Number = Field(default=0.0, alias="offset")
     """Physical = raw × scale + offset."""
-    minimum: float | None = Field(default=None, alias="min")
+    minimum: Number | None = Field(default=None, alias="min")
     """Lowest physical value."""
-    maximum: float | None = Field(default=None, alias="max")
+    maximum: Number | None = Field(default=None, alias="max")
     """Highest physical value."""
     wrap: bool = False
     """Whether an out-of-range value is sent modulo the range (a counter) instead of as the nearest limit."""

@@ -19,7 +19,9 @@ HEX: Final = {"format": "hex"}
 Code = Annotated[int, Field(ge=0, le=0xFFFF, json_schema_extra=HEX)]
 Byte = Annotated[int, Field(ge=0, le=0xFF, json_schema_extra=HEX)]
 CheckType = Literal["u8", "u16", "u32", "u64"]
-HeaderType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "u64", "i64", "bits8", "bits16", "bits32"]
+HeaderType = Literal[
+    "u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u64", "i64", "bits8", "bits16", "bits32"
+]
 CoveredPart = Literal["start", "header", "data"]
 SizedPart = Literal["start", "header", "data", "check", "end"]
 Role = Literal[
@@ -181,12 +183,23 @@ class SumCheck(_CheckModel):
 
 
 class XorCheck(_CheckModel):
-    """XOR of the bytes."""
+    """XOR of the bytes, or of words of two bytes."""
 
     kind: Literal["xor"]
     """Selects this check."""
-    init: Byte = 0
+    type: Literal["u8", "u16"] = "u8"
+    """Width: a byte, or a word in the byte order of the checksum. A zero completes an odd number of bytes."""
+    init: Code = 0
     """Initial value."""
+
+
+class FletcherCheck(_CheckModel):
+    """Fletcher's checksum of two bytes: the lower is the sum of the bytes, the upper the sum of these sums."""
+
+    kind: Literal["fletcher16"]
+    """Selects this check."""
+    modulus: Literal[255, 256] = 255
+    """Number below which both sums stay: 255, or 256 as in RFC 1146 and UBX."""
 
 
 class CrcCheck(_CheckModel):
@@ -225,7 +238,8 @@ class CustomCheck(_CheckModel):
 
 
 CheckModel = Annotated[
-    NoCheck | SumCheck | XorCheck | CrcCheck | XxHashCheck | CustomCheck, Field(discriminator="kind")
+    NoCheck | SumCheck | XorCheck | FletcherCheck | CrcCheck | XxHashCheck | CustomCheck,
+    Field(discriminator="kind"),
 ]
 
 

@@ -10,9 +10,9 @@ import struct
 from collections.abc import Mapping
 from functools import cached_property
 from types import MappingProxyType
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from starhil.protocol.errors import ProtocolError
@@ -20,7 +20,20 @@ from starhil.protocol.messages import ErrorCode
 
 Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 ParameterType = Literal["u8", "i8", "u16", "i16", "u32", "i32", "f32", "f64", "bool", "enum8"]
-Scalar = bool | int | float | str
+_Scalar = TypeVar("_Scalar", bound=bool | int | float | str)
+LARGEST: Final = 1e100
+"""Largest magnitude of a number in a definition: divided by a scale, it is finite."""
+
+
+def bounded(value: _Scalar) -> _Scalar:
+    """Return a value that is not too large for a definition."""
+    if isinstance(value, int | float) and abs(value) > LARGEST:
+        raise PydanticCustomError("bounded", f"a number is at most {LARGEST:g}")
+    return value
+
+
+Number = Annotated[float, AfterValidator(bounded)]
+Scalar = Annotated[bool | int | float | str, AfterValidator(bounded)]
 Value = bool | int | float | str | bytes
 """A physical value: a flag, a number in its unit, the name of a member of an enumeration, or raw bytes."""
 
@@ -28,7 +41,7 @@ INTEGER_RANGES: Final[Mapping[str, tuple[int, int]]] = MappingProxyType(
     {
         f"{sign}{bits}": (0, 2**bits - 1) if sign == "u" else (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1)
         for sign in "ui"
-        for bits in (8, 16, 32, 64)
+        for bits in (8, 16, 24, 32, 64)
     }
 )
 """Lowest and highest raw value of each integer type."""
@@ -81,7 +94,7 @@ class FieldError(MessageError):
 class DefinitionModel(BaseModel):
     """A table of a definition; unknown keys and wrong types are rejected."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
 class EnumDefinition(DefinitionModel):

@@ -19,7 +19,7 @@ from numba.core.compiler import CompilerBase, CompileResult, DefaultPassBuilder
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.typed_passes import NativeLowering
 
-from starid.jit import KernelFunction, StoredKernel, record_name
+from starid.kernel_store import KernelStore, StoredKernel, record_name
 
 _njit: Any = njit
 _codegen: Any = codegen
@@ -160,14 +160,14 @@ def without_literals(dispatcher: Any) -> Any:
 class KernelCache:
     """The disk cache of one kernel, as numba uses it: to write it, and to load what `starid.machine_code` cannot."""
 
-    def __init__(self, kernel: KernelFunction) -> None:
-        self._kernel = kernel
+    def __init__(self, store: KernelStore) -> None:
+        self._store = store
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return a cached kernel, or None."""
         target_context.refresh()
         arguments, _ = _normalize_signature(signature)
-        stored = self._kernel.read(names_of_types(arguments))
+        stored = self._store.read(names_of_types(arguments))
         if stored is None:
             return None
         name, description, *rest = pickle.loads(stored.description)  # noqa: S301 (this package's own cache)
@@ -179,7 +179,7 @@ class KernelCache:
 
     def save_overload(self, _signature: Any, kernel: Any) -> None:
         """Cache a kernel that was compiled."""
-        self._kernel.compilations += 1
+        self._store.compilations += 1
         if kernel.library.has_dynamic_globals or kernel.reload_init:
             return  # refers to objects of this process
         (name, _, (code, _)), description, *rest = kernel._reduce()  # noqa: SLF001
@@ -191,7 +191,7 @@ class KernelCache:
             list(used.items()),
             _dumps((name, description, *rest)),
         )
-        self._kernel.write(names_of_types(description.argtypes), stored)
+        self._store.write(names_of_types(description.argtypes), stored)
 
 
 def inner_dispatcher(function: Any, options: dict[str, Any]) -> Any:
@@ -202,25 +202,25 @@ def inner_dispatcher(function: Any, options: dict[str, Any]) -> Any:
     )
 
 
-def kernel_dispatcher(kernel: KernelFunction) -> Any:
+def kernel_dispatcher(store: KernelStore, options: dict[str, Any]) -> Any:
     """Return the dispatcher of a kernel that Python calls, which caches the kernel on disk."""
-    dispatcher = _njit(nogil=True, no_cfunc_wrapper=True, **kernel.options)(kernel.py_func)
-    dispatcher._cache = KernelCache(kernel)  # noqa: SLF001
+    dispatcher = _njit(nogil=True, no_cfunc_wrapper=True, **options)(store.function)
+    dispatcher._cache = KernelCache(store)  # noqa: SLF001
     return dispatcher
 
 
-def compile_kernel(kernel: KernelFunction, types: str, arguments: tuple[Any, ...]) -> Callable[..., Any]:
-    """Compile a kernel, or load it from the cache, for the types of some arguments.
+def compile_kernel(dispatcher: Any, types: str, arguments: tuple[Any, ...]) -> Callable[..., Any]:
+    """Compile a kernel, given its dispatcher, or load it from the cache, for the types of some arguments.
 
     Raises
     ------
     TypeError
         `starid.jit` and numba name the types differently, so the kernel would never be found in the cache.
     """
-    signature = tuple(kernel.entry.typeof_pyval(each) for each in arguments)
+    signature = tuple(dispatcher.typeof_pyval(each) for each in arguments)
     if names_of_types(signature) != types:
-        raise TypeError(f"{kernel.py_func.__name__}: arguments of types {types}, in numba {signature}")
-    return cast("Callable[..., Any]", kernel.entry.compile(signature))
+        raise TypeError(f"{dispatcher.py_func.__name__}: arguments of types {types}, in numba {signature}")
+    return cast("Callable[..., Any]", dispatcher.compile(signature))
 
 
 def names_of_types(signature: Iterable[Any]) -> str:

@@ -17,13 +17,12 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import Any, Final, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from starid.jit import StoredKernel
+from starid.kernel_store import StoredKernel
 
 _HEADER: Final = np.dtype(
     {

@@ -138,6 +138,14 @@ class AroundOptions:
             "127.0.0.1.",
         ),
     ] = "off"
+    view_token: Annotated[
+        str | None,
+        typer.Option(
+            envvar="STARHIL_VIEW_TOKEN",
+            help="Token of a second address of the console (`view_only` on the ready line), whose pages can look but not "
+            "command. It is the same in the next run, so that such pages reconnect.",
+        ),
+    ] = None
     record: Annotated[
         list[Path] | None,
         typer.Option(
@@ -153,6 +161,8 @@ class AroundOptions:
 
         if self.control_token is not None and not self.control_token:
             raise EmulatorError("--control-token: empty; give a text, or omit the option")
+        if self.view_token is not None and (not self.view_token or self.view == "off"):
+            raise EmulatorError("--view-token: needs a text, and --view")
         folder, mcap = (_one_path(self.record, mcap=mcap) for mcap in (False, True))
         for path, option in ((self.truth_log, "--truth-log"), (mcap, "--record")):
             if path is not None:
@@ -165,6 +175,7 @@ class AroundOptions:
             self.scenario,
             record=folder,
             view=self.view,
+            view_token=self.view_token or "",
             mcap=mcap,
             make_client=ConsoleClient,
         )

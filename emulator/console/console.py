@@ -37,11 +37,16 @@ TURN_S: Final = 0.1
 STATUS_S: Final = 0.5
 """Interval at which the status of the run is reported, seconds."""
 
+LINK_NAMES: Final = {"serial": "serial", "can": "CAN"}
+
 POLL_S: Final = 1.0
 """Period in which every telemetry row shown on a page is read once, seconds."""
 
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
+
+LOOKS: Final = frozenset({"subscribe", "encode", "parameters"})
+"""Requests that a page for viewing only may make."""
 
 
 class Console:
@@ -77,6 +82,7 @@ class Console:
             "point": self._point,
             "clock": self._set_clock,
             "encode": self._encode,
+            "parameters": self._parameters,
             "send": self._send,
             "read": self._read,
             "clear_session": self._clear_session,
@@ -147,7 +153,8 @@ class Console:
     async def welcome(self, viewer: Viewer) -> bytes:
         """Send the description of the run to a page; return the history as rows of 64-bit floats."""
         stars = await self._stars if self._stars is not None else {}
-        content = describe(self._run, self._head) | stars | {"session_steps": self.obc.steps}
+        content = describe(self._run, self._head) | stars
+        content |= {"session_steps": self.obc.steps, "view_only": not viewer.commands}
         viewer.send(json.dumps({"type": "hello", **content}))
         viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
         for message in self.runs.messages():
@@ -207,10 +214,23 @@ class Console:
                 "viewers": len(self.viewers),
                 "stepping": self.stepping.speed,
                 "session_steps": self.obc.steps,
+                "heard": self._heard(),
                 "wall_s": time.time(),
             }
         )
         await asyncio.sleep(STATUS_S)
+
+    def _heard(self) -> list[dict[str, Any]]:
+        """Return for each link its name, how many requests the OBC has sent on it, and the age of the last, seconds."""
+        now_s = asyncio.get_running_loop().time()
+        return [
+            {
+                "link": "CANopen" if link is self._head.canopen else LINK_NAMES[link.bus],
+                "requests": link.heard.requests,
+                "age_s": None if link.heard.last_s is None else round(now_s - link.heard.last_s, 1),
+            }
+            for link in self._head.links
+        ]
 
     async def _poll_telemetry(self) -> None:
         """Read every row that is shown on a page once."""
@@ -234,6 +254,8 @@ class Console:
         action = self._actions.get(str(request.get("do")))
         if action is None:
             return {**identity, "ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+        if not viewer.commands and request["do"] not in LOOKS:
+            return {**identity, "ok": False, "error": "view only: the token of this page may not command"}
         try:
             return {**identity, "ok": True, **await action(viewer, request)}
         except (EmulatorError, ProtocolError, StaridError) as error:
@@ -283,6 +305,11 @@ class Console:
         row, data, _, problem = self.obc.encode(str(request.get("row")), _table(request, "values"))
         address = int(self._head.device.parameters[self._address])
         return {"problem": problem, **self._requests.encode(row, data, CONSOLE_ADDRESS, address)}
+
+    async def _parameters(self, _viewer: Viewer, _request: dict[str, Any]) -> dict[str, Any]:
+        """Return the present values of the parameters by name, as numbers."""
+        present, known = self._head.device.parameters, self._head.icd.device_parameters
+        return {"values": {name: known[name].to_number(present[name]) for name in known}}
 
     async def _send(self, _viewer: Viewer, request: dict[str, Any]) -> dict[str, Any]:
         exchange = await self.obc.send(str(request.get("row")), _table(request, "values"))

@@ -27,7 +27,7 @@ async def open_obc(head: Head, make_client: MakeClient, closers: list[Callable[[
     if bus == "serial":
         from starhil.protocol.transports.serial import open_serial
 
-        separate = SerialLink(head.requests, open_serial("auto", paced=False))
+        separate = SerialLink(head.requests, open_serial("auto", paced=False), console=True)
     elif head.canopen if icd.canopen_only else head.can:
         where = head.ready_fields["can"]
     else:

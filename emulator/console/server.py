@@ -11,7 +11,7 @@ import secrets
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, cast
-from urllib.parse import urlsplit
+from urllib.parse import quote, urlsplit
 
 from aiohttp import WSMsgType, web
 from aiohttp.http import HttpProcessingError
@@ -64,18 +64,22 @@ class ConsoleServer:
 
     Parameters
     ----------
-    token
-        Token that the address of every page must contain; by default a random one.
+    view_token
+        Another token, whose pages may look but not command; empty: there is none.
     """
 
-    def __init__(self, consoles: Sequence[Console], token: str | None = None) -> None:
+    def __init__(self, consoles: Sequence[Console], view_token: str = "") -> None:
         self._consoles = consoles
-        self.token = secrets.token_urlsafe(18) if token is None else token
+        self.token = secrets.token_urlsafe(18)
+        self._view_token = view_token
         self._runner: web.AppRunner | None = None
         self._listener: asyncio.Server | None = None
 
-    async def start(self, where: str) -> str:
-        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the address of the page."""
+    async def start(self, where: str) -> dict[str, str]:
+        """Listen on `auto` (loopback interface, a free port) or HOST:PORT; return the addresses of the page.
+
+        They are fields of the ready line: `view`, and with a view token `view_only`.
+        """
         host, port = parse_address(where)
         app = web.Application(middlewares=[self._guard], client_max_size=LARGEST_REPORT)
         for path in ("/", "/runs"):
@@ -107,7 +111,9 @@ class ConsoleServer:
             ) from None
         bound = self._listener.sockets[0].getsockname()
         name = f"[{bound[0]}]" if ":" in bound[0] else bound[0]
-        return f"http://{name}:{bound[1]}/?token={self.token}"
+        page = f"http://{name}:{bound[1]}/?token="
+        only = {"view_only": page + quote(self._view_token, safe="")} if self._view_token else {}
+        return {"view": page + self.token, **only}
 
     async def close(self) -> None:
         """Stop listening and close all connections."""
@@ -127,7 +133,9 @@ class ConsoleServer:
             return web.Response(
                 status=403, text="403: the request comes from a page of another origin\n", headers=HEADERS
             )
-        if not request.path.startswith("/static/") and not self._token_is_valid(request):
+        commands = self._has_token(request, self.token)
+        looks = request.method == "GET" and self._has_token(request, self._view_token)
+        if not (commands or looks or request.path.startswith("/static/")):
             text = (
                 "403: the token in the address is missing or wrong; the ready line of `starhil run` has it\n"
             )
@@ -142,8 +150,9 @@ class ConsoleServer:
             response.headers.update(HEADERS)
         return response
 
-    def _token_is_valid(self, request: web.Request) -> bool:
-        return hmac.compare_digest(request.query.get("token", "").encode(), self.token.encode())
+    @staticmethod
+    def _has_token(request: web.Request, token: str) -> bool:
+        return token != "" and hmac.compare_digest(request.query.get("token", "").encode(), token.encode())
 
     def _console(self, request: web.Request) -> Console:
         """Return the console of the head that a request names; default: the first."""
@@ -182,7 +191,7 @@ class ConsoleServer:
             return web.Response(status=503, text=f"503: {MAX_VIEWERS} pages are already open\n")
         socket = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=LARGEST_MESSAGE, compress=False)
         await socket.prepare(request)
-        viewer = Viewer(socket)
+        viewer = Viewer(socket, commands=self._has_token(request, self.token))
         history = await console.welcome(viewer)
         tasks: set[asyncio.Task[None]] = set()
         try:

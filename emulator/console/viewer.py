@@ -25,6 +25,8 @@ class Viewer:
 
     Attributes
     ----------
+    commands
+        Whether the page may command.
     frames, wire
         Whether the page shows images, and whether it shows the trace.
     rows
@@ -33,8 +35,9 @@ class Viewer:
         Number of messages and images dropped because the page read too slowly.
     """
 
-    def __init__(self, socket: Socket) -> None:
+    def __init__(self, socket: Socket, *, commands: bool = True) -> None:
         self._socket = socket
+        self.commands = commands
         self._texts: deque[str] = deque()
         self._frame: bytes | None = None
         self._wake = asyncio.Event()

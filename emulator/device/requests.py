@@ -45,14 +45,17 @@ class Requests:
         """Whether replies contain the time."""
         device.signals.row_due.connect(self._send_unsolicited)
 
-    def handle(self, request: Request) -> Answer:
-        """Handle a request from a link; return the replies to send on the same link, in order."""
+    def handle(self, request: Request, *, console: bool = False) -> Answer:
+        """Handle a request from a link; return the replies to send on the same link, in order.
+
+        Telemetry that the `console` requests is not counted: what an OBC has counted still agrees with the device.
+        """
         device = self.device
         if device.unresponsive:
             return []
         if request.kind is RequestKind.TELEMETRY:
             row = self._telemetry_rows.get((request.klass, request.id))
-            device.counters.telemetry = (device.counters.telemetry + 1) & 0xFFFF
+            device.counters.telemetry = (device.counters.telemetry + (not console)) & 0xFFFF
             return self._replies(request, row, self._answer_telemetry(request, row))
         row = self._telecommand_rows.get((request.klass, request.id))
         device.counters.telecommands = (device.counters.telecommands + 1) & 0xFFFF

@@ -6,7 +6,7 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 
@@ -29,6 +29,20 @@ FLUSH_S: Final = 0.51
 """Delay after which an incomplete message is dropped, seconds; just above the receivers' timeout, 0.5 s."""
 
 
+@dataclass
+class Heard:
+    """Requests of the OBC on a link, without those of the console."""
+
+    requests: int = 0
+    last_s: float | None = None
+    """Time of the last one on the loop's clock, seconds; None before the first."""
+
+    def count(self) -> None:
+        """Count a request."""
+        self.requests += 1
+        self.last_s = asyncio.get_running_loop().time()
+
+
 class BusLink(ABC, Generic[Item]):
     """Connects a device to a transport."""
 
@@ -41,6 +55,8 @@ class BusLink(ABC, Generic[Item]):
         device = self._device = requests.device
         self._requests = requests
         self.transport: Final = transport
+        self.heard: Final = Heard()
+        """Requests of the OBC."""
         self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
         """Outgoing side of the link, with its faults."""
         self._timer: Event | None = None
@@ -102,6 +118,10 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
     def _send(self, reply: Reply, style: Style) -> None:
         """Send a reply."""
 
+    @abstractmethod
+    def _is_console(self, request: Request) -> bool:
+        """Return whether console or recording sent a request."""
+
     def _send_unsolicited(self, reply: Reply) -> None:
         """Send unsolicited telemetry."""
         if self._executing:
@@ -123,9 +143,12 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
             self._requests.count_fault(event)
             return
         style = self._reply_style()  # a change of format is answered in the old format
+        console = self._is_console(event)
+        if not console:
+            self.heard.count()
         self._executing = True
         try:
-            answer = self._requests.handle(event)
+            answer = self._requests.handle(event, console=console)
         finally:
             self._executing = False
         if isinstance(answer, PendingAnswer):

@@ -12,6 +12,7 @@ from typing import ClassVar
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
 from starhil.emulator.links.bus_address import BusAddress
+from starhil.emulator.links.traffic import CONSOLE_ADDRESS
 from starhil.protocol.can_framing import (
     MAX_EXTENDED_ID,
     MAX_FRAME_DATA,
@@ -21,7 +22,7 @@ from starhil.protocol.can_framing import (
     CanId,
     encode_reply_frames,
 )
-from starhil.protocol.messages import Reply
+from starhil.protocol.messages import Reply, Request
 from starhil.protocol.transports.base import Transport
 
 
@@ -88,6 +89,9 @@ class CanLink(DeviceLink[CanFrame, int]):
         if item.extended and CanId.unpack(item.id).source == self._address.number:
             self._address.report_duplicate()
         super()._receive(item)
+
+    def _is_console(self, request: Request) -> bool:
+        return request.source == CONSOLE_ADDRESS
 
     def _new_receiver(self) -> CanDeviceReceiver:
         return CanDeviceReceiver(self._reply_style())

@@ -23,6 +23,7 @@ from starhil.emulator.pipeline.messages import ImageResult
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import GreyImage, abort_of, check_status
+from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.context import UNCONFIGURED, EventKind, SlaveEvent
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
@@ -224,6 +225,8 @@ class CanopenLink(BusLink[CanFrame]):
 
     def _receive(self, item: CanFrame) -> None:
         if not item.extended and not self._device.unresponsive:
+            if item.id == SDO_RECEIVE + self.slave.node_id:
+                self.heard.count()
             self._run_action(partial(self.slave.receive, item))
 
     def _run_action(self, action: Action) -> None:

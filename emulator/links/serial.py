@@ -39,11 +39,19 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
     """Connects a device to a serial transport, at the bit rate in its parameter `serial_baud`.
 
     The CubeSpace family has three dialects of replies, of which only c has unsolicited telemetry.
+
+    Parameters
+    ----------
+    console
+        Whether the line is that of console and recording.
     """
 
     bus: ClassVar[str] = "serial"
 
-    def __init__(self, requests: Requests, transport: SerialTransport, seed: int = 0) -> None:
+    def __init__(
+        self, requests: Requests, transport: SerialTransport, seed: int = 0, *, console: bool = False
+    ) -> None:
+        self._console = console
         self._stack = build_serial_stack(requests.device.icd)
         super().__init__(requests, transport, SerialDamage(), seed)
         self._port = transport
@@ -67,6 +75,9 @@ class SerialLink(DeviceLink[bytes, Dialect | None]):
         if self._baud != self._wanted_baud():
             self._baud = self._wanted_baud()
             self._port.set_baud(self._baud)
+
+    def _is_console(self, request: Request) -> bool:  # noqa: ARG002 (nobody else is on its line)
+        return self._console
 
     def _new_receiver(self) -> Receiver[bytes, Request]:
         return self._stack.device()

@@ -21,7 +21,7 @@ from starid.camera import Camera
 _BRIGHTEST: Final = 200
 """Number of a frame's stars that are looked for; detections of other light rarely coincide with so few."""
 
-_SEEN_PX: Final = 3.0
+SEEN_PX: Final = 3.0
 """Largest distance between a star and its detection, pixels."""
 
 
@@ -44,7 +44,7 @@ def bodies_in_field(sky: SkyObjects, attitude: Attitude, camera: Camera) -> tupl
 def stars_seen(stars_xy: Array, detections_xy: Array) -> int:
     """Return how many of a frame's stars (n, 2), brightest first, were detected (m, 2)."""
     offsets = stars_xy[:_BRIGHTEST, None] - detections_xy
-    return int(np.count_nonzero((np.hypot(offsets[..., 0], offsets[..., 1]) <= _SEEN_PX).any(axis=1)))
+    return int(np.count_nonzero((np.hypot(offsets[..., 0], offsets[..., 1]) <= SEEN_PX).any(axis=1)))
 
 
 def with_bodies(result: FrameResult, in_field: tuple[str, ...], *, enough_stars: bool) -> FrameResult:

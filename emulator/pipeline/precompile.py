@@ -19,7 +19,7 @@ from starid.projection import back_project_kernel
 def start_helper() -> subprocess.Popen[bytes] | None:
     """Start the process that compiles the star identifier, unless the cache has kernels; the caller must wait for it."""
     kernel: Any = back_project_kernel
-    if kernel.in_cache:
+    if kernel.store.in_cache:
         return None
     return subprocess.Popen(
         [sys.executable, "-m", "starhil.emulator.pipeline.precompile"], stdin=subprocess.DEVNULL

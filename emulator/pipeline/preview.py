@@ -4,7 +4,10 @@ The overlay is JSON; places in the image are pairs x, y, pixels:
 
 - ``width``, ``height`` of the image;
 - ``detections``: place, magnitude and signal-to-noise ratio of each, brightest first, and ``hips``: the Hipparcos number
-  of each, 0 if it was not identified;
+  of each, 0 if the solution does not have it;
+- ``unused``: Hipparcos number of the catalogue star at the place of each detection without one in ``hips``; 0 if there is
+  none. With a slightly wrong calibration, the solution leaves out bright stars, which deviate by more than their small
+  noise;
 - ``catalogue``: Hipparcos number, place and V of the catalogue stars in the field, brightest first;
 - ``false_stars``: their places;
 - ``bodies``: ``name`` (`sun`, `moon`, `earth`, or that of a planet), ``ra_deg`` and ``dec_deg`` of the centre, ICRS, angular
@@ -21,11 +24,12 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.bodies import SEEN_PX
 from starhil.emulator.pipeline.messages import Preview
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame
 from starhil.emulator.sky.objects import CelestialBody, Obstruction, SkyObjects
-from starid.arrays import GreyImage
+from starid.arrays import Array, GreyImage, Indices32
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.imaging.detection import Detections
@@ -56,11 +60,9 @@ def make_preview(
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
     bright &= np.all((stars.xy_px > -0.5) & (stars.xy_px < (width - 0.5, height - 0.5)), axis=1)
+    hip, xy_px = stars.hip[bright], stars.xy_px[bright]
     catalogue = zip(
-        stars.hip[bright].tolist(),
-        *stars.xy_px[bright].round(1).T.tolist(),
-        stars.magnitude[bright].round(2).tolist(),
-        strict=True,
+        hip.tolist(), *xy_px.round(1).T.tolist(), stars.magnitude[bright].round(2).tolist(), strict=True
     )
     detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
     overlay = {
@@ -68,6 +70,7 @@ def make_preview(
         "height": height,
         "detections": detections,
         "hips": hips,
+        "unused": [] if found is None else unused_stars(found.xy_px, hips, hip, xy_px),
         "catalogue": list(catalogue),
         "false_stars": [] if objects is None else objects.false_xy_px.round(1).tolist(),
         "bodies": _bodies(sky, camera, frame.attitude),
@@ -105,6 +108,18 @@ def _detections(
         *found.xy_px.round(2).T.tolist(), magnitude.round(2).tolist(), snr.round(1).tolist(), strict=True
     )
     return list(rows), hips.tolist()
+
+
+def unused_stars(detections_xy: Array, hips: list[int], hip: Indices32, xy_px: Array) -> list[int]:
+    """Return for each detection (n, 2) without a Hipparcos number that of the star (m, 2), brightest first, at its place."""
+    unused = [0] * len(hips)
+    left = ~np.isin(hip, hips)
+    for number, place in zip(hip[left].tolist(), xy_px[left], strict=True):
+        distances = np.hypot(*(detections_xy - place).T)
+        row = int(distances.argmin()) if len(distances) else -1
+        if row >= 0 and distances[row] <= SEEN_PX and hips[row] == unused[row] == 0:
+            unused[row] = number
+    return unused
 
 
 def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[dict[str, Any]]:

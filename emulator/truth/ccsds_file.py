@@ -8,7 +8,7 @@ vectors is its conjugate. One of the two frames must be inertial and known (`sta
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -46,10 +46,10 @@ XML_ORDER: Final = {"EPOCH": 0, "Q1": 1, "Q2": 2, "Q3": 3, "QC": 4}
 
 @dataclass
 class Segment:
-    """Keywords of the metadata, and rows of a date and numbers."""
+    """Keywords of the metadata, and rows of a Unix time, nanoseconds, and numbers."""
 
     keywords: dict[str, str]
-    rows: list[tuple[str, list[float]]]
+    rows: list[tuple[int, list[float]]]
 
 
 def is_ccsds(text: str) -> bool:
@@ -61,31 +61,39 @@ def read_aem(path: Path, text: str) -> FileTruth:
     """Read the attitudes of an AEM."""
     where = f"truth file {path}"
     version, segments = _segments(where, "AEM", text)
-    blocks = [list(_attitudes(f"{where}, segment {n}", version, each)) for n, each in enumerate(segments, 1)]
-    methods = {segment.keywords.get("INTERPOLATION_METHOD", "").upper() for segment in segments}
-    return truth_of(path, blocks, smooth="LINEAR" not in methods)
+    kinds = {segment.keywords.get("ATTITUDE_TYPE", "").upper() for segment in segments}
+    if version == "1" and kinds != {"QUATERNION"}:
+        raise EmulatorError(f"{where}: of version 1, only ATTITUDE_TYPE QUATERNION is read")
+    return attitudes_of(path, segments)
 
 
 def read_oem(path: Path, text: str) -> OrbitTable:
     """Read positions and velocities of an OEM about the Earth."""
+    _, segments = _segments(f"orbit file {path}", "OEM", text)
+    return orbit_of(path, segments)
+
+
+def attitudes_of(path: Path, segments: Sequence[Segment]) -> FileTruth:
+    """Return the truth of segments with the keywords of an AEM, in any notation."""
+    blocks = [list(_attitudes(f"truth file {path}, segment {n}", each)) for n, each in enumerate(segments, 1)]
+    methods = {segment.keywords.get("INTERPOLATION_METHOD", "").upper() for segment in segments}
+    return truth_of(path, blocks, smooth="LINEAR" not in methods)
+
+
+def orbit_of(path: Path, segments: Sequence[Segment]) -> OrbitTable:
+    """Return the orbit of segments with the keywords of an OEM, in any notation; km and km/s."""
     where = f"orbit file {path}"
-    _, segments = _segments(where, "OEM", text)
     frames = {_keyword(where, segment, "REF_FRAME") for segment in segments}
     centres = {_keyword(where, segment, "CENTER_NAME").upper() for segment in segments}
     if len(frames) != 1 or centres != {"EARTH"}:
-        raise EmulatorError(f"{where}: needs one REF_FRAME, and EARTH as CENTER_NAME")
-    dates: list[int] = []
-    rows: list[list[float]] = []
+        raise EmulatorError(f"{where}: needs one reference frame, and the Earth as its centre")
+    rows: dict[int, list[float]] = {}
     for segment in segments:
-        scale = _keyword(where, segment, "TIME_SYSTEM")
-        for date, numbers in segment.rows:
+        for at_ns, numbers in segment.rows:
             if len(numbers) not in (6, 9):
                 raise EmulatorError(f"{where}: {len(numbers)} numbers in a row; position and velocity are 6")
-            at_ns = unix_ns(where, date, scale)
-            if not dates or at_ns != dates[-1]:
-                dates.append(at_ns)
-                rows.append([1e3 * number for number in numbers[:6]])
-    return orbit_of_rows(path, icrs_to(where, frames.pop()), dates, rows)
+            rows.setdefault(at_ns, [1e3 * number for number in numbers[:6]])
+    return orbit_of_rows(path, icrs_to(where, frames.pop()), list(rows), list(rows.values()))
 
 
 def write_aem(truth: FileTruth, sensor: str) -> str:
@@ -108,12 +116,10 @@ def write_aem(truth: FileTruth, sensor: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _attitudes(where: str, version: str, segment: Segment) -> Iterator[Row]:
+def _attitudes(where: str, segment: Segment) -> Iterator[Row]:
     kind = _keyword(where, segment, "ATTITUDE_TYPE").upper()
-    if kind not in TYPES or (version == "1" and kind != "QUATERNION"):
-        raise EmulatorError(
-            f"{where}: ATTITUDE_TYPE {kind[:40]!r} of version {version} is not read; known: {', '.join(TYPES)}"
-        )
+    if kind not in TYPES:
+        raise EmulatorError(f"{where}: ATTITUDE_TYPE {kind[:40]!r} is not read; known: {', '.join(TYPES)}")
     reference, body = (_keyword(where, segment, f"REF_FRAME_{letter}") for letter in "AB")
     is_inverse = segment.keywords.get("ATTITUDE_DIR", "A2B").upper() == "B2A"
     inertial = body if is_inertial(body) else reference
@@ -121,10 +127,9 @@ def _attitudes(where: str, version: str, segment: Segment) -> Iterator[Row]:
         raise EmulatorError(f"{where}: both frames are inertial; one must be the body")
     to_reference = icrs_to(where, inertial)
     is_inverse ^= inertial == body
-    scale = _keyword(where, segment, "TIME_SYSTEM")
     scalar_first = segment.keywords.get("QUATERNION_TYPE", "LAST").upper() == "FIRST"
     size = 4 if kind.startswith("QUATERNION") else 3
-    for date, numbers in segment.rows:
+    for at_ns, numbers in segment.rows:
         if len(numbers) != TYPES[kind]:
             raise EmulatorError(
                 f"{where}: {len(numbers)} numbers in a row of {kind}, which has {TYPES[kind]}"
@@ -144,7 +149,7 @@ def _attitudes(where: str, version: str, segment: Segment) -> Iterator[Row]:
         if rate is not None:
             rate = _rate_of_body(where, segment, rate, turn, reference, body, of_a=is_inverse)
         turn = inverse(turn) if is_inverse else turn
-        yield Row(unix_ns(where, date, scale), body_attitude(to_reference, turn), rate)
+        yield Row(at_ns, body_attitude(to_reference, turn), rate)
 
 
 def _rate_of_body(
@@ -187,7 +192,7 @@ def _from_kvn(where: str, kind: str, text: str) -> tuple[str | None, list[Segmen
         elif equals:
             segments[-1].keywords[key] = value
         else:
-            segments[-1].rows.append(_row(f"{where} line {number}", line.split()))
+            segments[-1].rows.append(_row(f"{where} line {number}", segments[-1].keywords, line.split()))
     return version, segments
 
 
@@ -207,7 +212,7 @@ def _from_xml(where: str, kind: str, text: str) -> tuple[str | None, list[Segmen
             if state.tag in ("attitudeState", "stateVector"):
                 leaves = [each for each in state.iter() if len(each) == 0 and each.tag != "COMMENT"]
                 leaves.sort(key=lambda leaf: XML_ORDER.get(leaf.tag, len(XML_ORDER)))
-                rows.append(_row(where, [(leaf.text or "").strip() for leaf in leaves]))
+                rows.append(_row(where, keywords, [(leaf.text or "").strip() for leaf in leaves]))
         keywords.pop("QUATERNION_TYPE", None)  # the elements have names
         segments.append(Segment(keywords, rows))
     return found.get("version", ""), segments
@@ -217,11 +222,13 @@ def _name(node: Any) -> str:
     return re.sub(r"^\{.*\}", "", str(node.tag))
 
 
-def _row(where: str, cells: list[str]) -> tuple[str, list[float]]:
+def _row(where: str, keywords: dict[str, str], cells: list[str]) -> tuple[int, list[float]]:
     try:
-        return cells[0], [read_number(cell) for cell in cells[1:]]
-    except (ValueError, IndexError):
+        date, *numbers = cells
+        values = [read_number(number) for number in numbers]
+    except ValueError:
         raise EmulatorError(f"{where}: must be a date and numbers") from None
+    return unix_ns(where, date, keywords.get("TIME_SYSTEM", "(none)")), values
 
 
 def _keyword(where: str, segment: Segment, key: str) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import re
+from calendar import timegm
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
+from time import strptime
 from typing import Final
 
 import numpy as np
@@ -31,13 +32,8 @@ TAI_MINUS: Final = {"TAI": 0.0, "TT": 32.184, "TDT": 32.184, "TDB": 32.184, "GPS
 MAX_METRES: Final = 1e12
 """Largest distance in an orbit file, m, and speed, m/s."""
 
-MONTHS: Final = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-_CALENDAR: Final = re.compile(
-    r"(?P<year>\d{4})-(?:(?P<month>\d\d)-(?P<day>\d\d)|(?P<of_year>\d{3}))T(?P<clock>\d\d:\d\d:\d\d)(?P<rest>\.\d*)?Z?"
-)
-_STK_DATE: Final = re.compile(
-    r"(?P<day>\d{1,2}) (?P<month>[a-z]{3}) (?P<year>\d{4}) (?P<clock>\d{1,2}:\d\d:\d\d)(?P<rest>\.\d*)?"
-)
+DATES: Final = ("%Y-%m-%dT%H:%M:%S", "%Y-%jT%H:%M:%S", "%d %b %Y %H:%M:%S")
+"""ISO 8601 with month or day of year, and STK's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,18 +66,14 @@ def is_inertial(frame: str) -> bool:
 
 def unix_ns(where: str, text: str, scale: str = "UTC") -> int:
     """Return the Unix time of a date, nanoseconds: ISO 8601 with month or day of year, or as STK writes it."""
-    found = _CALENDAR.fullmatch(text) or _STK_DATE.fullmatch(text.lower())
-    day: dict[str, str | None] = {} if found is None else found.groupdict()
-    try:
-        hours, minutes, seconds = (int(part) for part in (day.get("clock") or "").split(":"))
-        month = day["month"] or "1"
-        number = MONTHS.index(month) + 1 if month.isalpha() else int(month)
-        begin = datetime(int(day["year"] or 0), number, int(day["day"] or 1), tzinfo=UTC)
-        begin += timedelta(days=int(day.get("of_year") or 1) - 1)
-    except ValueError:
-        raise EmulatorError(f"{where}: not a date, e.g. 2026-03-20T12:00:00.0") from None
-    whole = int(begin.timestamp()) + 3600 * hours + 60 * minutes + seconds
-    label_ns = whole * NANOSECONDS + int(((day["rest"] or ".")[1:] + "0" * 9)[:9])
+    whole_text, _, fraction = text.removesuffix("Z").partition(".")
+    for form in DATES:
+        with suppress(ValueError):
+            whole = timegm(strptime(whole_text, form))
+            label_ns = whole * NANOSECONDS + int((fraction + "0" * 9)[:9])
+            break
+    else:
+        raise EmulatorError(f"{where}: not a date, e.g. 2026-03-20T12:00:00.0")
     if scale.upper() == "UTC":
         return label_ns
     if scale.upper() not in TAI_MINUS:
@@ -153,10 +145,11 @@ def inverse(rotation: Attitude) -> Attitude:
 
 def euler_turn(where: str, sequence: str, angles_deg: Vector) -> Attitude:
     """Return the rotation by successive turns of the frame about its axes: XYZ, or digits."""
-    axes = [{"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}.get(letter.upper(), -1) for letter in sequence]
-    if len(axes) != 3 or -1 in axes:
-        raise EmulatorError(f"{where}: {sequence[:40]!r} is not a sequence of three axes")
-    turn = Attitude.identity()
-    for axis, angle in zip(axes, np.radians(angles_deg), strict=True):
-        turn = turn.rotated(angle * np.eye(3)[axis])
-    return turn
+    from scipy.spatial.transform import Rotation
+
+    axes = sequence.upper().translate(str.maketrans("123", "XYZ"))
+    try:
+        turns = Rotation.from_euler(axes, angles_deg, degrees=True)
+    except ValueError:
+        raise EmulatorError(f"{where}: {sequence[:40]!r} is not a sequence of three axes") from None
+    return inverse(Attitude(turns.as_quat()))

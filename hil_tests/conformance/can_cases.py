@@ -40,24 +40,8 @@ LONGEST: Final = 56
 class CanRows:
     """Rows of a unit that the cases use; None if it has no such row.
 
-    Attributes
-    ----------
-    single, small
-        Telemetry that fits into a frame; the second has fewer than 8 bytes.
-    long
-        Telemetry in segments, if possible with a last one that is not full.
-    unknown_telemetry, unknown_telecommand
-        IDs that the unit does not have.
-    empty
-        Telecommand without data that may be sent at any time.
-    refused
-        Telecommand that fits into a frame, and data with a value that must be refused.
-    eight
-        Same, with 8 bytes.
-    short
-        Telecommand of 2 to 8 bytes.
-    longest
-        Telecommand with the most bytes.
+    `long` is telemetry in segments, if possible with a last one that is not full; `empty` a telecommand that may be sent at any
+    time; `refused` and `eight` telecommands in a frame that have a value that must be refused, the second of 8 bytes.
     """
 
     def __init__(self, unit: Unit) -> None:

@@ -14,6 +14,7 @@ from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_eq
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
+    Entry,
     abort_code,
     expedited_data,
     expedited_download,
@@ -281,8 +282,8 @@ class CanopenProbe:
         data = bytes.fromhex(request) if isinstance(request, str) else request
         check_abort(self.ask(data), *codes, multiplexer=data[1:4].hex())
 
-    def value(self, item: ODVariable) -> bytes:
-        """Read an object of the EDS."""
+    def value(self, item: ODVariable | Entry) -> bytes:
+        """Read an object of the EDS or of the definition."""
         return self.read(item.index, item.subindex)
 
     def read(self, index: int, subindex: int = 0) -> bytes:
@@ -326,8 +327,8 @@ class CanopenProbe:
             raise CaseFailed(f"an answer for {index:04X}h:{subindex:02X}h", answer.hex(" "))
         return 0 if answer[0] == 0x60 else abort_code(answer)
 
-    def put(self, item: ODVariable, data: bytes) -> None:
-        """Write an object of the EDS; fail if it is refused."""
+    def put(self, item: ODVariable | Entry, data: bytes) -> None:
+        """Write an object of the EDS or of the definition; fail if it is refused."""
         self.set(item.index, item.subindex, data)
 
     def set(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> None:

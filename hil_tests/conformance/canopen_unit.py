@@ -66,39 +66,6 @@ def _case(
 # --- reading and writing ---
 
 
-def _read(probe: CanopenProbe, entry: Entry) -> bytes:
-    """Read an entry and check its size; return it in the byte order of its row."""
-    data = probe.read(entry.index, entry.subindex)
-    if entry.slot is not None and not entry.size:
-        return data.ljust(entry.slot.size, b"\0")
-    check_equal(len(data), entry.size, f"bytes of {entry.name}h")
-    return with_byte_order(entry.slot, data)
-
-
-def _read_row(probe: CanopenProbe, row: Row, found: list[Entry]) -> bytes:
-    """Read the entries of a row repeatedly, until no new sample has come in between."""
-    seen = [b"", bytes(row.size)]
-    for _ in range(10):
-        data = bytearray(bytes(row.size))
-        for entry in found:
-            if entry.row is row and entry.slot is not None:
-                data[entry.slot.offset : entry.slot.offset + entry.slot.size] = _read(probe, entry)
-        seen.append(bytes(data))
-        if seen[-1] == seen[-2]:
-            break
-    return seen[-1]
-
-
-def _write(probe: CanopenProbe, entry: Entry, command: Row, values: dict[str, Value]) -> None:
-    """Write an entry that executes a telecommand, which must be accepted."""
-    probe.set(entry.index, entry.subindex, written(entry, command, command.encode(values)))
-
-
-def _carries(found: list[Entry], row: Row, item: Field) -> bool:
-    slots = [entry.slot for entry in found if entry.row is row and entry.slot is not None]
-    return item.offset in {slot.offset for slot in slots}
-
-
 class EntryAccess:
     """The rows that entries of the object dictionary hold."""
 
@@ -119,14 +86,33 @@ class EntryAccess:
         return _carries(self._found, row, item)
 
     def values(self, row: Row) -> dict[str, Value]:
-        """Read the values of a row; one outside its limits fails the case."""
-        return checked_values(row, _read_row(self._probe, row, self._found))
+        """Read the values of a row; one outside its limits fails the case.
+
+        The entries are read repeatedly, until no new sample has come in between.
+        """
+        seen = [b"", bytes(row.size)]
+        for _ in range(10):
+            data = bytearray(row.size)
+            for entry, slot in _slots(self._found, row):
+                data[slot.offset : slot.offset + slot.size] = self._read(entry, slot)
+            seen.append(bytes(data))
+            if seen[-1] == seen[-2]:
+                break
+        return checked_values(row, seen[-1])
+
+    def _read(self, entry: Entry, slot: Field) -> bytes:
+        """Read an entry and check its size; return it in the byte order of its row."""
+        data = self._probe.value(entry)
+        if not entry.size:
+            return data.ljust(slot.size, b"\0")
+        check_equal(len(data), entry.size, f"bytes of {entry.name}h")
+        return with_byte_order(slot, data)
 
     def command(self, name: str, **values: Value) -> None:
         """Write an entry that executes a telecommand, which must be accepted."""
         entry = next(item for item in self._found if item.command is not None and item.command.name == name)
         if entry.command is not None:
-            _write(self._probe, entry, entry.command, values)
+            _write(entry, entry.command, values, self._probe)
 
     def now(self) -> float:
         """Time of the port, s."""
@@ -135,6 +121,21 @@ class EntryAccess:
     def sleep(self, seconds: float) -> None:
         """Wait."""
         self._probe.wait_for(NOBODY, seconds)
+
+
+def _slots(found: list[Entry], row: Row) -> Iterator[tuple[Entry, Field]]:
+    for entry in found:
+        if entry.row is row and entry.slot is not None:
+            yield entry, entry.slot
+
+
+def _carries(found: list[Entry], row: Row, item: Field) -> bool:
+    return item.offset in {slot.offset for _, slot in _slots(found, row)}
+
+
+def _write(entry: Entry, command: Row, values: dict[str, Value], probe: CanopenProbe) -> None:
+    """Write an entry that executes a telecommand, which must be accepted."""
+    probe.put(entry, written(entry, command, command.encode(values)))
 
 
 def _argument(entry: Entry, name: str) -> Field | None:
@@ -155,20 +156,17 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
         ):
             attitude = None
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
-        yield _case("rows", row.name, title, _values(row, attitude, found), row, safe=True)
+        yield _case("rows", row.name, title, partial(_values, row, attitude, found), row, safe=True)
         if attitude is not None:
             run = partial(_becomes_valid, attitude, found)
             yield _case("attitude", row.name, attitude.title, run, row)
 
 
-def _values(row: Row, attitude: AttitudeRow | None, found: list[Entry]) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        access = EntryAccess(probe, found)
-        seen = access.values(row)
-        if attitude is not None:
-            attitude.check(access, seen)
-
-    return run
+def _values(row: Row, attitude: AttitudeRow | None, found: list[Entry], probe: CanopenProbe) -> None:
+    access = EntryAccess(probe, found)
+    seen = access.values(row)
+    if attitude is not None:
+        attitude.check(access, seen)
 
 
 def _becomes_valid(attitude: AttitudeRow, found: list[Entry], probe: CanopenProbe) -> None:
@@ -185,34 +183,26 @@ def _commands(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             continue
         if command.action == "reset":
             title = f"{command.name} restarts the node"
-            run = _restarts(entry, command, found)
+            run = partial(_restarts, entry, command, found)
         elif entry.row is not None and entry.slot is not None:
             title = f"{entry.name}h reports each written value of {command.name}"
-            run = _reported(entry, command)
+            run = partial(_reported, entry, command)
         elif command.action in (None, "nothing"):
-            title, run = f"{command.name} is accepted", _accepted(entry, command)
+            title, run = f"{command.name} is accepted", partial(_write, entry, command, command.example())
         else:
             continue
         yield _case("commands", command.name, title, run, command)
 
 
-def _accepted(entry: Entry, command: Row) -> Run:
-    return lambda probe: _write(probe, entry, command, command.example())
-
-
-def _restarts(entry: Entry, command: Row, found: list[Entry]) -> Run:
+def _restarts(entry: Entry, command: Row, found: list[Entry], probe: CanopenProbe) -> None:
     """Restart the unit, and wait until the mode reported by an entry is no longer the boot mode."""
-
-    def run(probe: CanopenProbe) -> None:
-        probe.drain()
-        _write(probe, entry, command, command.example())
-        probe.expect_boot_up()
-        end = probe.port.now() + BOOT_S
-        while reported_mode(EntryAccess(probe, found)) == "boot":
-            check(probe.port.now() < end, f"the end of booting within {BOOT_S:g} s", "boot")
-            probe.wait_for(NOBODY, 0.1)
-
-    return run
+    probe.drain()
+    _write(entry, command, command.example(), probe)
+    probe.expect_boot_up()
+    end = probe.port.now() + BOOT_S
+    while reported_mode(EntryAccess(probe, found)) == "boot":
+        check(probe.port.now() < end, f"the end of booting within {BOOT_S:g} s", "boot")
+        probe.wait_for(NOBODY, 0.1)
 
 
 def _fields(entry: Entry) -> list[Field]:
@@ -226,7 +216,7 @@ def _reports(entry: Entry, *quantities: str) -> bool:
     return any(field.value is not None and field.value.startswith(quantities) for field in _fields(entry))
 
 
-def _reported(entry: Entry, command: Row) -> Run:
+def _reported(entry: Entry, command: Row, probe: CanopenProbe) -> None:
     """Write all values of an enumeration, or else both limits; restore the previous value."""
     (name, field), *_ = command.named.items()
     values: list[Value]
@@ -234,18 +224,12 @@ def _reported(entry: Entry, command: Row) -> Run:
         values = ["s", "star"]
     else:
         values = list(field.limits) if field.enum is None else list(field.enum)
-
-    def run(probe: CanopenProbe) -> None:
-        before = probe.read(entry.index, entry.subindex)
-        for value in values:
-            data = written(entry, command, command.encode({name: value}))
-            probe.set(entry.index, entry.subindex, data)
-            check_equal(
-                probe.read(entry.index, entry.subindex), data, f"{entry.name}h after writing {value!s}:"
-            )
-        probe.set(entry.index, entry.subindex, before or b"\0")
-
-    return run
+    before = probe.value(entry)
+    for value in values:
+        data = written(entry, command, command.encode({name: value}))
+        probe.put(entry, data)
+        check_equal(probe.value(entry), data, f"{entry.name}h after writing {value!s}:")
+    probe.put(entry, before or b"\0")
 
 
 def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
@@ -255,22 +239,19 @@ def _records(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     }.values():
         members = [entry for entry in found if entry.command is command and entry.size <= EXPEDITED]
         title = f"each entry of {command.name} keeps its written value when other entries are written"
-        yield _case("records", command.name, title, _keeps_values(command, members), command)
+        yield _case("records", command.name, title, partial(_keeps_values, command, members), command)
 
 
-def _keeps_values(command: Row, members: list[Entry]) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        before = [probe.read(entry.index, entry.subindex) for entry in members]
-        for end in (1, 0):
-            for entry in members:
-                probe.set(entry.index, entry.subindex, _limit(command, entry, end))
-            for entry in members:
-                seen = probe.read(entry.index, entry.subindex)
-                check_equal(seen, _limit(command, entry, end), f"{entry.name}h after all were written:")
-        for entry, data in zip(members, before, strict=True):
-            probe.set(entry.index, entry.subindex, data)
-
-    return run
+def _keeps_values(command: Row, members: list[Entry], probe: CanopenProbe) -> None:
+    before = [probe.value(entry) for entry in members]
+    for end in (1, 0):
+        for entry in members:
+            probe.put(entry, _limit(command, entry, end))
+        for entry in members:
+            seen = probe.value(entry)
+            check_equal(seen, _limit(command, entry, end), f"{entry.name}h after all were written:")
+    for entry, data in zip(members, before, strict=True):
+        probe.put(entry, data)
 
 
 def _limit(command: Row, entry: Entry, end: int) -> bytes:
@@ -292,18 +273,15 @@ def _limits(found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 continue
             for why, data in command.bad_values(field):
                 title = f"{entry.name}h with {name} {why} is refused"
-                run = _refused(entry, written(entry, command, data))
+                run = partial(_refused, entry, written(entry, command, data))
                 yield _case("limits", f"{command.name}.{name}.{why}", title, run, command)
 
 
-def _refused(entry: Entry, data: bytes) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        before = probe.read(entry.index, entry.subindex) if entry.row is not None else b""
-        probe.expect_refusal(entry.index, entry.subindex, data, len(data), *VALUE_ABORTS)
-        if entry.row is not None:
-            check_equal(probe.read(entry.index, entry.subindex), before, f"{entry.name}h, unchanged:")
-
-    return run
+def _refused(entry: Entry, data: bytes, probe: CanopenProbe) -> None:
+    before = probe.value(entry) if entry.row is not None else b""
+    probe.expect_refusal(entry.index, entry.subindex, data, len(data), *VALUE_ABORTS)
+    if entry.row is not None:
+        check_equal(probe.value(entry), before, f"{entry.name}h, unchanged:")
 
 
 # --- PDOs ---
@@ -317,12 +295,14 @@ def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
             mapped = [by_name[name.lower()] for name in model.objects]
             index, label = first + number, f"{kind[:4].upper()} {number + 1} ({model.name})"
             title = f"{label} has the CAN ID, transmission type, timers and mapping of the definition"
-            yield _case(kind, f"{number + 1}.default", title, _default(index, model, mapped), safe=True)
+            yield _case(
+                kind, f"{number + 1}.default", title, partial(_default, index, model, mapped), safe=True
+            )
             if not mapped:
                 continue
             if first == 0x1800:
                 title = f"{label} carries the values of its objects"
-                yield _case(kind, f"{number + 1}.data", title, _carries_values(index, mapped))
+                yield _case(kind, f"{number + 1}.data", title, partial(_carries_values, index, mapped))
             if (
                 first == 0x1800
                 and model.enabled
@@ -330,61 +310,54 @@ def _pdos(layout: Any, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
                 and any(_reports(entry, *CHANGING) and not _fields(entry)[0].width for entry in mapped)
             ):
                 title = f"{label} is sent when frames are taken"
-                yield _case(kind, f"{number + 1}.frames", title, _sent_with_frames(index, model, found))
+                yield _case(
+                    kind, f"{number + 1}.frames", title, partial(_sent_with_frames, index, model, found)
+                )
             if first == 0x1400 and model.enabled:
                 yield from _clock(index, model, mapped, found)
 
 
-def _default(index: int, model: Any, mapped: list[Entry]) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        at = f"{index:04X}h"
-        flags = 0 if model.enabled else PDO_OFF
-        cob_id = probe.number(index, 1) & ~NO_RTR
-        check_equal(f"{cob_id:08X}", f"{flags | pdo_can_id(probe.node, index, model):08X}", f"{at}:01h")
-        check_equal(probe.number(index, 2), model.transmission_type, f"{at}:02h, transmission type")
-        if index >= 0x1800:
-            check_equal(probe.number(index, 3), round(model.inhibit_ms * 10), f"{at}:03h, inhibit time")
-        check_equal(probe.number(index, 5), model.event_ms, f"{at}:05h, event timer")
-        count = probe.number(index + 0x200, 0)
-        seen = [f"{probe.number(index + 0x200, number):08X}" for number in range(1, count + 1)]
-        check_equal(seen, [f"{entry.mapping:08X}" for entry in mapped], f"{index + 0x200:04X}h")
-
-    return run
+def _default(index: int, model: Any, mapped: list[Entry], probe: CanopenProbe) -> None:
+    at = f"{index:04X}h"
+    flags = 0 if model.enabled else PDO_OFF
+    cob_id = probe.number(index, 1) & ~NO_RTR
+    check_equal(f"{cob_id:08X}", f"{flags | pdo_can_id(probe.node, index, model):08X}", f"{at}:01h")
+    check_equal(probe.number(index, 2), model.transmission_type, f"{at}:02h, transmission type")
+    if index >= 0x1800:
+        check_equal(probe.number(index, 3), round(model.inhibit_ms * 10), f"{at}:03h, inhibit time")
+    check_equal(probe.number(index, 5), model.event_ms, f"{at}:05h, event timer")
+    count = probe.number(index + 0x200, 0)
+    seen = [f"{probe.number(index + 0x200, number):08X}" for number in range(1, count + 1)]
+    check_equal(seen, [f"{entry.mapping:08X}" for entry in mapped], f"{index + 0x200:04X}h")
 
 
-def _carries_values(index: int, mapped: list[Entry]) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        probe.quiet()
-        can_id = probe.number(index, 1) & 0x7FF or UNUSED_ID
-        probe.set(index, 2, SYNCHRONOUS, 1)
-        probe.set(index, 1, NO_RTR | can_id)
+def _carries_values(index: int, mapped: list[Entry], probe: CanopenProbe) -> None:
+    probe.quiet()
+    can_id = probe.number(index, 1) & 0x7FF or UNUSED_ID
+    probe.set(index, 2, SYNCHRONOUS, 1)
+    probe.set(index, 1, NO_RTR | can_id)
+    probe.command(START)
+
+    def read() -> bytes:
+        return b"".join(probe.value(entry) for entry in mapped)
+
+    for _ in range(10):  # until nothing has changed between the readings
+        before = read()
+        probe.drain()
+        send_sync(probe)
+        data, after = probe.expect(can_id, "TPDO after a SYNC"), read()
+        if before == after:
+            break
+    check_equal(data, after, "data")
+
+
+def _sent_with_frames(index: int, model: Any, found: list[Entry], probe: CanopenProbe) -> None:
+    with identifying_stars(EntryAccess(probe, found)):
         probe.command(START)
-
-        def read() -> bytes:
-            return b"".join(probe.read(entry.index, entry.subindex) for entry in mapped)
-
-        for _ in range(10):  # until nothing has changed between the readings
-            before = read()
-            probe.drain()
-            send_sync(probe)
-            data, after = probe.expect(can_id, "TPDO after a SYNC"), read()
-            if before == after:
-                break
-        check_equal(data, after, "data")
-
-    return run
-
-
-def _sent_with_frames(index: int, model: Any, found: list[Entry]) -> Run:
-    def run(probe: CanopenProbe) -> None:
-        with identifying_stars(EntryAccess(probe, found)):
-            probe.command(START)
-            can_id = pdo_can_id(probe.node, index, model)
-            times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
-        probe.command(PRE_OPERATIONAL)
-        check_equal(len(times), 3, "TPDOs")
-
-    return run
+        can_id = pdo_can_id(probe.node, index, model)
+        times = [probe.expect(can_id, "TPDO of a frame", ATTITUDE_S) for _ in range(3)]
+    probe.command(PRE_OPERATIONAL)
+    check_equal(len(times), 3, "TPDOs")
 
 
 def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> Iterator[Case[CanopenProbe]]:

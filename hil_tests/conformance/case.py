@@ -13,13 +13,7 @@ ProbeType = TypeVar("ProbeType")
 
 
 class CaseFailed(Exception):  # noqa: N818 (the outcome of a case, not an error of the bench)
-    """The device violated the rule.
-
-    Attributes
-    ----------
-    expected, seen
-        What was expected and what was seen, one line each.
-    """
+    """The device violated the rule; what was expected and what was seen, one line each."""
 
     def __init__(self, expected: str, seen: str) -> None:
         super().__init__(f"expected {expected}; seen {seen}")
@@ -33,46 +27,27 @@ class CaseSkipped(Exception):  # noqa: N818 (the outcome of a case, not an error
 
 @dataclass(frozen=True)
 class Case(Generic[ProbeType]):
-    """One check.
-
-    Attributes
-    ----------
-    id
-        Dotted name, unique: link, area, check.
-    area
-        Area of the protocol.
-    title
-        The checked behaviour, one line.
-    clause
-        Clause of a standard, or the source that confirms the behaviour.
-    run
-        Performs the check with a probe; raises `CaseFailed` or `CaseSkipped`.
-    intrusive
-        Whether the case changes settings or state of the device, so that it is not for a unit in use.
-    """
+    """One check."""
 
     id: str
+    """Dotted name, unique: link, area, check."""
     area: str
+    """Area of the protocol."""
     title: str
+    """The checked behaviour, one line."""
     clause: str
+    """Clause of a standard, or the source that confirms the behaviour."""
     run: Callable[[ProbeType], None]
+    """Performs the check with a probe; raises `CaseFailed` or `CaseSkipped`."""
     intrusive: bool = False
+    """Whether the case changes settings or state of the device, so that it is not for a unit in use."""
 
 
 @dataclass(frozen=True)
 class CaseArea(Generic[ProbeType]):
-    """The cases of one area of the protocol.
+    """The cases of one area of the protocol, in the order of their declaration; its name is the prefix of their IDs.
 
-    Attributes
-    ----------
-    name
-        Dotted name, the prefix of the case IDs.
-    clause, intrusive
-        Defaults for the cases.
-    links
-        Links on which a unit's own cases run.
-    cases
-        Cases in the order of their declaration.
+    `clause` and `intrusive` are defaults; a unit's own cases run on `links`.
     """
 
     name: str

@@ -95,19 +95,13 @@ def all_cases(request: ConformanceRequest) -> list[Case[Any]]:
 
 @dataclass(frozen=True)
 class ConformanceResult:
-    """Outcomes of a run.
-
-    Attributes
-    ----------
-    facts
-        For reports: `date`, versions of `starhil` and of the `definition`, `links`, and `device on LINK`: its identity.
-    interruption
-        The signal that interrupted the run, if any.
-    """
+    """Outcomes of a run."""
 
     outcomes: list[Outcome]
     facts: dict[str, str]
+    """For reports: `date`, versions of `starhil` and of the `definition`, `links`, and `device on LINK`: its identity."""
     interruption: Interrupted | None = None
+    """The signal that interrupted the run, if any."""
 
 
 def _facts(request: ConformanceRequest, unit: Unit) -> dict[str, str]:

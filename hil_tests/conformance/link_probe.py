@@ -40,24 +40,16 @@ REPORTED: Final = {
 
 @dataclass(frozen=True)
 class ProbeTimes:
-    """Timeouts of the tester.
-
-    Attributes
-    ----------
-    answer_s
-        Maximum time for an answer.
-    quiet_s
-        Silence that counts as no answer.
-    boot_s
-        Maximum time from a reset to the first answer in standby.
-    image_s
-        Maximum time for taking an image.
-    """
+    """Timeouts of the tester."""
 
     answer_s: float = 1.0
+    """Maximum time for an answer."""
     quiet_s: float = 0.1
+    """Silence that counts as no answer."""
     boot_s: float = 15.0
+    """Maximum time from a reset to the first answer in standby."""
     image_s: float = 20.0
+    """Maximum time for taking an image."""
 
 
 class Settings(Protocol):
@@ -93,19 +85,13 @@ class ReadableSettings:
 class LinkProbe(ABC):
     """Talks to a unit over a link.
 
-    `settings` are what a run restores; by default, those that can be read.
-
-    Attributes
-    ----------
-    has_unsolicited
-        Whether the link carries unsolicited telemetry.
-    truth
-        The true attitude, if the tester knows it; set by the run.
+    `settings` are what a run restores; by default, those that can be read. The run sets `truth` if the true attitude is known.
     """
 
     link: str
     """`serial` or `can`."""
     has_unsolicited = True
+    """Whether the link carries unsolicited telemetry."""
     numbers = 0
     """How many numbers the header has for messages; 0 if it has none."""
     has_codes = True

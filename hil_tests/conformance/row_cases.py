@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import pairwise
 from typing import Final
 
@@ -62,7 +63,7 @@ def row_cases(
         for index, (name, item) in enumerate(row.named.items()):
             for why, data in row.bad_values(item):
                 title = f"{row.name} with {name} {why} is refused, and the refused field named"
-                run = _refused(row, data, INVALID_PARAMETER, index)
+                run = partial(_refused, row, data, INVALID_PARAMETER, index)
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
@@ -118,16 +119,13 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
         for why, data in tried.items():
             if data is not None:
                 title = f"{row.name} with {len(data)} bytes ({why}) is refused for its length"
-                run = _refused(row, data, INVALID_LENGTH)
+                run = partial(_refused, row, data, INVALID_LENGTH, None)
                 yield case_in("lengths", f"{row.name}.{why}", title, run, row, intrusive=True)
 
 
-def _refused(row: Row, data: bytes, error: str, index: int | None = None) -> Run:
-    def run(probe: LinkProbe) -> None:
-        probe.expect_refusal(row, data, error)
-        probe.check_reported(row.id, error, index)
-
-    return run
+def _refused(row: Row, data: bytes, error: str, index: int | None, probe: LinkProbe) -> None:
+    probe.expect_refusal(row, data, error)
+    probe.check_reported(row.id, error, index)
 
 
 # --- telemetry ---
@@ -217,45 +215,38 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
     for row in unit.telecommands.values():
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
-            yield case_in("commands", row.name, title, _accepted(row), row, intrusive=True)
+            yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
     for row in unit.telemetry.values():
         source = next((item.telecommand for item in row.named.values() if item.telecommand), None)
         if source is not None and unit.telecommands[source].action in (None, "nothing"):
             title = f"{row.name} reports the bytes set by {source}"
-            run = _read_back(unit.telecommands[source], row, marks)
+            run = partial(_read_back, unit.telecommands[source], row, marks)
             yield case_in("settings", row.name, title, run, row, intrusive=True)
 
 
-def _accepted(row: Row) -> Run:
+def _accepted(row: Row, probe: LinkProbe) -> None:
     """Send plain values, and both limits of each number if the row has no effect."""
-
-    def run(probe: LinkProbe) -> None:
-        probe.send_command(row, row.encode())
-        for name, item in row.named.items() if row.action == "nothing" else ():
-            for limit, given in zip(
-                item.limits if item.kind in ("integer", "float") else (),
-                (item.minimum, item.maximum),
-                strict=False,
-            ):
-                if given is not None:
-                    probe.send_command(row, row.encode({name: limit}))
-
-    return run
+    probe.send_command(row, row.encode())
+    for name, item in row.named.items() if row.action == "nothing" else ():
+        for limit, given in zip(
+            item.limits if item.kind in ("integer", "float") else (),
+            (item.minimum, item.maximum),
+            strict=False,
+        ):
+            if given is not None:
+                probe.send_command(row, row.encode({name: limit}))
 
 
-def _read_back(command: Row, row: Row, marks: bytes) -> Run:
-    def run(probe: LinkProbe) -> None:
-        before = probe.data_of(row)
-        rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
-        for turn in range(3):
-            data = command.encode(
-                {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
-            )
-            probe.send_command(command, data)
-            check_equal(probe.data_of(row), data, f"the bytes of {command.name}")
-        probe.send_command(command, before)
-
-    return run
+def _read_back(command: Row, row: Row, marks: bytes, probe: LinkProbe) -> None:
+    before = probe.data_of(row)
+    rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
+    for turn in range(3):
+        data = command.encode(
+            {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
+        )
+        probe.send_command(command, data)
+        check_equal(probe.data_of(row), data, f"the bytes of {command.name}")
+    probe.send_command(command, before)
 
 
 # --- unsolicited telemetry, subscriptions and floods ---
@@ -266,10 +257,10 @@ def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
     for row in unit.telemetry.values():
         if isinstance(row.unsolicited, float):
             title = f"{row.name} is sent {row.unsolicited:g} times a second without a request"
-            yield case_in("unsolicited", row.name, title, _streamed(row, row.unsolicited), row)
+            yield case_in("unsolicited", row.name, title, partial(_streamed, row, row.unsolicited), row)
         elif row.unsolicited is not None and not CAUSED.isdisjoint(row.unsolicited):
             title = f"{row.name} is sent without a request after {' or '.join(row.unsolicited)}"
-            yield case_in("unsolicited", row.name, title, _reported(row), row, intrusive=True)
+            yield case_in("unsolicited", row.name, title, partial(_reported, row), row, intrusive=True)
 
 
 def _of_row(row: Row, answers: list[Answer]) -> list[Answer]:
@@ -281,39 +272,33 @@ def _of_row(row: Row, answers: list[Answer]) -> list[Answer]:
     return found
 
 
-def _streamed(row: Row, rate_hz: float) -> Run:
-    def run(probe: LinkProbe) -> None:
-        _check_carried(probe)
-        seconds = max(SUBSCRIBED_S, STREAMED / rate_hz)
-        answers = probe.receive_unsolicited(seconds)
-        probe.check_numbers(answers)
-        wanted, seen = rate_hz * seconds, len(_of_row(row, answers))
-        check(abs(seen - wanted) <= 1 + RATE_TOLERANCE * wanted, f"about {wanted:.0f} messages", seen)
-
-    return run
+def _streamed(row: Row, rate_hz: float, probe: LinkProbe) -> None:
+    _check_carried(probe)
+    seconds = max(SUBSCRIBED_S, STREAMED / rate_hz)
+    answers = probe.receive_unsolicited(seconds)
+    probe.check_numbers(answers)
+    wanted, seen = rate_hz * seconds, len(_of_row(row, answers))
+    check(abs(seen - wanted) <= 1 + RATE_TOLERANCE * wanted, f"about {wanted:.0f} messages", seen)
 
 
-def _reported(row: Row) -> Run:
-    def run(probe: LinkProbe) -> None:
-        _check_carried(probe)
-        rest, search = mode_command(probe, STANDBY), mode_command(probe, SEARCHING)
-        if rest is None or search is None:
-            raise CaseSkipped("no telecommand starts and ends the identification of stars")
-        with identifying_stars(probe):
-            rest()
-            probe.sleep(SETTLING_S)
-            answers = probe.receive_unsolicited(SUBSCRIBED_S, search)
-        probe.check_numbers(answers)
-        found = _of_row(row, answers)
-        check(bool(found), f"{row.name} within {SUBSCRIBED_S:g} s of a telecommand for {SEARCHING}", "none")
-        modes = [name for name, item in row.named.items() if item.value == "mode"]
-        if row.unsolicited == ["mode"] and modes and SEARCHING not in row.named[modes[0]].shared:
-            seen = [row.decode(answer.data)[modes[0]] for answer in found]
-            check_equal(seen[0], SEARCHING, "mode in the first message")
-            changes = all(one != other for one, other in pairwise(seen))
-            check(changes, "another mode in each message", seen)
-
-    return run
+def _reported(row: Row, probe: LinkProbe) -> None:
+    _check_carried(probe)
+    rest, search = mode_command(probe, STANDBY), mode_command(probe, SEARCHING)
+    if rest is None or search is None:
+        raise CaseSkipped("no telecommand starts and ends the identification of stars")
+    with identifying_stars(probe):
+        rest()
+        probe.sleep(SETTLING_S)
+        answers = probe.receive_unsolicited(SUBSCRIBED_S, search)
+    probe.check_numbers(answers)
+    found = _of_row(row, answers)
+    check(bool(found), f"{row.name} within {SUBSCRIBED_S:g} s of a telecommand for {SEARCHING}", "none")
+    modes = [name for name, item in row.named.items() if item.value == "mode"]
+    if row.unsolicited == ["mode"] and modes and SEARCHING not in row.named[modes[0]].shared:
+        seen = [row.decode(answer.data)[modes[0]] for answer in found]
+        check_equal(seen[0], SEARCHING, "mode in the first message")
+        changes = all(one != other for one, other in pairwise(seen))
+        check(changes, "another mode in each message", seen)
 
 
 def _check_carried(probe: LinkProbe) -> None:
@@ -331,37 +316,37 @@ def _subscriptions(unit: Unit) -> Iterator[Case[LinkProbe]]:
         if row.action == "subscribe" and fields and offered:
             title = f"{row.name} starts and stops unsolicited telemetry"
             yield case_in(
-                "subscriptions", row.name, title, _subscribed(row, fields, offered), row, intrusive=True
+                "subscriptions",
+                row.name,
+                title,
+                partial(_subscribed, row, fields, offered),
+                row,
+                intrusive=True,
             )
 
 
-def _subscribed(command: Row, fields: list[str], offered: list[Row]) -> Run:
+def _subscribed(command: Row, fields: list[str], offered: list[Row], probe: LinkProbe) -> None:
     none = dict.fromkeys(fields, 0)
 
-    def of_list(probe: LinkProbe, seconds: float) -> list[Answer]:
+    def of_list(seconds: float) -> list[Answer]:
         """Return the messages that the list has caused, not those that the unit always sends."""
         seen = probe.receive_unsolicited(seconds)
         probe.check_numbers(seen)
         always = {(row.id, row.klass) for row in probe.unit.telemetry.values() if row.unsolicited is not None}
         return [answer for answer in seen if (answer.row_id, answer.klass) not in always]
 
-    def run(probe: LinkProbe) -> None:
-        chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
-        probe.send_command(command, command.encode(chosen))
-        seen = of_list(probe, SUBSCRIBED_S)
-        probe.send_command(command, command.encode(none))
-        probe.sleep(0.5)
-        wanted = {(row.id, row.size) for row in offered[: len(fields)]}
-        check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
-        check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
-        check_equal(
-            {answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes"
-        )
-        for answer in seen:
-            checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
-        check_equal(len(of_list(probe, 2.0)), 0, "messages after the end of the subscription")
-
-    return run
+    chosen = none | {name: row.id for name, row in zip(fields, offered, strict=False)}
+    probe.send_command(command, command.encode(chosen))
+    seen = of_list(SUBSCRIBED_S)
+    probe.send_command(command, command.encode(none))
+    probe.sleep(0.5)
+    wanted = {(row.id, row.size) for row in offered[: len(fields)]}
+    check(len(seen) >= len(wanted), "a message of each row within 3 s", f"{len(seen)} messages")
+    check_equal({(answer.row_id, len(answer.data)) for answer in seen}, wanted, "rows and sizes")
+    check_equal({answer.klass for answer in seen} - {""}, {row.klass for row in offered} - {""}, "classes")
+    for answer in seen:
+        checked_values(next(row for row in offered if row.id == answer.row_id), answer.data)
+    check_equal(len(of_list(2.0)), 0, "messages after the end of the subscription")
 
 
 def _flood(probe: LinkProbe) -> None:

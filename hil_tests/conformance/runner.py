@@ -26,21 +26,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of a case.
-
-    Attributes
-    ----------
-    id, area, title, clause, intrusive
-        As in the case.
-    status
-        `passed`, `failed`, `skipped` or `not run`.
-    expected, seen
-        Set for a failed case; for a skipped case or one not run, `seen` has the reason.
-    seconds
-        Duration, with the recovery after a failure.
-    log
-        Sent and received traffic, with times.
-    """
+    """Outcome of a case, whose ID, area, title, clause and intrusiveness it has."""
 
     id: str
     area: str
@@ -48,10 +34,14 @@ class Outcome:
     clause: str
     intrusive: bool
     status: str
+    """`passed`, `failed`, `skipped` or `not run`."""
     expected: str
     seen: str
+    """Both set for a failed case; for a skipped case or one not run, `seen` has the reason."""
     seconds: float
+    """Duration, with the recovery after a failure."""
     log: tuple[str, ...]
+    """Sent and received traffic, with times."""
 
     @classmethod
     def of(cls, case: Case[Any], verdict: Verdict, seconds: float = 0.0, log: Sequence[str] = ()) -> Outcome:

@@ -328,29 +328,26 @@ def _clock(unit: Unit, replies: Header) -> Iterator[Case[SerialProbe]]:
         names = {item.argument: name for name, item in command.named.items()}
         if command.action == "set_clock" and "microseconds" in names and row is not None:
             title = "the times in replies follow the clock after it was set"
-            run = _clock_runs(command, names["microseconds"], row)
+            run = partial(_clock_runs, command, names["microseconds"], row)
             yield case_in("clock", command.name, title, run, command, intrusive=True)
 
 
-def _clock_runs(command: Row, name: str, row: Row) -> Run:
-    def run(probe: SerialProbe) -> None:
-        def time_s() -> float:
-            probe.post(row)
-            return probe.expect_telemetry(row).time_s
+def _clock_runs(command: Row, name: str, row: Row, probe: SerialProbe) -> None:
+    def time_s() -> float:
+        probe.post(row)
+        return probe.expect_telemetry(row).time_s
 
-        def set_clock(seconds: float) -> None:
-            probe.command(command.name, **{name: command.named[name].physical(round(seconds * 1e6))})
+    def set_clock(seconds: float) -> None:
+        probe.command(command.name, **{name: command.named[name].physical(round(seconds * 1e6))})
 
-        before, began = time_s(), probe.now()
-        set_clock(CLOCK_S)
-        first = time_s()
-        probe.sleep(0.5)
-        second = time_s()
-        set_clock(before + probe.now() - began)
-        check(0 <= first - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", f"{first:.6f} s")
-        check(0.4 <= second - first <= 1.5, "half a second more", f"{second - first:.6f} s")
-
-    return run
+    before, began = time_s(), probe.now()
+    set_clock(CLOCK_S)
+    first = time_s()
+    probe.sleep(0.5)
+    second = time_s()
+    set_clock(before + probe.now() - began)
+    check(0 <= first - CLOCK_S <= 1, f"a time just after {CLOCK_S} s", f"{first:.6f} s")
+    check(0.4 <= second - first <= 1.5, "half a second more", f"{second - first:.6f} s")
 
 
 # --- echoes, time, noise ---
@@ -360,17 +357,14 @@ def _echoes(unit: Unit) -> Iterator[Case[SerialProbe]]:
     for row in unit.rows:
         if "echo" in row.answers:
             title = f"{row.name} is echoed byte for byte before any other answer"
-            yield case_in("echo", row.name, title, _echoed(row), row, intrusive=not row.is_telemetry)
+            yield case_in("echo", row.name, title, partial(_echoed, row), row, intrusive=not row.is_telemetry)
 
 
-def _echoed(row: Row) -> Run:
-    def run(probe: SerialProbe) -> None:
-        data = b"" if row.is_telemetry else row.encode()
-        probe.ask(row, data)
-        sent = probe.sent
-        check_equal(probe.raw[: len(sent)] or None, sent, "the echo")
-
-    return run
+def _echoed(row: Row, probe: SerialProbe) -> None:
+    data = b"" if row.is_telemetry else row.encode()
+    probe.ask(row, data)
+    sent = probe.sent
+    check_equal(probe.raw[: len(sent)] or None, sent, "the echo")
 
 
 def pace(probe: SerialProbe) -> None:

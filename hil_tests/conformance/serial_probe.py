@@ -27,14 +27,9 @@ SHOWN_BYTES: Final = 48
 class SerialProbe(LinkProbe):
     """Talks to a unit over a serial port.
 
-    `dialect` is that of the answers, of a unit that has several; `baud` the bit rate of the line, None if unknown.
-
-    Attributes
-    ----------
-    raw, sent
-        All bytes received since the last drain, without unsolicited telemetry, and those sent last.
-    numbered
-        Messages since the last drain to which the unit has given a number.
+    `dialect` is that of the answers, of a unit that has several; `baud` the bit rate of the line, None if unknown; `raw` are all
+    bytes received since the last drain, without unsolicited telemetry, `sent` those sent last, and `numbered` the messages since
+    the last drain to which the unit has given a number.
     """
 
     link = "serial"

@@ -16,26 +16,18 @@ ProbeType = TypeVar("ProbeType", bound=LinkProbe)
 
 @dataclass(frozen=True)
 class Exchange:
-    """Raw traffic and the answers to it.
-
-    Attributes
-    ----------
-    id, title, clause
-        As in a case; clause None: the clause of the area.
-    sent
-        Raw traffic, in the format of `LinkProbe.send_text`.
-    answers
-        All expected answers, in the format of `LinkProbe.expect_exactly`.
-    pause_s
-        Pause after each item, s.
-    """
+    """Raw traffic and the answers to it; ID, title and clause as in a case."""
 
     id: str
     title: str
     sent: tuple[str, ...]
+    """Raw traffic, in the format of `LinkProbe.send_text`."""
     answers: tuple[str, ...] = ()
+    """All expected answers, in the format of `LinkProbe.expect_exactly`."""
     clause: str | None = None
+    """None: the clause of the area."""
     pause_s: float = 0.0
+    """Pause after each item, s."""
 
 
 def add_exchange_cases(

@@ -34,23 +34,11 @@ Readings = Mapping[str, tuple[Field, Value]]
 
 
 class AttitudeJudge:
-    """Judges attitudes by the motion of the sensor and the parameters in use.
+    """Judges attitudes, reported in `conventions`, by the motion of the sensor and the parameters in use.
 
-    Parameters
-    ----------
-    conventions
-        Conventions in which the unit reports attitudes.
-    sigma_arcsec
-        Largest standard deviation across and about the boresight that the unit may leave unstated.
-
-    Attributes
-    ----------
-    count
-        Number of valid attitudes compared with the truth.
-    motions
-        Motions of the sensor, in the order of their start.
-    dark_since_s
-        Time since which no light reaches the detector; None: it does.
+    `sigma_arcsec` are the largest standard deviations across and about the boresight that the unit may leave unstated; `count` valid
+    attitudes were compared with the truth, which follows the `motions` in the order of their start; no light has reached the
+    detector since `dark_since_s`, None: it does.
     """
 
     def __init__(self, conventions: Conventions, sigma_arcsec: tuple[float, float]) -> None:
@@ -73,20 +61,9 @@ class AttitudeJudge:
     def judge(
         self, row: str, read: Readings, now_s: float, values: Mapping[str, Known | None], *, imaging: bool
     ) -> None:
-        """Judge the attitude in a row, read now.
+        """Judge the attitude in a row, read at a simulation time in seconds with these parameters in use.
 
-        Parameters
-        ----------
-        row
-            Name of the row.
-        read
-            Its values.
-        now_s
-            Simulation time, seconds.
-        values
-            Parameters in use.
-        imaging
-            Whether the unit may be in a mode with frames.
+        `imaging`: whether the unit may be in a mode with frames.
         """
         reported = [read[name] for name in (f"attitude.{letter}" for letter in "xyzw") if name in read]
         numbers = [float(value) for _, value in reported if not isinstance(value, (str, bytes))]

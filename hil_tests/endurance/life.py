@@ -89,25 +89,14 @@ UNRECORDED: Final = frozenset({"disk", "end_pipeline"})
 
 @dataclass(frozen=True)
 class Life:
-    """A life: the unit's profile, and the steps.
-
-    Attributes
-    ----------
-    unit
-        Name or folder of the unit.
-    seed
-        Seed of the life and of the noise in it.
-    links
-        The links that are open: `serial`, `can`, `canopen`.
-    profile
-        Keys of the unit's profile.
-    steps
-        The steps in order.
-    """
+    """A life: keys of the unit's profile, and the steps in order."""
 
     unit: str
+    """Name or folder."""
     seed: int
+    """Seed of the life and of the noise in it."""
     links: tuple[str, ...]
+    """The links that are open: `serial`, `can`, `canopen`."""
     profile: dict[str, Any]
     steps: tuple[Step, ...]
 
@@ -141,19 +130,7 @@ def make_life(
 
 
 class LifeGenerator:
-    """Generates steps for a unit.
-
-    Parameters
-    ----------
-    icd
-        Definition of the unit.
-    links
-        Its links: `serial`, `can`, `canopen`.
-    random_of_life
-        Source of chance.
-    is_long
-        Whether the unit is left alone for days.
-    """
+    """Generates steps for a unit with these links open; a unit whose life `is_long` is left alone for days."""
 
     def __init__(
         self,

@@ -38,10 +38,7 @@ Readings = dict[str, tuple[Field, Value]]
 class _Mapped:
     """An entry of a TPDO: its size, and the field that it carries, possibly in a narrower type.
 
-    Attributes
-    ----------
-    fields
-        What the definition says of the fields of the row, by name.
+    `fields` are those of the row by name, in the definition.
     """
 
     size: int
@@ -69,15 +66,7 @@ class _Mapped:
 
 
 class Node:
-    """Judges the messages of a node.
-
-    Parameters
-    ----------
-    icd
-        Definition of the unit.
-    unit
-        The same in the judge's types.
-    """
+    """Judges the messages of a node; `unit` is its definition in the judge's types."""
 
     def __init__(self, icd: InterfaceDefinition, unit: Unit) -> None:
         self._errors: Mapping[int, str] = icd.enum("device_error").names

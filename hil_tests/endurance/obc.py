@@ -285,7 +285,8 @@ class Obc:
     def _read(self, what: str, row: Row | None, request: Request, reply: Answer) -> None:
         number = request.id if reply.row_id is None else reply.row_id
         other = self._icd.rows_by_key.get((reply.klass or request.klass, number)) or row
-        if other is None or other.kind != "telemetry":
+        named = set() if row is None else {item.partition(":")[2] or row.name for item in row.answers}
+        if other is None or other.kind != "telemetry" or other.name not in named:
             raise Violation(f"{what}: {reply}")
         self._outcome.readings += 1
         self._oracle.read(other, reply.data)

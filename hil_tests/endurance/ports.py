@@ -46,13 +46,7 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """An OBC on a serial line.
-
-    Attributes
-    ----------
-    dialect
-        Dialect of the answers, of a unit that has several.
-    """
+    """An OBC on a serial line; `dialect` is that of the answers, of a unit that has several."""
 
     def __init__(self, unit: Unit, deliver: Deliver, take: Take, dialect: str | None) -> None:
         self._unit = unit
@@ -134,13 +128,7 @@ Objects = dict[tuple[str, str], list[canopen.Entry]]
 
 
 class CanopenPort:
-    """A CANopen master that executes each request by SDO transfers.
-
-    Attributes
-    ----------
-    node
-        Node ID of the unit.
-    """
+    """A CANopen master that executes each request by SDO transfers; `node` is the node ID of the unit."""
 
     def __init__(self, unit: Unit, objects: Objects, deliver: Deliver, take: Take, node: int) -> None:
         self._unit, self._objects = unit, objects

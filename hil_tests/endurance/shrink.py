@@ -17,14 +17,7 @@ def kind_of(violation: str) -> str:
 def shortened(life: Life, fails: Callable[[Life], bool], *, attempts: int = 400) -> Life:
     """Return the life with as few steps as possible for which `fails` holds (delta debugging, Zeller 1999).
 
-    Parameters
-    ----------
-    life
-        A life that fails.
-    fails
-        Whether a life fails in the same way.
-    attempts
-        Largest number of lives to try.
+    At most this many `attempts` are made to live a shorter life.
     """
     left = attempts
 

@@ -48,21 +48,14 @@ def of_pairs(seen: tuple[Vector, Vector], known: tuple[Vector, Vector]) -> Quate
 
 @dataclass(frozen=True)
 class Motion:
-    """A rotation at a constant body rate since a time; at rest if the rate is zero.
-
-    Attributes
-    ----------
-    start_s
-        Simulation time at which the motion begins.
-    attitude
-        Attitude at the start.
-    rate_rad_s
-        Body rate (3), sensor frame.
-    """
+    """A rotation at a constant body rate since a time; at rest if the rate is zero."""
 
     start_s: float
+    """Simulation time."""
     attitude: Quaternion
+    """Attitude at the start."""
     rate_rad_s: tuple[float, float, float]
+    """Body rate, sensor frame."""
 
     @classmethod
     def of(cls, truth: Mapping[str, Any], start_s: float) -> Motion:

@@ -1,14 +1,14 @@
-"""Checks: sum, XOR, CRC and XXH32, each bit by bit or step by step from its definition.
+"""Checks: sum, XOR, Fletcher, CRC and XXH32, each bit by bit or step by step from its definition.
 
 Sources: the Rocksoft model (R. Williams, "A painless guide to CRC error detection algorithms", 1993), whose terms
-the CRC catalogues use, and the xxHash specification (Y. Collet, doc/xxhash_spec.md). The tests compare with the check
+the CRC catalogues use, the xxHash specification (Y. Collet, doc/xxhash_spec.md), and RFC 1146 (Fletcher). The tests compare with the check
 values that the catalogues publish for "123456789" and with `zlib`, `binascii` and the xxHash library.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from starhil.hil_tests.judge.rows import SIZES
 
@@ -31,7 +31,10 @@ def check_function(
                 SIZES[model.type], order
             )
         case "xor":
-            return lambda covered: bytes((_xor(covered, model.init),))
+            size = SIZES[model.type]
+            return lambda covered: _xor(covered, size, model.init, order).to_bytes(size, order)
+        case "fletcher16":
+            return lambda covered: _fletcher(covered, model.modulus).to_bytes(2, order)
         case "crc":
             size = SIZES[model.type]
             return lambda covered: crc(
@@ -48,10 +51,18 @@ def _sum(covered: bytes, size: int, complement: str) -> int:
     return {"none": total, "ones": (1 << 8 * size) - 1 - total, "twos": -total % (1 << 8 * size)}[complement]
 
 
-def _xor(covered: bytes, start: int) -> int:
-    for byte in covered:
-        start ^= byte
+def _xor(covered: bytes, size: int, start: int, order: Literal["little", "big"]) -> int:
+    """Return the XOR of words in an order; zeros complete the last one."""
+    for place in range(0, len(covered), size):
+        start ^= int.from_bytes(covered[place : place + size].ljust(size, b"\0"), order)
     return start
+
+
+def _fletcher(covered: bytes, modulus: int) -> int:
+    """Return Fletcher's checksum: a byte counts once in the lower sum, and in the upper as often as bytes are left."""
+    lower = sum(covered) % modulus
+    upper = sum(byte * (len(covered) - place) for place, byte in enumerate(covered)) % modulus
+    return upper * 256 + lower
 
 
 def crc(data: bytes, bits: int, poly: int, init: int, xor_out: int, *, reflect: bool) -> int:

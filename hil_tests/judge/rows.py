@@ -23,7 +23,7 @@ from starhil.hil_tests.judge.messages import Value
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 RowKind = Literal["telecommand", "telemetry"]
 SIZES: Final = {
-    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
+    "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u24": 3, "i24": 3, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
 }  # fmt: skip
 """Bytes of each type of number."""
 LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
@@ -211,7 +211,7 @@ class Field:
             case "float":
                 number = float(self.read(bytes(self.offset) + pattern))
                 low, high = self.limits
-                return min(max(number, low), high) if abs(number) < 1e30 else 0.0
+                return min(max(number if abs(number) < 1e30 else 0.0, low), high)
             case _:
                 low_raw, high_raw = self.raw_limits
                 raw = int.from_bytes(pattern, self.order)

@@ -14,7 +14,7 @@ from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.packets import key_bits, key_of, wire_order
 from starhil.protocol.quoting import Scope, cosmos_name, cosmos_state, cosmos_string
-from starhil.protocol.values import EnumDefinition
+from starhil.protocol.values import EnumDefinition, IcdError
 
 TARGET: Final = "STARHIL"
 IDENTIFIER: Final = "PACKET_ID"
@@ -79,6 +79,10 @@ def _field(row: Row, field: Field, name: str, start: int) -> Iterator[str]:
     limits = _limits(field) if row.kind == "telecommand" else ""
     endian = f" {'LITTLE' if field.slot.order == 'little' and not field.width else 'BIG'}_ENDIAN"
     offset = start + 8 * field.offset
+    if field.slot.bytewise and field.slot.order == "little":
+        raise IcdError(
+            f"{row.kind} {row.name}: field {field.name}: COSMOS has no little-endian numbers of {field.size} bytes"
+        )
     if (
         field.width
     ):  # COSMOS counts bits from the most significant one, and takes a bit field's order from its bytes

@@ -30,7 +30,6 @@ EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""
 
 _JOINED: Final = "Messages longer than 8 bytes describe the data after their segments are joined."
-_SIGNED: Final = ("i8", "i16", "i32", "i64")
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ def _signals(field: Field, receiver: str) -> Iterator[str]:
         return
     big = field.slot.order == "big"
     byte, bit = field.place(field.bit_count - 1 if big else 0)
-    sign = "-" if field.slot.type in _SIGNED or field.kind == "float" else "+"
+    sign = "-" if field.slot.type.startswith("i") or field.kind == "float" else "+"
     low, high = _limits(field)
     yield (
         f" SG_ {field.name} : {8 * byte + bit}|{field.bit_count}@{int(not big)}{sign} "

@@ -26,14 +26,23 @@ from starid.wahba import solve_wahba
 MIN_STARS: Final = 5
 """Fewest stars of a field that has features."""
 
+# The search is this project's, and so are its constants; the thesis takes the nearest cell.
 _MAGNITUDE_GATE: Final = 0.8
+"""Largest difference between a detection and the catalogue star for which it votes, mag."""
 _MAX_VOTERS: Final = 60
+"""Number of detections that vote, the brightest first."""
 _VOTE_SHARE: Final = 0.25
-_SPREAD: Final = 0.8
-_SPOTS_PER_BAND: Final = 100_000.0
-_STAGES: Final = (200, 3000)
-_OFFSET_SHARE: Final = 0.055
+"""Share that must vote for one rotation, of the detections or the catalogue stars, whichever are fewer."""
 _MIN_VOTES: Final = 6.0
+"""Least number of votes for one rotation."""
+_OFFSET_SHARE: Final = 0.055
+"""Largest error of a boresight that is worth a vote, as a share of the half-width of the circle."""
+_SPREAD: Final = 0.8
+"""Side of the spots, each of which is tried once, as a share of that error."""
+_SPOTS_PER_BAND: Final = 100_000.0
+"""Numbers reserved for the spots of one band of declination, more than there are."""
+_STAGES: Final = (200, 3000)
+"""Numbers of nearest cells tried before all are."""
 
 
 @dataclass(frozen=True, eq=False)

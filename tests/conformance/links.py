@@ -41,6 +41,21 @@ reply_header = [
     { role = "address", type = "u16", default = 0x1234 }, { role = "id", type = "u8" }, { role = "status", type = "u8" },
 ]
 """,
+    "xor16": """
+framing = { kind = "length", start = [0x5A] }
+check = { kind = "xor", type = "u16", init = 0x1234 }
+request_header = [{ role = "length", type = "u24" }, { role = "id", type = "u8" }]
+reply_header = [{ role = "length", type = "u24" }, { role = "id", type = "u8" }, { role = "status", type = "u8" }]
+""",
+    "fletcher": """
+framing = { kind = "length", start = [0x5A] }
+check = { kind = "fletcher16" }
+request_header = [{ role = "id", type = "u8" }, { role = "length", type = "u16", offset = 1 }]
+reply_header = [
+    { role = "id", type = "u8" }, { role = "length", type = "u16", offset = 1 },
+    { role = "sequence", type = "u8", counts = ["reply"] }, { role = "status", type = "u8" },
+]
+""",
     "hdlc": """
 framing = { kind = "slip", end = 0x7E, escape = 0x7D, xor = 0x20 }
 check = { kind = "crc", type = "u16", poly = 0x1021, init = 0xFFFF, reflect = true, xor = 0xFFFF, order = "big" }
@@ -77,6 +92,8 @@ fields = [
     {{ name = "e", type = "u16", scale = -0.5, offset = 100, min = -1000, max = 50, default = 0 }},
     {{ name = "f", type = "f64", min = 0, max = 1e9, default = 0 }},
     {{ name = "g", type = "i64", min = -5, max = 5, default = 0 }},
+    {{ name = "h", type = "i24", scale = 0.5, min = -4000000, max = 4000000, default = 0 }},
+    {{ name = "i", type = "u24", order = "little", min = 1, max = 0x123456, default = 1 }},
     {{ type = "bits16", bits = [{{ name = "flag", default = false }}, {{ name = "group", width = 5, default = 3 }}, {{ width = 10 }}] }},
 ]
 
@@ -118,6 +135,8 @@ fields = [
     {{ type = "bits8", bits = [{{ width = 2 }}, {{ name = "valid", value = "attitude.valid" }}, {{ width = 5 }}] }},
     {{ type = "bits16", bits = [{{ width = 3 }}, {{ name = "detected", width = 7, value = "stars.detected" }}, {{ width = 6 }}] }},
     {{ name = "boots", type = "u8", value = "boot.count" }},
+    {{ name = "z_24", type = "i24", scale = 2.5e-7, value = "attitude.z" }},
+    {{ name = "detected_24", type = "u24", order = "little", value = "stars.detected" }},
 ]
 
 [link.serial]

@@ -103,3 +103,17 @@ class Control:
 
     async def do(self, action, **values) -> dict:
         return await self.raw(json.dumps({"do": action, **values}).encode())
+
+
+async def every_row_read(emulation):
+    """Wait until console or recording, whose requests are not counted, has read every telemetry row."""
+    read, telemetry = set(), emulation.requests.telemetry
+
+    def note(name):
+        read.add(name)
+        return telemetry(name)
+
+    emulation.requests.telemetry = note
+    async with asyncio.timeout(20.0):
+        while len(read) < len(emulation.device.icd.telemetry):
+            await asyncio.sleep(0.01)

@@ -1,6 +1,5 @@
 """On a full disk, each file that a run writes fails alone: one warning, and the device goes on."""
 
-import asyncio
 import contextlib
 import resource
 
@@ -8,9 +7,8 @@ import pytest
 
 from starhil.emulator.cli.console_client import ConsoleClient
 from starhil.emulator.launch import RunOptions
-from tests.emulator.runs import command
+from tests.emulator.runs import command, every_row_read
 
-WITHIN_S = 20.0
 FULL = 600
 """Largest size of a file, bytes: less than what each writer has to write."""
 
@@ -40,10 +38,7 @@ async def track(emulation, seconds=6.0):
 async def track_with_telemetry(emulation):
     """Let the device take images while an OBC reads its telemetry, of which the recording is then full."""
     frames = await track(emulation)
-    counters = emulation.device.counters
-    async with asyncio.timeout(WITHIN_S):
-        while counters.telemetry < len(emulation.device.icd.telemetry):
-            await asyncio.sleep(0.01)
+    await every_row_read(emulation)
     return frames
 
 

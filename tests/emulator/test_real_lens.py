@@ -1,5 +1,7 @@
 """The profiles with a real lens have the errors of a real unit, and the calibration makes most of them."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from starid.attitude import ARCSEC_PER_RAD, Attitude, random_attitude
 DATA_SHEET_ARCSEC = 55.44 * 2**0.5
 """About x and y together."""
 FIELDS = 4
+SIRIUS = 32349
 
 PUBLISHED_3_SIGMA_ARCSEC = np.array([55.4, 55.4, 77.4])
 """About x, y and z."""
@@ -51,6 +54,22 @@ def test_a_slightly_wrong_calibration_stays_within_the_data_sheet(name, noise_ar
     assert max(wrong) < DATA_SHEET_ARCSEC
     parameters.set(constants)
     assert max(errors_arcsec(pipeline, parameters)) < noise_arcsec
+
+
+def test_bright_stars_that_a_wrong_calibration_keeps_out_of_the_solution_are_not_missing():
+    profile, icd = load_profile("cubestar", ["run.clock=stepped"]), load_unit()
+    pipeline = Pipeline(pipeline_setup(profile))
+    parameters = Parameters(icd, profile_defaults(profile, icd))
+    settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
+    truth = TruthState(Attitude.from_radec_roll(83.8, -1.2, 0.0), ZERO_RATE)
+    unused = set()
+    for index in range(5):
+        request = FrameRequest(index, truth, 0.3, 1.0, settings=settings, preview=True)
+        overlay = json.loads(pipeline.handle(request).preview.overlay)
+        bright = {hip for hip, _x, _y, v in overlay["catalogue"] if v < 2.0}
+        assert bright <= {*overlay["hips"], *overlay["unused"]}
+        unused |= bright & {*overlay["unused"]}
+    assert SIRIUS in unused
 
 
 @pytest.mark.parametrize("name", ["ideal", "demo"])

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from starhil.hil_tests.attitude import attitude_error, from_radec_roll
+from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.expect import Variable
 from starhil.hil_tests.script import Command, Read, Sample, Send, load_script
@@ -85,7 +85,7 @@ def test_a_full_script_is_read_unchanged(load):
     assert (script.emulator.profile, script.emulator.settings, script.emulator.seed) == (
         "demo", ("truth.ra_deg=83.8",), 3,
     )  # fmt: skip
-    assert attitude_error(script.truth.attitude, from_radec_roll(83.8, -1.2, 30.0)).total_arcsec == 0.0
+    assert script.truth.attitude == from_radec_roll(83.8, -1.2, 30.0)
     read, clock, attitude, sample, send, wait = script.steps
     assert isinstance(read, Read)
     assert read.row.id == 128
@@ -99,6 +99,9 @@ def test_a_full_script_is_read_unchanged(load):
     assert isinstance(send, Send)
     assert send.link == "serial"
     assert wait.name == "wait 0.5 s"
+
+
+ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
 
 
 @pytest.mark.parametrize(
@@ -193,6 +196,27 @@ def test_a_full_script_is_read_unchanged(load):
         (
             "[[step]]\nread = 'hole_map_1'\nexpect = { map = { min = 1 } }",
             ["'map' is bytes, and 'min' is for"],
+        ),
+        (
+            "[[step]]\ncommand = 'set_mode'\nwith = { mode = 'standby' }\nwith_hex = '00'",
+            ["give the parameters as a table 'with' or as bytes 'with_hex', not both"],
+        ),
+        (
+            "[[step]]\nset_parameter = 'exposure'\nvalue = 'long'\nrefused = 'invalid_parameter'",
+            ["'value' must be a number if a refusal is expected"],
+        ),
+        (
+            f"[truth]\nfile = 't.csv'\n{ANGLES}[[step]]\nwait_s = 1",
+            ["truth", "give an attitude or a file, not both"],
+        ),
+        ("[[step]]\nset_parameter = 'exposure'", ["'value' must be given, but is missing"]),
+        (
+            "[[step]]\nread = 'rates'\nexpect = { rate_x = [1, 2] }",
+            ["must be a number, true, false or a text, not [1, 2]"],
+        ),
+        (
+            f"[truth]\n{ANGLES}[[step]]\nread = 'quaternion'\nattitude = {{}}",
+            ["needs a tolerance: within_arcsec"],
         ),
     ],
 )

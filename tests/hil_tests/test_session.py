@@ -382,6 +382,68 @@ def test_links_are_chosen_by_step_and_a_missing_one_is_skipped(play, device, hub
     assert [(item.link, item.status) for item in result.results] == [("can", "skipped"), ("serial", "passed")]
 
 
+class Kept(dict):
+    """Parameters that the device acknowledges but does not change."""
+
+    def __setitem__(self, _identifier, _value):
+        pass
+
+
+VERDICTS = {
+    "a telecommand as bytes": ("command = 'set_mode'\nwith_hex = '63'\nrefused = 'invalid_parameter'", "passed", "refused with 3 (invalid_parameter), as expected"),
+    "telemetry that must be refused": ("read = 'rates'\nrefused = 'busy'", "passed", "refused with 6 (busy), as expected"),
+    "telemetry that is not refused": ("read = 'quaternion'\nrefused = 'busy'", "failed", "accepted, expected to be refused with busy"),
+    "a parameter that keeps its value": ("set_parameter = 'exposure'\nvalue = 250", "failed", "exposure reads back as 100, expected 250"),
+    "too few samples": ("sample = 'quaternion'\nevery_s = 0\nfor_s = 0\nmin_samples = 9", "failed", "only 1 samples arrived in 0 s, expected at least 9"),
+    "an answer that is only shown": ("send = '1F 7F 80 1F FF'", "passed", "came back: 1F"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_a_step_has_the_verdict_and_detail_of_what_the_device_did(play, device, name):
+    step, status, detail = VERDICTS[name]
+    device.refuse["rates"] = ErrorCode.BUSY
+    device.parameters = Kept(device.parameters)
+    (result,) = play(f"[[step]]\n{step}\n").results
+    assert (result.status, detail in result.detail) == (status, True), result.detail
+
+
+@pytest.mark.parametrize(("wanted", "status"), [(7, "passed"), (8, "failed")])
+def test_one_unsolicited_message_is_judged_without_a_rate(device, hub, tmp_path, wanted, status):
+    path = tmp_path / "trial.toml"
+    path.write_text(
+        f"[[step]]\nlisten = 'precise_attitude'\nexpect = {{ frame_counter = {wanted} }}\n", encoding="utf-8"
+    )
+    script = load_script(path, ICD)
+    with Bench(LinkOptions(can=device.open_can(hub), timeout_s=20.0), ICD) as bench:
+        bench.client("can").read("rates")
+        timer = threading.Timer(0.2, device.say, ["precise_attitude", {"frame_counter": 7}])
+        timer.start()
+        (result,) = SessionRunner(script, bench, tmp_path).run().results
+        timer.join()
+    assert (result.status, "rate_hz" in result.figures) == (status, False), result.detail
+
+
+def test_frames_are_sent_and_each_frame_of_the_answer_compared(play, device, hub):
+    channel = device.open_can(hub)
+    request = f"send = '{4 << 24 | 188 << 16 | 1 << 8 | 4:08X}#'\nlink = 'can'\n"
+    answer = f"{5 << 24 | 188 << 16 | 4 << 8 | 1:08X}#............"
+    passed, failed = play(
+        f"[[step]]\n{request}answer = '{answer}'\n[[step]]\n{request}answer = ['{answer}', '{answer}']\ntimeout_s = 0.2\n",
+        channel,
+    ).results
+    assert (passed.status, failed.status) == ("passed", "failed"), (passed.detail, failed.detail)
+
+
+def test_a_row_without_a_time_has_no_truth_in_a_file(play, tmp_path):
+    (tmp_path / "t.csv").write_text("")
+    (result,) = play(
+        "[truth]\nfile = 't.csv'\n[[step]]\nread = 'quaternion'\nattitude = { within_arcsec = 3 }\n"
+    ).results
+    assert result.status == "failed"
+    assert "quaternion has no time; read precise_attitude" in result.detail
+
+
 def test_only_an_emulator_that_the_session_started_can_be_restarted(play):
     result = play("[[step]]\nrestart = 'kill'")
     assert "use --start" in result.results[0].detail

@@ -154,6 +154,22 @@ TEXT = stack_of(
     rows=(RowShape("", 3, TC, 2), RowShape("", 200, TLM, 0, 6)),
 )
 
+
+def _length_framed(check: dict[str, Any]) -> SerialStack:
+    header = [{"role": "id", "type": "u8"}, {"role": "length", "type": "u16"}]
+    link = {
+        "framing": {"kind": "length", "start": [0x5A]},
+        "check": {"covers": ["start", "header", "data"]} | check,
+        "request_header": header,
+        "reply_header": [*header, {"role": "status", "type": "u8"}],
+    }
+    return stack_of(link, rows=(RowShape("", 3, TC, 2), RowShape("", 200, TLM, 0, 6)))
+
+
+XOR16 = _length_framed({"kind": "xor", "type": "u16", "init": 0x1234})
+FLETCHER = _length_framed({"kind": "fletcher16", "order": "big"})
+UBX = _length_framed({"kind": "fletcher16", "modulus": 256, "covers": ["header", "data"]})
+
 STACKS = {
     "sagitta": SAGITTA,
     "nos3": NOS3,
@@ -162,6 +178,9 @@ STACKS = {
     "dle": DLE,
     "hdlc": HDLC,
     "text": TEXT,
+    "xor16": XOR16,
+    "fletcher": FLETCHER,
+    "ubx": UBX,
 }
 
 REQUESTS: dict[str, list[Request]] = {
@@ -181,6 +200,7 @@ REQUESTS: dict[str, list[Request]] = {
     "dle": [Request(TC, 3, b"\x10\x10"), Request(TLM, 16)],
     "hdlc": [Request(TC, 3, b"\x7e\x7d"), Request(TLM, 126)],
     "text": [Request(TC, 3, b"\r\n"), Request(TLM, 200)],
+    **{name: [Request(TC, 3, b"\xfe\x01"), Request(TLM, 200)] for name in ("xor16", "fletcher", "ubx")},
 }
 
 REPLIES: dict[str, list[Reply]] = {
@@ -208,6 +228,10 @@ REPLIES: dict[str, list[Reply]] = {
     "dle": [Reply(ReplyKind.ACK, 3), Reply(ReplyKind.TELEMETRY, 16, b"\x10\x03" * 3)],
     "hdlc": [Reply(ReplyKind.ACK, 3), Reply(ReplyKind.TELEMETRY, 126, b"\x7e\x7d" * 3)],
     "text": [Reply(ReplyKind.ACK, 3), Reply(ReplyKind.TELEMETRY, 200, b"\r\n$$\r\n")],
+    **{
+        name: [Reply(ReplyKind.ACK, 3), Reply(ReplyKind.TELEMETRY, 200, b"\xff\x01\x02\xfe\x80\xff")]
+        for name in ("xor16", "fletcher", "ubx")
+    },
 }
 
 ALL_REQUESTS = [(name, request) for name, requests in REQUESTS.items() for request in requests]

@@ -69,9 +69,13 @@ def test_xxh32_gives_the_published_vectors(data: bytes, seed: int, expected: int
         ({"kind": "sum", "complement": "twos"}, 0x23),
         ({"kind": "xor"}, 0x31),
         ({"kind": "xor", "init": 0xFF}, 0xCE),
+        ({"kind": "xor", "type": "u16"}, 0x3908),
+        ({"kind": "xor", "type": "u16", "init": 0x1234}, 0x2B3C),
+        ({"kind": "fletcher16"}, 0x1EDE),
+        ({"kind": "fletcher16", "modulus": 256}, 0x15DD),
     ],
 )
-def test_sum_and_xor_of_the_digits(model: dict[str, object], expected: int) -> None:
+def test_sum_xor_and_fletcher_of_the_digits(model: dict[str, object], expected: int) -> None:
     assert compute(DIGITS, **model) == expected
 
 
@@ -83,6 +87,20 @@ def test_the_byte_order_of_the_check_overrides_the_unit_s() -> None:
 def test_value_wider_than_the_check_is_rejected() -> None:
     with pytest.raises(IcdError, match="poly 0x11021 does not fit u16"):
         build_check(ADAPTER.validate_python({"kind": "crc", "type": "u16", "poly": 0x11021}), "little")
+
+
+def test_the_words_of_an_xor_are_in_the_order_of_the_check() -> None:
+    model = {"kind": "xor", "type": "u16", "init": 0x1234}
+    assert build_check(ADAPTER.validate_python(model), "little").compute(DIGITS) == bytes.fromhex("0D1A")
+    with pytest.raises(IcdError, match="init 0x1234 does not fit u8"):
+        build_check(ADAPTER.validate_python(model | {"type": "u8"}), "little")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [(b"abcde", 0xC8F0), (b"abcdef", 0x2057), (b"abcdefgh", 0x0627)]
+)
+def test_fletcher_gives_the_published_vectors(text: bytes, expected: int) -> None:
+    assert compute(text, kind="fletcher16") == expected
 
 
 def test_check_of_a_plugin_is_found_by_name() -> None:

@@ -219,6 +219,25 @@ HEADER = [{"role": "id", "type": "u8"}]
             },
             "the bits add up to 5, must be 8",
         ),
+        (
+            {
+                "framing": {"kind": "slip"},
+                "request_header": HEADER,
+                "reply_header": [{"type": "u8", "role": "id", "counts": ["reply"]}],
+            },
+            "reply_header: 1: only role sequence has `counts`",
+        ),
+        (
+            {
+                "framing": {"kind": "slip"},
+                "request_header": [*HEADER, {"type": "u8", "role": "sequence", "counts": ["reply"]}],
+            },
+            "request_header: `counts` belongs to the reply header",
+        ),
+        (
+            {"framing": {"kind": "slip"}, "request_header": [{"type": "u8", "role": "id", "offset": 1}]},
+            "only role length has an `offset`",
+        ),
         ({"framing": {"kind": "slip", "end": 1, "escape": 1}, "request_header": HEADER}, "must differ"),
         (
             {"framing": {"kind": "escaped", "escape": 2, "start": 2}, "request_header": HEADER},

@@ -152,6 +152,7 @@ INVALID = [
     ("unknown key of a convention", '[conventions]\nquaternions = "attitude"\n', r"conventions\.quaternions: unknown key; did you mean quaternion"),
     ("left-handed axes", '[conventions]\naxes = ["+x", "-y", "+z"]\n', "is not a right-handed frame"),
     ("unknown epoch", '[conventions]\nepoch = "y2k"\n', "'y2k' is not one of unix, gps, j2000, midnight"),
+    ("error that is never sent", "[errors]\ncrc = 4\n", "errors.crc: never sent"),
     ("unknown error", "[errors]\nbad_id = 1\n", "errors.bad_id: no such error; did you mean invalid_id"),
     ("unknown class", CLASSES + telemetry("", more='class = "gets"'), "no class named 'gets'; did you mean get"),
     ("class left out", CLASSES + telemetry(""), "needs `class`, one of get, watch"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from starid.cache import cached_files, remove
-from starid.jit import read_verified, source_stamp, write_verified
+from starid.kernel_store import read_verified, source_stamp, write_verified
 
 CALLER = """
 from other_kernels.inner import FACTOR, scaled
@@ -22,7 +22,7 @@ def outer(x: float) -> float:
     return scaled(x) + FACTOR
 
 
-print(outer(1.0), 1 - outer.compilations)
+print(outer(1.0), 1 - outer.store.compilations)
 """
 
 INNER = """

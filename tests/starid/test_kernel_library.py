@@ -102,7 +102,7 @@ ARGUMENTS = ((1.0, 3.0), 4, Sums(7, np.array([0.5])))
 def loaded(kernel: Any, *arguments: object) -> Any:
     """The machine code of a kernel from the cache, without numba."""
     kernel(*arguments)
-    return load(kernel.read(type_names(arguments)), kernel.py_func)
+    return load(kernel.store.read(type_names(arguments)), kernel.py_func)
 
 
 def test_loaded_machine_code_returns_what_numba_returns() -> None:
@@ -156,9 +156,25 @@ def last(values: Array) -> float:
 def test_code_of_another_machine_is_left_to_numba(change: dict[str, Any]) -> None:
     inverse(4.0)
     kernel: Any = inverse
-    stored = kernel.read("float64")
+    stored = kernel.store.read("float64")
     with pytest.raises(NotLoadableError):
         load(stored._replace(**change), kernel.py_func)
+
+
+def test_counts_from_object_files_are_divided_as_integers(monkeypatch: pytest.MonkeyPatch) -> None:
+    # NumPy 1 divides a uint64 by an int into a float, which frombuffer rejects
+    inverse(4.0)
+    kernel: Any = inverse
+    counts, read = [], np.frombuffer
+
+    def recorded(buffer: bytes, dtype: Any = float, count: int = -1, offset: int = 0) -> Any:
+        counts.append(count)
+        return read(buffer, dtype, count, offset)
+
+    monkeypatch.setattr(np, "frombuffer", recorded)
+    assert load(kernel.store.read("float64"), kernel.py_func)(8.0) == 0.125
+    assert len(counts) > 3
+    assert not any(isinstance(count, np.uint64) for count in counts)
 
 
 def test_numba_loads_what_only_it_can_load(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +186,7 @@ def test_numba_loads_what_only_it_can_load(monkeypatch: pytest.MonkeyPatch) -> N
     again: Any = KernelFunction(inverse.__wrapped__)  # type: ignore[attr-defined]
     again.options = inverse.options  # type: ignore[attr-defined]
     assert again(4.0) == 0.25
-    assert again.compilations == 0
+    assert again.store.compilations == 0
 
 
 def test_a_warm_start_runs_kernels_without_numba() -> None:

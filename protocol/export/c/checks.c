@@ -24,6 +24,28 @@ static uint64_t check(uint64_t state, const uint8_t *bytes, size_t size)
     return state;
 }
 
+// xor16
+static uint64_t check(uint64_t state, const uint8_t *bytes, size_t size)
+{
+    const uint64_t second = UINT64_C(1) << 32; /* set before the second byte of a word */
+    while (size-- > 0u) {
+        state ^= (state & second) != 0u ? *bytes : (uint64_t)*bytes << 8;
+        state ^= second;
+        ++bytes;
+    }
+    return state;
+}
+
+// fletcher16
+static uint64_t check(uint64_t state, const uint8_t *bytes, size_t size)
+{
+    while (size-- > 0u) {
+        const uint64_t lower = ((state & 0xFFu) + *bytes++) % MODULUS;
+        state = ((state >> 8) + lower) % MODULUS << 8 | lower;
+    }
+    return state;
+}
+
 // crc
 static uint64_t check(uint64_t state, const uint8_t *bytes, size_t size)
 {

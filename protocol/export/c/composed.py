@@ -6,6 +6,7 @@ import re
 from typing import Any, Final
 
 from starhil.protocol.checks import reversed_bits
+from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Header, HeaderField
 from starhil.protocol.export.packets import row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
@@ -13,6 +14,7 @@ from starhil.protocol.link_schema import (
     CrcCheck,
     DelimitedFraming,
     EscapedFraming,
+    FletcherCheck,
     SlipFraming,
     SumCheck,
     XorCheck,
@@ -83,6 +85,8 @@ def _constants(stack: SerialStack) -> dict[str, str]:
             macros = {"IS_HEX": int(model.encoding == "hex")}
         case _:
             macros = {}
+    if isinstance(stack.link.check, FletcherCheck):
+        macros["MODULUS"] = stack.link.check.modulus
     if isinstance(stack.link.check, CrcCheck):
         bits = 8 * stack.check.size
         poly = stack.link.check.poly
@@ -172,11 +176,16 @@ def _length(header: Header) -> str:
 def _check(stack: SerialStack) -> dict[str, Any]:
     model, check = stack.link.check, stack.check
     initial, result = "0u", "state"
+    order: Order = getattr(model, "order", None) or stack.byte_order
+    kind: str = model.kind
+    suffix = _suffix(order)
     match model:
         case SumCheck():
             result = {"none": "state", "ones": "~state", "twos": "~state + 1u"}[model.complement]
-        case XorCheck():
-            initial = _number(model.init)
+        case XorCheck():  # the first byte of a word is the first of the checksum
+            initial = _number(int.from_bytes(model.init.to_bytes(check.size, order), "big"))
+            kind = "xor16" if check.size > 1 else "xor"
+            suffix = "be"
         case CrcCheck():
             bits = 8 * check.size
             initial = _number(reversed_bits(model.init, bits) if model.reflect else model.init)
@@ -198,11 +207,11 @@ def _check(stack: SerialStack) -> dict[str, Any]:
             "link.serial.check: xxh32 over separate parts cannot be exported to C; cover header and data"
         )
     return {
-        "check_function": part_of("c/checks.c", model.kind),
+        "check_function": part_of("c/checks.c", kind),
         "check_initial": initial,
         "check_result": result,
         "check_size": check.size,
-        "check_suffix": _suffix(getattr(model, "order", None) or stack.byte_order),
+        "check_suffix": suffix,
         "covered": used,
     }
 

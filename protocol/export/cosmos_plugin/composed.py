@@ -16,6 +16,7 @@ from starhil.protocol.link_schema import (
     CustomFraming,
     DelimitedFraming,
     EscapedFraming,
+    FletcherCheck,
     NoCheck,
     SlipFraming,
     SumCheck,
@@ -87,6 +88,8 @@ def _check(stack: SerialStack) -> dict[str, Any]:
             constants["COMPLEMENT"] = model.complement
         case XorCheck():
             constants["INITIAL"] = model.init
+        case FletcherCheck():
+            constants["MODULUS"] = model.modulus
         case CrcCheck():
             constants |= {
                 "POLYNOMIAL": model.poly,

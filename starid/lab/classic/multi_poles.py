@@ -21,10 +21,10 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from starid.arrays import Array, Indices, Indices32
-from starid.jit import compiled_ieee, inner
+from starid.arrays import Array, Indices
+from starid.jit import compiled_ieee
 from starid.lab.classic.neighbours import MAX_TIED, add_winners
-from starid.lab.classic.pairs import PairTable, chord_between, pair_range, pair_table
+from starid.lab.classic.pairs import PairTable, pair_table, pole_partners
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 
 IDENTITIES: Final = 10
@@ -37,54 +37,23 @@ MIN_POLES: Final = 2
 """Least number of poles with which a match is accepted."""
 
 
-@inner
-def pole_votes(table: PairTable, seen: Array, pole: int, tolerance: float, votes: Indices32) -> None:
-    """Count, for each catalogue star, the observed stars that have a partner of it at their distance to the pole."""
-    votes[:] = 0
-    voter = np.full(votes.shape[0], -1, dtype=np.int64)
-    for other in range(seen.shape[0]):
-        if other == pole:
-            continue
-        distance = chord_between(seen, pole, seen, other)
-        start, end = pair_range(table, distance - tolerance, distance + tolerance)
-        for pair in range(start, end):
-            for star in (table.first[pair], table.second[pair]):
-                if voter[star] != other:
-                    votes[star] += 1
-                    voter[star] = other
-
-
-@inner
-def accept(
-    table: PairTable, seen: Array, pole: int, identity: int, tolerance: float, accepted: Indices32
-) -> None:
-    """Count a pole with this identity among the poles (n, N) that accept each match."""
-    accepted[pole, identity] += 1
-    for other in range(seen.shape[0]):
-        if other == pole:
-            continue
-        distance = chord_between(seen, pole, seen, other)
-        start, end = pair_range(table, distance - tolerance, distance + tolerance)
-        for pair in range(start, end):
-            if table.first[pair] == identity:
-                accepted[other, table.second[pair]] += 1
-            elif table.second[pair] == identity:
-                accepted[other, table.first[pair]] += 1
-
-
 @compiled_ieee
 def _verified(table: PairTable, stars: int, seen: Array, tolerance: float) -> Indices:
     """Matches (m, 2) that the most poles accept, at least `MIN_POLES`."""
     n = seen.shape[0]
-    votes, accepted = np.empty(stars, dtype=np.int32), np.zeros((n, stars), dtype=np.int32)
+    partners = [(0, 0, 0)]
+    votes, accepted = np.empty(stars, dtype=np.int64), np.zeros((n, stars), dtype=np.int32)
     for pole in range(n):
-        pole_votes(table, seen, pole, tolerance, votes)
+        pole_partners(table, seen, pole, tolerance, partners, votes)
         for _ in range(IDENTITIES):
             identity = int(np.argmax(votes))
             if votes[identity] < MIN_ACCEPTED:
                 break
             votes[identity] = 0
-            accept(table, seen, pole, identity, tolerance, accepted)
+            accepted[pole, identity] += 1
+            for candidate, other, star in partners:
+                if candidate == identity:
+                    accepted[other, star] += 1
     matches = np.empty((n * MAX_TIED, 2), dtype=np.int64)
     filled = 0
     for star in range(n):

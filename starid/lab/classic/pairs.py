@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from starid.arrays import Array, Array32, Indices32
+from starid.arrays import Array, Array32, Indices, Indices32
 from starid.errors import StaridError
 from starid.jit import compiled_ieee, inner
 
@@ -123,6 +123,50 @@ def pair_range(table: PairTable, low: float, high: float) -> tuple[int, int]:
     while end > start and chord[end - 1] > high:
         end -= 1
     return start, max(start, end)
+
+
+@inner
+def pole_partners(
+    table: PairTable,
+    seen: Array,
+    pole: int,
+    tolerance: float,
+    partners: list[tuple[int, int, int]],
+    explained: Indices,
+) -> None:
+    """Collect the catalogue pairs that fit the distances from a pole to the other observed stars.
+
+    Parameters
+    ----------
+    table
+        The catalogue pairs.
+    seen
+        Directions of the observed stars, (n, 3).
+    pole
+        Row of the pole.
+    tolerance
+        Largest difference of two chords.
+    partners
+        Receives an identity of the pole, the row of the other star, and the identity of the latter.
+    explained
+        Receives, for each catalogue star as the pole, how many of the other stars have a partner.
+    """
+    partners.clear()
+    explained[:] = 0
+    last = np.full(explained.shape[0], -1, dtype=np.int64)
+    for j in range(seen.shape[0]):
+        if j == pole:
+            continue
+        distance = chord_between(seen, pole, seen, j)
+        start, end = pair_range(table, distance - tolerance, distance + tolerance)
+        for pair in range(start, end):
+            for side in range(2):
+                a = int(table.first[pair]) if side == 0 else int(table.second[pair])
+                b = int(table.second[pair]) if side == 0 else int(table.first[pair])
+                partners.append((a, j, b))
+                if last[a] != j:
+                    explained[a] += 1
+                    last[a] = j
 
 
 @compiled_ieee

@@ -25,9 +25,9 @@ import numpy as np
 
 from starid.arrays import Array, Indices
 from starid.errors import StaridError
-from starid.jit import compiled_ieee, inner
+from starid.jit import compiled_ieee
 from starid.lab.classic.agreement import group_around
-from starid.lab.classic.pairs import PairTable, chord_between, pair_range, pair_table
+from starid.lab.classic.pairs import PairTable, pair_table, pole_partners
 from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 from starid.wahba import solve_wahba
 
@@ -60,34 +60,6 @@ def simplest_size(stars: int, width_rad: float, tolerance: float) -> int:
     return size
 
 
-@inner
-def _groups(
-    table: PairTable,
-    seen: Array,
-    pole: int,
-    tolerance: float,
-    partners: list[tuple[int, int, int]],
-    size: Indices,
-) -> None:
-    """Collect a pole's match groups: (candidate, neighbour, its star) of fitting pairs, and their sizes."""
-    partners.clear()
-    size[:] = 0
-    last = np.full(size.shape[0], -1, dtype=np.int64)
-    for j in range(seen.shape[0]):
-        if j == pole:
-            continue
-        distance = chord_between(seen, pole, seen, j)
-        start, end = pair_range(table, distance - tolerance, distance + tolerance)
-        for pair in range(start, end):
-            for side in range(2):
-                a = int(table.first[pair]) if side == 0 else int(table.second[pair])
-                b = int(table.second[pair]) if side == 0 else int(table.first[pair])
-                partners.append((a, j, b))
-                if last[a] != j:
-                    size[a] += 1
-                    last[a] = j
-
-
 @compiled_ieee
 def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, least: int) -> list[Indices]:
     """List the subgraphs (m, 2), of at least `least` stars, that agree in all distances."""
@@ -95,7 +67,7 @@ def _subgraphs(table: PairTable, vectors: Array, seen: Array, tolerance: float, 
     partners = [(0, 0, 0)]
     size = np.empty(vectors.shape[0], dtype=np.int64)
     for pole in range(min(seen.shape[0], POLES)):
-        _groups(table, seen, pole, tolerance, partners, size)
+        pole_partners(table, seen, pole, tolerance, partners, size)
         for _ in range(GROUPS):
             candidate = np.argmax(size)
             if size[candidate] + 1 < least:

@@ -13,7 +13,7 @@ from starid.arrays import Array
 from starid.lab.classic.registry import CLASSICS, class_of, make_identifier
 from starid.lab.experiments.classics_sky import SkyName, ThesisSky, thesis_sky
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
-from starid.lab.experiments.figures import Curve, Panel
+from starid.lab.experiments.figures import Curve, Panel, curves_of
 from starid.lab.experiments.lsi_noise import IDENTIFIED_DEG
 from starid.lab.experiments.lsi_trials import centres, error_of, share, stars_of
 from starid.lab.experiments.tables import published, read_lines
@@ -36,9 +36,9 @@ _LABELS: Final = {
 _OWN_SKY: Final = {"lsi": "flat", "geometric": "sphere"}
 """The sky for which an algorithm of this project, or of the thesis, is designed."""
 
-_SKY_LABELS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars on the sphere"}
 _SENSOR: Final = (12.0, 1024, 6.0)
 """Sensor that most of the papers simulate: field in degrees, pixels, faintest star."""
+_SKY_LABELS: Final = {"flat": "the thesis's flat sky", "sphere": "the same stars on the sphere"}
 
 
 def parts(parameters: Parameters) -> list[Part]:
@@ -192,40 +192,32 @@ def _compare(e: Evaluation) -> None:
         e.compare(f"{SHORT[name]}: median time, no noise", text=milliseconds, unit="ms", ours=median)
 
 
-def _figures(e: Evaluation) -> None:
-    cases, skies = e.parameters["cases"], e.parameters["skies"]
+def _figures(e: Evaluation, lines: list[dict[str, Any]]) -> None:
+    """Draw the rates of all algorithms, and the published ones as crosses."""
     for number, kind, label in (
         (9, "position", "σ of position noise / px"),
         (10, "brightness", "σ of brightness noise / intensity units"),
         (11, "false", "false stars"),
         (8, "missing", "missing stars"),
     ):
-        levels = {
-            level: case for level in range(4) if (case := f"{kind}-{level}" if level else "none") in cases
-        }
-        if list(levels) == [0]:
+        levels = {f"{kind}-{level}" if level else "none": level for level in range(4)}
+        members = [line | {"level": levels[line["case"]]} for line in lines if line["case"] in levels]
+        if not any(line["level"] for line in members):
             continue
         known = [
-            (level, value)
-            for level, case in levels.items()
-            for name in SHORT
-            for value in e.published(f"{name}, {case}")
+            Curve([level], e.published(f"{name}, {case}"), "x", "", {"color": "red", "ms": 7})
+            for (case, level), name in itertools.product(levels.items(), SHORT)
+            if e.published(f"{name}, {case}")
         ]
-        panels = []
-        for sky in skies:
-            curves = []
-            for i, part in enumerate(part for part in e.parts if part.values["sky"] == sky):
-                rates = [_rate(e.results[part.key], case) for case in levels.values()]
-                own = part.values["algorithm"] not in CLASSICS
-                line = {"linewidth": 2.0 if own else 1.2, "ms": 3, "color": "black" if own else f"C{i % 10}"}
-                style = ("-", "--", ":")[i % 3] + "o"
-                curves.append(Curve(list(levels), rates, style, SHORT[part.values["algorithm"]], line))
-            for level, value in known:
-                curves.append(Curve([level], [value], "x", "", {"color": "red", "ms": 7}))
-            settings = {"xlabel": label, "ylabel": "identified / %", "xticks": list(levels), "ylim": (0, 102)}
-            panels.append(Panel(_SKY_LABELS[sky], curves, settings, "best"))
-        size = {"columns": len(skies), "width": 5.5 * len(skies), "height": 4.4}
-        e.draw(f"figure_6_{number}_classics.png", panels, **size)
+        shown = []
+        for sky in e.parameters["skies"]:
+            rates = [line for line in members if line["sky"] == sky]
+            curves = curves_of(rates, "level", "identified_percent", lambda line: SHORT[line["algorithm"]])
+            settings = {"xlabel": label, "ylabel": "identified / %", "xticks": range(4), "ylim": (0, 102)}
+            shown.append(Panel(_SKY_LABELS[sky], [*curves, *known], settings, "best"))
+        e.draw(
+            f"figure_6_{number}_classics.png", shown, columns=len(shown), width=5.5 * len(shown), height=4.4
+        )
 
 
 def evaluate(e: Evaluation) -> None:
@@ -240,7 +232,7 @@ def evaluate(e: Evaluation) -> None:
             line |= {"median_ms": float(np.median(times)), "p99_ms": float(np.percentile(times, 99.0))}
             lines.append(line)
     e.write("rates.csv", lines)
-    _figures(e)
+    _figures(e, lines)
     _compare(e)
     stars, unit = len(thesis_sky("sphere").catalog), NoiseModel().magnitude_per_unit
     e.note = {"limit": IDENTIFIED_DEG, "unit": unit, "stars": stars}

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, planar_sky
-from starid.lab.experiments.figures import Curve, Panel, Picture
+from starid.lab.experiments.figures import Panel, Picture, curves_of
 
 FRAME_DEG: Final = 42.0
 """Frame width of these figures, degrees: their zones, δ −6° … 36° and α 0° … 42°, are 42° wide."""
@@ -63,13 +63,9 @@ def _maps(e: Evaluation) -> None:
     shape = (result["dec"].size, result["ra"].size)
     half = 0.5 * FRAME_DEG * (1.0 - e.parameters["map_percent"] / 100.0)
     extent = (-half, result["ra"][-1] + half, -90.0 - half, result["dec"][-1] + half)
-    settings = {
-        "xlabel": "α of the centre / °",
-        "ylabel": "δ of the centre / °",
-        "xlim": (0, 360),
-        "ylim": (-90, 90),
-    }
-    settings |= {"xticks": range(0, 361, 60), "yticks": range(-90, 91, 30)}
+    settings: dict[str, Any] = {"xlabel": "α of the centre / °", "ylabel": "δ of the centre / °"}
+    settings |= {"xlim": (0, 360), "xticks": range(0, 361, 60)}
+    settings |= {"ylim": (-90, 90), "yticks": range(-90, 91, 30)}
     for values, name in zip(result["features"].T, _COLUMNS, strict=True):
         number, quantity, symbol = _MAPS[name]
         options = {"cmap": "twilight", "vmin": -180, "vmax": 180} if name == "theta" else {}
@@ -81,26 +77,24 @@ def _maps(e: Evaluation) -> None:
 
 
 def _variation(e: Evaluation, number: int, axis: str, keys: dict[str, str]) -> None:
-    column, symbol, limits = (0, "α", (0, 360)) if axis == "ra" else (1, "δ", (-90, 90))
-    panels, lines = [], []
-    for name, (_, _, unit) in _MAPS.items():
-        curves = [
-            Curve(
-                e.results[key]["places"][:, column],
-                e.results[key]["features"][:, _COLUMNS.index(name)],
-                label=label,
-            )
-            for key, label in keys.items()
-        ]
-        panels.append(Panel("", curves, {"ylabel": unit, "xlim": limits}))
-    panels[-1].settings["xlabel"] = f"{symbol} of the centre / °"
-    for key, label in keys.items():
-        for (ra, dec), features in zip(e.results[key]["places"], e.results[key]["features"], strict=True):
-            line = {"curve": label, "ra_deg": ra, "dec_deg": dec}
-            lines.append(line | dict(zip(_COLUMNS, features, strict=True)))
-    legend = {"legend": "outside upper center", "legend_columns": len(keys)}
-    e.draw(f"figure_2_{number}.png", panels, width=7.5, height=9.5, sharex=True, **legend)
+    column, symbol, limits = ("ra_deg", "α", (0, 360)) if axis == "ra" else ("dec_deg", "δ", (-90, 90))
+    lines = [
+        {"curve": label, "ra_deg": ra, "dec_deg": dec} | dict(zip(_COLUMNS, features, strict=True))
+        for key, label in keys.items()
+        for (ra, dec), features in zip(e.results[key]["places"], e.results[key]["features"], strict=True)
+    ]
     e.write(f"figure_2_{number}.csv", lines)
+    shown = [
+        Panel(
+            "",
+            curves_of(lines, column, name, lambda line: line["curve"], "-"),
+            {"ylabel": unit, "xlim": limits},
+        )
+        for name, (_, _, unit) in _MAPS.items()
+    ]
+    shown[-1].settings["xlabel"] = f"{symbol} of the centre / °"
+    legend = {"legend": "outside upper center", "legend_columns": len(keys)}
+    e.draw(f"figure_2_{number}.png", shown, width=7.5, height=9.5, sharex=True, **legend)
 
 
 def _compare_map(e: Evaluation) -> None:

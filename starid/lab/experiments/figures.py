@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -56,20 +56,41 @@ class Picture:
 
 def precision(errors: Any, limit: float, label: str = "", style: str = "-", **options: Any) -> Curve:
     """Percentage of errors at or below a threshold, for 1000 thresholds from 0 to limit."""
-    thresholds = np.linspace(0.0, limit, 1001)
+    thresholds = np.round(np.linspace(0.0, limit, 1001), 6)
     ordered = np.sort(np.asarray(errors, dtype=np.float64))
     share = 100.0 * np.searchsorted(ordered, thresholds, side="right") / max(ordered.size, 1)
     return Curve(thresholds, share, style, label, options)
 
 
-def precision_axes(symbol: str, limit: float) -> dict[str, Any]:
+def precision_axes(symbol: str) -> dict[str, Any]:
     """Settings of a panel of precision curves."""
-    return {
-        "xlabel": f"threshold of {symbol} / °",
-        "ylabel": "precision rate / %",
-        "xlim": (0.0, limit),
-        "ylim": (0.0, 102.0),
-    }
+    words = {"xlabel": f"threshold of {symbol} / °", "ylabel": "precision rate / %"}
+    return {**words, "xmargin": 0.0, "ylim": (0.0, 102.0)}
+
+
+def curves_of(
+    table: Iterable[Mapping[str, Any]],
+    x: str,
+    y: str,
+    label: Callable[[Mapping[str, Any]], str],
+    style: str = "o-",
+) -> list[Curve]:
+    """A curve for each label of lines of a table, through the values of two columns."""
+    found: dict[str, list[Mapping[str, Any]]] = {}
+    for line in table:
+        found.setdefault(label(line), []).append(line)
+    return [
+        Curve([line[x] for line in lines], [line[y] for line in lines], style, words)
+        for words, lines in found.items()
+    ]
+
+
+def panels(curves: Iterable[tuple[str, Curve]], legend: str = "", **settings: Any) -> list[Panel]:
+    """Panels with the same settings, in order, from curves with the titles of their panels."""
+    found: dict[str, list[Curve]] = {}
+    for title, curve in curves:
+        found.setdefault(title, []).append(curve)
+    return [Panel(title, members, settings, legend) for title, members in found.items()]
 
 
 def _picture(fig: Any, axis: Any, picture: Picture) -> list[Any]:
@@ -122,6 +143,8 @@ def draw(
     """
     rows = -(-len(panels) // columns)
     fig, axes = figure(rows, columns, width=width, height=height, squeeze=False, **options)
+    for axis in axes.ravel()[len(panels) :]:
+        axis.remove()
     for axis, panel in zip(axes.ravel(), panels, strict=False):
         handles = _picture(fig, axis, panel) if isinstance(panel, Picture) else _curves(axis, panel)
         axis.set(title=panel.title, **panel.settings)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 import numpy as np
 
 from starid.arrays import Mask
 from starid.lab.experiments.author_noise import filter_noise
-from starid.lab.experiments.comparison import best_constant, markdown_table
+from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Curve, Panel
+from starid.lab.experiments.figures import Curve, panels
 from starid.lab.experiments.tables import CONFUSION
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
 from starid.plots import colours
@@ -34,6 +34,7 @@ _BRIGHTEST: Final = 3.0
 _MAGNITUDES: Final = (-1.5, 3.0)
 _COUNTS: Final = ("TP", "FP", "FN", "TN")
 _INDICATORS: Final = ("accuracy", "precision", "recall", "f1")
+_DISTANCES: Final = ("μ_d", "σ_d")
 _PUBLISHED_FRAMES: Final = 1000
 
 
@@ -147,18 +148,21 @@ def _percent(counts: Sequence[int], indicator: str) -> float:
     return Confusion(*(int(count) for count in counts)).percent(indicator)
 
 
-def _published(kind: str, f: int, k: int, indicator: str) -> float:
-    return _percent(CONFUSION[kind, f][k], indicator)
-
-
-def _printed_value(e: Evaluation, kind: str, f: int, k: int, indicator: str, which: str = "any") -> float:
-    return _percent(e.results[f"{kind}-f{f}-printed"][which][k], indicator)
-
-
 def _of_author(e: Evaluation, kind: str, f: int, k: int, indicator: str, stretch: float = 1.0) -> float:
     """Median over the first frames of an indicator as the author ran it, percent."""
     sums = e.results[f"{kind}-f{f}-author-x{stretch:g}"]["counts"][k].sum(axis=1)
     return float(np.median([_percent(counts, indicator) for counts in sums]))
+
+
+def _values(e: Evaluation, kind: str, f: int, k: int, indicator: str) -> dict[str, float]:
+    """An indicator of a set, percent: published, as the author ran it, as printed, and of the scalable filter."""
+    printed = e.results[f"{kind}-f{f}-printed"]
+    return {
+        "published": _percent(CONFUSION[kind, f][k], indicator),
+        "author": _of_author(e, kind, f, k, indicator),
+        "printed": _percent(printed["any"][k], indicator),
+        "ours": _percent(printed["followed"][k], indicator),
+    }
 
 
 def _largest(e: Evaluation, kind: str, f: int, k: int, indicator: str) -> float:
@@ -198,57 +202,27 @@ def _write(e: Evaluation) -> None:
     e.write("confusion_matrices.csv", lines)
 
 
-Curves = Mapping[tuple[str, int], Sequence[float]]
-"""Kind of noise and number of false stars → a value for each factor of the noise."""
-
-
 def _figures(e: Evaluation) -> None:
-    """Draw the indicators beside the published ones, and the means of μ_d and σ_d."""
-    sets = list(itertools.product(e.parameters["kinds"], e.parameters["false_stars"]))
-    for number, name in enumerate(_INDICATORS, start=14):
-        author = {case: [_of_author(e, *case, k, name) for k in FACTORS] for case in sets}
-        published = {case: [_published(*case, k, name) for k in FACTORS] for case in sets}
-        title = f"{name.capitalize()}, as the author ran it (dotted: published)"
-        _draw(e, number, f"{name} / %", title, author, published)
-    (worst,) = e.published("figure 6.18: greatest mean μ_d of all sets")
-    for number, name, place in ((18, "μ_d", 0), (19, "σ_d", 1)):
-        distances = {
-            case: e.results[f"{case[0]}-f{case[1]}-author-x1"]["distances"][..., place] for case in sets
-        }
-        means = {case: np.nanmean(values, axis=(1, 2)) for case, values in distances.items()}
-        title = f"Mean {name}, as the author ran it; published: at most {worst:g}° of μ_d"
-        _draw(e, number, f"mean {name} / °", title, means, {})
-
-
-def _draw(e: Evaluation, number: int, label: str, title: str, author: Curves, published: Curves) -> None:
-    """Draw a panel for each kind of noise, a curve for each number of false stars."""
-    kinds, false_stars = e.parameters["kinds"], e.parameters["false_stars"]
-    panels = []
-    for kind in kinds:
+    """Draw figures 6.14 to 6.19: the indicators beside the published ones, and the means of μ_d and σ_d."""
+    kinds, shades = e.parameters["kinds"], zip(e.parameters["false_stars"], colours(6), strict=False)
+    sets = list(itertools.product(kinds, shades))
+    for number, name in enumerate((*_INDICATORS, *_DISTANCES), start=14):
         curves = []
-        for f, shade in zip(false_stars, colours(6), strict=False):
-            style = {"color": shade, "markersize": 3}
-            curves.append(Curve(FACTORS, author[kind, f], "-o", f"f = {f}", style))
-            if published:
-                curves.append(Curve(FACTORS, published[kind, f], ":", "", {"color": shade}))
-        settings = {"xlabel": "noise factor μ", "ylabel": label}
-        panels.append(Panel(f"{_KINDS[kind]} noise", curves, settings))
-    size = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
-    e.draw(f"figure_6_{number}.png", panels, title=title, **size)
-
-
-def _matrix(e: Evaluation, indicator: str) -> str:
-    """Tabulate our and the published indicator: a line for each table A.1–A.18, a column for each μ."""
-    lines = []
-    for kind, f in itertools.product(e.parameters["kinds"], e.parameters["false_stars"]):
-        cells = []
-        for k in range(len(FACTORS)):
-            case = (kind, f, k, indicator)
-            values = (_published(*case), _of_author(e, *case), _printed_value(e, *case))
-            cells.append(" / ".join(f"{value:.1f}" for value in values))
-        lines.append([f"A.{3 * f + 1 + list(_KINDS).index(kind)}: f = {f}, {_KINDS[kind]}", *cells])
-    head = f"{indicator} / %: published / as the author ran it / as printed"
-    return markdown_table([head, *(f"μ = {factor}" for factor in FACTORS)], lines)
+        for kind, (f, shade) in sets:
+            panel, colour = f"{_KINDS[kind]} noise", {"color": shade}
+            if name in _INDICATORS:
+                values = [_values(e, kind, f, k, name) for k in FACTORS]
+                author, published = ([each[word] for each in values] for word in ("author", "published"))
+                curves.append((panel, Curve(FACTORS, published, ":", "", colour)))
+            else:
+                distances = e.results[f"{kind}-f{f}-author-x1"]["distances"]
+                author = list(np.nanmean(distances[..., _DISTANCES.index(name)], axis=(1, 2)))
+            curves.append((panel, Curve(FACTORS, author, "-o", f"f = {f}", colour | {"markersize": 3})))
+        label = f"{name} / %" if name in _INDICATORS else f"mean {name} / °"
+        shown = panels(curves, xlabel="noise factor μ", ylabel=label)
+        size = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
+        title = f"{name}, as the author ran it (dotted: published)"
+        e.draw(f"figure_6_{number}.png", shown, title=title, **size)
 
 
 def _compare_tables(e: Evaluation) -> None:
@@ -258,9 +232,10 @@ def _compare_tables(e: Evaluation) -> None:
         matches, printed, intervals = [], 0, []
         for f, k in sets:
             case = (kind, f, k, indicator)
-            theirs, largest = _published(*case), _largest(e, *case)
-            matches.append(abs(_of_author(e, *case) - theirs) <= largest)
-            printed += abs(_printed_value(e, *case) - theirs) <= largest
+            values, largest = _values(e, *case), _largest(e, *case)
+            theirs = values["published"]
+            matches.append(abs(values["author"] - theirs) <= largest)
+            printed += abs(values["printed"] - theirs) <= largest
             intervals.append((theirs - largest, theirs + largest))
         constant = best_constant(intervals)
         null = [low <= constant <= high for low, high in intervals]
@@ -284,7 +259,7 @@ def _compare_predictions(e: Evaluation, law: str, kinds: Sequence[str]) -> None:
     for case in sets:
         medians = [_of_author(e, *case, "recall", stretch) for stretch in stretches]
         curves[case] = np.polyfit(stretches, medians, 2)
-        published[case] = _published(*case, "recall"), _largest(e, *case, "recall")
+        published[case] = _values(e, *case, "recall")["published"], _largest(e, *case, "recall")
 
     def away(case: tuple[str, int, int], stretch: float) -> float:
         theirs, largest = published[case]
@@ -312,13 +287,13 @@ def _compare_named(e: Evaluation) -> None:
     for kind, f, k, indicator in itertools.product(
         e.parameters["kinds"], e.parameters["false_stars"], range(len(FACTORS)), _INDICATORS
     ):
-        case = (kind, f, k, indicator)
         quantity = f"{indicator}, {_KINDS[kind]} noise, μ = {k}, f = {f}"
+        values = _values(e, kind, f, k, indicator)
         if e.published(quantity):
-            e.compare(quantity, author=_of_author(e, *case), printed=_printed_value(e, *case))
+            e.compare(quantity, author=values["author"], printed=values["printed"])
         quantity += ": scalable filter (ours), noise as printed"
         if e.published(quantity):
-            e.compare(quantity, ours=_printed_value(e, *case, "followed"))
+            e.compare(quantity, ours=values["ours"])
 
 
 def _compare_motion(e: Evaluation) -> None:
@@ -350,4 +325,3 @@ def evaluate(e: Evaluation) -> None:
         _compare_predictions(e, "brightness", ("brightness",))
     _compare_named(e)
     _compare_motion(e)
-    e.note["matrix"] = _matrix(e, "recall")

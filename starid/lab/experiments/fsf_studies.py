@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Curve, Panel
+from starid.lab.experiments.figures import Curve, Panel, curves_of, panels
 from starid.lab.experiments.fsf import (
     RADIUS_DEG,
     author_distances,
@@ -20,7 +20,6 @@ from starid.lab.experiments.fsf import (
 )
 from starid.lab.experiments.tables import CASE_STUDY
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, turned
-from starid.plots import figure, save
 from starid.thesis.cme import estimate_motion, matched_motion
 from starid.thesis.false_stars import ObservedFrame
 from starid.thesis.fsf import ClusterFilter
@@ -51,36 +50,29 @@ def compute_choice(context: Context, part: Part) -> Results:
 
 def evaluate_choice(e: Evaluation) -> None:
     """Figure 6.12, and the choice of the thesis."""
-    lines = []
+    lines = {}
     for part in e.parts:
         lost, shift = (e.results[part.key][name] for name in ("lost", "shift"))
         error = float(np.mean(shift)) if shift.size else math.nan
-        lines.append({"part": part.key, "lost_stars": float(lost.mean()), "shift_error_deg": error})
-    e.write("parameter_choice.csv", lines)
-    found = {line["part"]: line for line in lines}
-    epsilons, shares = e.parameters["epsilons"], e.parameters["shares"]
-    by_epsilon = [
-        Curve(epsilons, [found[f"eps{epsilon:g}"][name] for epsilon in epsilons], style, label)
-        for name, style, label in (
-            ("lost_stars", "o-", "stars lost a frame"),
-            ("shift_error_deg", "s-", "error of the shift / °"),
-        )
+        lines[part.key] = {"part": part.key, "lost_stars": float(lost.mean()), "shift_error_deg": error}
+    e.write("parameter_choice.csv", list(lines.values()))
+    by_epsilon, by_share = (
+        [{**lines[part.key], **part.values} for part in e.parts if name in part.values]
+        for name in ("least", "share")
+    )
+    curves = [
+        *curves_of(by_epsilon, "epsilon", "lost_stars", lambda _: "stars lost a frame"),
+        *curves_of(by_epsilon, "epsilon", "shift_error_deg", lambda _: "error of the shift / °"),
     ]
-    by_share = [
-        Curve(
-            shares,
-            [found[f"share{share:g}-eps{epsilon:g}"]["lost_stars"] for share in shares],
-            "o-",
-            f"stars lost a frame, ε = {epsilon:g}",
-        )
-        for epsilon in (0.4, 0.8)
+    lost_stars = curves_of(
+        by_share, "share", "lost_stars", lambda line: f"lost a frame, ε = {line['epsilon']:g}"
+    )
+    shown = [
+        Panel("", curves, {"xlabel": "ε (min_samples = 3)"}, "best"),
+        Panel("", lost_stars, {"xlabel": "min_samples / number of objects"}, "best"),
     ]
-    panels = [
-        Panel("", by_epsilon, {"xlabel": "ε (min_samples = 3)"}, "best", cycle=True),
-        Panel("", by_share, {"xlabel": "min_samples / number of objects"}, "best", cycle=True),
-    ]
-    e.draw("figure_6_12.png", panels, columns=2)
-    chosen = found["share0.5-eps0.4"]
+    e.draw("figure_6_12.png", shown, columns=2)
+    chosen = lines["share0.5-eps0.4"]
     quantity = "stars lost a frame, ε = 0.4, min_samples = 0.5·n, position noise 0.1°"
     e.compare(quantity, printed=chosen["lost_stars"])
     e.compare("error of the shift, the same", printed=chosen["shift_error_deg"], unit="°", digits=4)
@@ -121,38 +113,24 @@ def evaluate_case(e: Evaluation) -> None:
         printed = {name: {"printed": value} for name, value in measured.items()}
         e.compare_line("6.3 and 6.4", "", f"f = {f}, noise: {kind}", known, printed)
     e.write("tables_6_3_and_6_4.csv", lines)
-    e.files.append(_reconstruction_figure(e.context))
+    _draw_reconstruction(e)
 
 
-def _reconstruction_figure(context: Context) -> str:
+def _draw_reconstruction(e: Evaluation) -> None:
     """Draw figure 6.13: the stars of a frame, and of the previous one after the estimated motion."""
-    fig, axes = figure(1, 2, width=9.5, height=4.6, sharey=True)
-    for factor, ax in zip((0.0, 1.0), axes, strict=True):
-        clean, frames = frames_of_seven(context.rng("figure 6.13"), noise_of("both", factor, 0), 1)
+    curves = []
+    for factor in (0.0, 1.0):
+        clean, frames = frames_of_seven(e.context.rng("figure 6.13"), noise_of("both", factor, 0), 1)
         first, second = clean.observed, next(frames).observed
-        matches = ClusterFilter()(first, second).matches
-        stars = second.positions[matches[:, 1]]
-        motion = estimate_motion(first.positions[matches[:, 0]], stars)
-        moved = motion.apply(first.positions[matches[:, 0]])
-        magnified = ax.inset_axes((0.03, 0.03, 0.3, 0.3))
-        for axis, size in ((ax, 7.0), (magnified, 11.0)):
-            axis.plot(*stars.T, "bo", markersize=size, fillstyle="none", label="stars")
-            axis.plot(*moved.T, "r+", markersize=size, label="reconstructed")
-        at = stars[int(np.argmax(np.hypot(*(moved - stars).T)))]
-        magnified.set(
-            xlim=at[0] + np.array([-0.3, 0.3]), ylim=at[1] + np.array([-0.3, 0.3]), xticks=[], yticks=[]
-        )
-        ax.indicate_inset_zoom(magnified, edgecolor="black")
-        ax.set(
-            title=f"μ = {factor:g}: γ̃ = {motion.rotation_deg:.3f}°, μ_d = {motion.mean_distance_deg:.1e}°",
-            xlabel="x / °",
-            xlim=(-RADIUS_DEG, RADIUS_DEG),
-            ylim=(-RADIUS_DEG, RADIUS_DEG),
-        )
-    axes[0].set_ylabel("y / °")
-    axes[0].legend(loc="upper right")
-    fig.suptitle("Figure 6.13: the inset magnifies the star that lies farthest from its reconstruction")
-    return save(fig, context.folder / "figure_6_13.png")
+        before, now = ClusterFilter()(first, second).matches.T
+        motion = estimate_motion(first.positions[before], second.positions[now])
+        title = f"μ = {factor:g}: γ̃ = {motion.rotation_deg:.3f}°, μ_d = {motion.mean_distance_deg:.1e}°"
+        (x, y), (moved_x, moved_y) = second.positions[now].T, motion.apply(first.positions[before]).T
+        curves.append((title, Curve(x, y, "o", "stars", {"fillstyle": "none"})))
+        curves.append((title, Curve(moved_x, moved_y, "+", "reconstructed")))
+    limits = (-RADIUS_DEG, RADIUS_DEG)
+    shown = panels(curves, "upper right", xlabel="x / °", ylabel="y / °", xlim=limits, ylim=limits)
+    e.draw("figure_6_13.png", shown, columns=2, width=9.5, height=4.6, sharey=True)
 
 
 def compute_correlation(context: Context, part: Part) -> Results:
@@ -173,7 +151,7 @@ def compute_correlation(context: Context, part: Part) -> Results:
 
 def evaluate_correlation(e: Evaluation) -> None:
     """Table 6.5, and the first fifty frames of each set."""
-    lines, panels = [], []
+    lines, curves = [], []
     for part in e.parts:
         motion, factor = e.results[part.key]["author"], part.values["factor"]
         rho, p = correlation(motion[:, 0], motion[:, 1])
@@ -189,9 +167,10 @@ def evaluate_correlation(e: Evaluation) -> None:
             remark=f"p-value {p:.1g}.",
         )
         trials = np.arange(min(50, len(motion)))
-        curves = [Curve(trials, motion[:50, i], "-", f"{name} / °") for i, name in enumerate(("μ_d", "σ_d"))]
-        panels.append(Panel(f"μ = f = {factor}", curves, {"xlabel": "trial"}, "upper right", cycle=True))
-    e.draw("figures_6_31_6_32_d.png", panels, height=1.6 * len(panels))
+        for values, name in zip(motion[:50].T, ("μ_d", "σ_d"), strict=True):
+            curves.append((f"μ = f = {factor}", Curve(trials, values, "-", f"{name} / °")))
+    shown = panels(curves, "upper right", xlabel="trial")
+    e.draw("figures_6_31_6_32_d.png", shown, height=1.6 * len(shown))
     e.write("table_6_5.csv", lines)
 
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Panel, Picture, precision, precision_axes
+from starid.lab.experiments.figures import Picture, panels, precision, precision_axes
 from starid.lab.experiments.lsi_trials import COLUMNS, GRID_LABELS, OFF, ON, ROWS, share, shares, solve_frames
 from starid.plots import colours
 from starid.thesis.metrics import error_colours
@@ -24,6 +25,7 @@ _KINDS: Final = {
     "author_mse": "MSE, as the author ran it",
     "author_1se": "1SE, as the author ran it",
     "mse": "MSE, as printed",
+    "1se": "1SE, as printed",
     "fine": "sub-cell, ours",
     "stars": "stars compared, ours",
 }
@@ -54,53 +56,43 @@ def _map(title: str, errors: Array, limit: float) -> Picture:
     return Picture(title, values, extent, settings, "ε_f / °", scale, "max")
 
 
-def _draw_maps(e: Evaluation, name: str, maps: Sequence[Picture], columns: int, title: str) -> None:
-    size = {"width": 3.5 + 2.75 * columns, "height": 0.6 + 1.7 * len(maps) / columns}
-    e.draw(name, maps, columns=columns, title=title, sharex=True, sharey=True, **size)
-
-
-def _maps(e: Evaluation, percents: list[float], rolls: list[float], roll_percent: float) -> None:
+def _maps(e: Evaluation, percents: list[float]) -> None:
+    """Draw figures 6.1 to 6.3: databases on two scales, and turned cameras."""
     mapped = [percent for percent in percents if 99.1 <= percent <= 99.5] or percents[-1:]
-    for number, kind, word in ((1, "author_mse", "MSE"), (2, "author_1se", "1SE")):
-        for grid in (ON, OFF):
-            maps = [
-                _map(
-                    f"p = {percent:g} %, 0° … {limit:g}°",
-                    e.results[f"p{percent:g}-{grid}"][f"f_{kind}"],
-                    limit,
-                )
-                for percent in mapped
-                for limit in _MAP_SCALES
-            ]
-            title = f"ε_f of the {word} solution as the author ran it, frames {GRID_LABELS[grid]}"
-            _draw_maps(e, f"figure_6_{number}_{grid}.png", maps, 2, title)
-    for grid in () if e.context.quick else (ON, OFF):
-        turns = [
-            _map(
-                f"camera turned by {roll:g}°",
-                e.results[f"p{roll_percent:g}-roll{roll:g}-{grid}"]["f_author_mse"],
-                1.0,
-            )
-            for roll in rolls
+    scales = [(f"p{p:g}", f"p = {p:g} %, 0° … {limit:g}°", limit) for p in mapped for limit in _MAP_SCALES]
+    turned = f"p{e.parameters['roll_percent']:g}-roll"
+    turns = [(f"{turned}{roll:g}", f"camera turned by {roll:g}°", 1.0) for roll in e.parameters["rolls"]]
+    figures = [(1, "mse", 2, scales), (2, "1se", 2, scales), (3, "mse", 1, turns)]
+    for (number, kind, columns, shown), grid in itertools.product(figures, (ON, OFF)):
+        maps = [
+            _map(title, e.results[f"{key}-{grid}"][f"f_author_{kind}"], limit) for key, title, limit in shown
         ]
-        title = f"ε_f (MSE) as the author ran it, p = {roll_percent:g} %, frames {GRID_LABELS[grid]}"
-        _draw_maps(e, f"figure_6_3_{grid}.png", turns, 1, title)
+        title = f"ε_f of the {kind.upper()} solution as the author ran it, frames {GRID_LABELS[grid]}"
+        size = {"columns": columns, "width": 3.5 + 2.75 * columns, "height": 0.6 + 1.7 * len(maps) / columns}
+        e.draw(f"figure_6_{number}_{grid}.png", maps, title=title, sharex=True, sharey=True, **size)
 
 
-def _precision_figures(e: Evaluation, percents: list[float]) -> None:
+def _precision(e: Evaluation, percents: list[float]) -> None:
+    """Write and draw figures 6.4 and 6.5."""
     shades = dict(zip(percents, colours(len(percents)), strict=True))
     for number, quantity, symbol in ((4, "f", "ε_f"), (5, "theta", "ε_θ")):
-        panels = []
-        for grid in (ON, OFF):
-            for kind, word in _KINDS.items():
-                curves = [
-                    precision(result[f"{quantity}_{kind}"], 1.0, f"p = {percent:g} %", color=shades[percent])
-                    for percent in percents
-                    if f"{quantity}_{kind}" in (result := e.results[f"p{percent:g}-{grid}"])
-                ]
-                panels.append(Panel(f"{word}, {GRID_LABELS[grid]}", curves, precision_axes(symbol, 1.0)))
-        size = {"columns": len(_KINDS), "width": 16.0, "height": 6.6, "sharey": True}
-        e.draw(f"figure_6_{number}.png", panels, legend="outside right upper", **size)
+        found = {
+            (percent, grid, kind): precision(errors, 1.0, f"p = {percent:g} %", color=shades[percent])
+            for percent, grid, kind in itertools.product(percents, (ON, OFF), _KINDS)
+            if (errors := e.results[f"p{percent:g}-{grid}"].get(f"{quantity}_{kind}")) is not None
+        }
+        columns = {f"p{p:g}_{grid}_{kind}_percent": curve.y for (p, grid, kind), curve in found.items()}
+        e.write(f"figure_6_{number}.csv", {"threshold_deg": next(iter(found.values())).x} | columns)
+        shown = panels(
+            (
+                (f"{word}, {GRID_LABELS[grid]}", found[percent, grid, kind])
+                for (kind, word), grid, percent in itertools.product(_KINDS.items(), (ON, OFF), percents)
+                if (percent, grid, kind) in found
+            ),
+            **precision_axes(symbol),
+        )
+        size = {"columns": 4, "width": 16.0, "height": 9.9, "sharey": True}
+        e.draw(f"figure_6_{number}.png", shown, legend="outside right upper", **size)
 
 
 def _compare_best(e: Evaluation, on: Results, off: Results) -> None:
@@ -171,33 +163,15 @@ def _compare_rolls(e: Evaluation, percent: float, rolls: list[float]) -> None:
         _compare_listed(e, f"{where}: share with ε_f ≤ 0.3° at roll {{}}°", keys, rolls, "equal", 2)
 
 
-def _write(e: Evaluation, percents: list[float]) -> None:
-    thresholds = np.round(np.linspace(0.0, 1.0, 1001), 3)
-    for number, quantity in ((4, "f"), (5, "theta")):
-        columns: dict[str, Any] = {"threshold_deg": thresholds}
-        for percent in percents:
-            for grid in (ON, OFF):
-                result = e.results[f"p{percent:g}-{grid}"]
-                for kind in ("author_mse", "author_1se", "mse", "1se", "fine", "stars"):
-                    if f"{quantity}_{kind}" not in result:
-                        continue
-                    ordered = np.sort(result[f"{quantity}_{kind}"])
-                    rate = 100.0 * np.searchsorted(ordered, thresholds, side="right") / ordered.size
-                    columns[f"p{percent:g}_{grid}_{kind}_percent"] = rate
-        e.write(f"figure_6_{number}.csv", columns)
-    for key, result in e.results.items():
-        columns = {"ra_deg": result["frames"][:, 0], "dec_deg": result["frames"][:, 1]}
-        columns.update({name: values for name, values in result.items() if name != "frames"})
-        e.write(f"errors_{key}.csv", columns)
-
-
 def evaluate(e: Evaluation) -> None:
     """Maps, precision curves, shares within limits, and their independence of the roll."""
-    percents, rolls = e.parameters["percent"], e.parameters["rolls"]
-    roll_percent = e.parameters["roll_percent"]
-    _maps(e, percents, rolls, roll_percent)
-    _precision_figures(e, percents)
-    _write(e, percents)
+    percents = e.parameters["percent"]
+    _maps(e, percents)
+    _precision(e, percents)
+    for key, result in e.results.items():
+        frames = {"ra_deg": result["frames"][:, 0], "dec_deg": result["frames"][:, 1]}
+        values = {name: values for name, values in result.items() if name != "frames"}
+        e.write(f"errors_{key}.csv", frames | values)
     off = e.results[f"p{_BEST:g}-{OFF}"]
     _compare_best(e, e.results[f"p{_BEST:g}-{ON}"], off)
     best = {
@@ -208,7 +182,7 @@ def evaluate(e: Evaluation) -> None:
     for grid, words in ((ON, "grows up to 99.5 %"), (OFF, None)):
         quantity = f"LSI (MSE), {GRID_LABELS[grid]}: share with ε_f ≤ 0.3° for p = {{}} %"
         _compare_listed(e, quantity, [f"p{percent:g}-{grid}" for percent in percents], percents, words, 1)
-    _compare_rolls(e, roll_percent, rolls)
+    _compare_rolls(e, e.parameters["roll_percent"], e.parameters["rolls"])
     agree = off["residual"] < _AGREES
     e.note = {
         "ambiguous": 100.0 * float(np.mean(agree & (off["f_fine"] > 0.01))),

@@ -12,11 +12,10 @@ import numpy as np
 from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.comparison import Readings
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Curve, Panel, precision, precision_axes
+from starid.lab.experiments.figures import Curve, Panel, curves_of, panels, precision, precision_axes
 from starid.lab.experiments.lsi_patterns import add_patterns
 from starid.lab.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label, share, solve_frames
 from starid.lab.simulation import NoiseModel
-from starid.plots import colours
 
 IDENTIFIED_DEG: Final = 0.283
 """A frame counts as identified when its boresight is within 16.98′, section 6.1.2.3."""
@@ -36,6 +35,7 @@ _CASES: Final = (
     *((kind, level, IDENTIFIED_DEG) for kind in ("position", "brightness") for level in (0.0, 3.0)),
 )
 """Kind of noise, σ and limit of ε_f of the published shares."""
+_METHODS: Final = {"author_mse": "as the author ran it", "mse": "as printed", "fine": "sub-cell (ours)"}
 _RATES: Final = (
     (9, "position", "σ of positional noise / px"),
     (10, "brightness", "σ of brightness noise / intensity units"),
@@ -73,65 +73,69 @@ def _key(kind: str, level: float, grid: str, head: str = "", tail: str = "") -> 
     return f"{head}{kind}-{level:g}{tail}-{grid}" if level else f"none-{grid}"
 
 
-def _noise_figure(e: Evaluation, grid: str, quantity: str, *, author: bool) -> None:
+def _noise_figure(e: Evaluation, grid: str, quantity: str, reading: str) -> None:
     """Draw figure 6.6 (ε_f) or 6.7 (ε_θ): a row for each kind of noise, with two scales."""
+    author = reading == "author"
     head, name = ("root-", f"{quantity}_author_mse") if author else ("", f"{quantity}_mse")
+    number, symbol, limits = (6, "ε_f", (1.0, 0.05)) if quantity == "f" else (7, "ε_θ", (1.0, 10.0))
     tails = {"": ", μ = 0"} if author else {"": ", μ = 0", "-mean": ", μ drawn"}
-    number, symbol = (6, "ε_f (MSE)") if quantity == "f" else (7, "ε_θ (MSE)")
-    panels: list[Panel] = []
-    for kind, (_, label) in _KINDS.items():
-        for limit in (1.0, 0.05) if quantity == "f" else (1.0, 10.0):
-            curves = [precision(e.results[f"none-{grid}"][name], limit, "no noise", color="black")]
-            levels = itertools.product(tails.items(), _LEVELS)
-            for ((tail, words), level), colour in zip(levels, colours(6), strict=False):
-                errors = e.results[_key(kind, level, grid, head, tail)][name]
-                style = "--" if tail else "-"
-                curves.append(precision(errors, limit, f"σ = {level:g}{words}", style, color=colour))
-            legend = "" if len(panels) % 2 else "lower right"
-            panels.append(
-                Panel(f"{label}, {GRID_LABELS[grid]}", curves, precision_axes(symbol, limit), legend)
-            )
-    title, reading = ("As the author ran it", "author") if author else ("As printed", "printed")
-    size = {"columns": 2, "width": 8.5, "height": 9.0}
-    e.draw(f"figure_6_{number}_{grid}_{reading}.png", panels, title=title, **size)
+    noises = itertools.product(tails.items(), _LEVELS)
+    cases = [
+        ("no noise", "", 0.0),
+        *((f"σ = {level:g}{words}", tail, level) for (tail, words), level in noises),
+    ]
+    curves = (
+        (
+            f"{label} up to {limit:g}°",
+            precision(
+                e.results[_key(kind, level, grid, head, tail)][name], limit, words, "--" if tail else "-"
+            ),
+        )
+        for (kind, (_, label)), limit, (words, tail, level) in itertools.product(
+            _KINDS.items(), limits, cases
+        )
+    )
+    shown = panels(curves, "lower right", **precision_axes(f"{symbol} (MSE)"))
+    title = f"As {'the author ran it' if author else 'printed'}, frames {GRID_LABELS[grid]}"
+    e.draw(f"figure_6_{number}_{grid}_{reading}.png", shown, title=title, columns=2, width=8.5, height=9.0)
 
 
 def _false_figure(e: Evaluation) -> None:
-    panels = []
-    for grid, kind in itertools.product((ON, OFF), ("false", "missing")):
-        curves = []
-        for count, colour in zip(range(4), ["black", *colours(3)], strict=True):
-            if (key := _key(kind, count, grid)) in e.results:
-                label = count_label(count, kind) if count else "no noise"
-                curves.append(precision(e.results[key]["f_mse"], 1.0, label, color=colour))
-        settings = precision_axes("ε_f (MSE)", 1.0)
-        panels.append(Panel(f"{kind} stars, {GRID_LABELS[grid]}", curves, settings, "center right"))
-    e.draw("figure_6_8.png", panels, columns=2, width=8.5, height=6.6, sharey=True)
+    curves = (
+        (
+            f"{kind} stars, {GRID_LABELS[grid]}",
+            precision(e.results[key]["f_mse"], 1.0, count_label(count, kind) if count else "no noise"),
+        )
+        for grid, kind, count in itertools.product((ON, OFF), ("false", "missing"), range(4))
+        if (key := _key(kind, count, grid)) in e.results
+    )
+    shown = panels(curves, "center right", **precision_axes("ε_f (MSE)"))
+    e.draw("figure_6_8.png", shown, columns=2, width=8.5, height=6.6, sharey=True)
 
 
 def _rate_figures(e: Evaluation) -> None:
+    """Write and draw figures 6.9 to 6.11, with the published rates as crosses."""
     for number, kind, label in _RATES:
         if f"{kind}-1-{ON}" not in e.results:
             continue
-        lines: list[dict[str, Any]] = []
-        curves = []
-        for grid, style in ((ON, "-o"), (OFF, "--o")):
-            for method, word, colour, head in (
-                ("author_mse", "as the author ran it", "C1", "root-" if kind in _KINDS else ""),
-                ("mse", "as printed", "C0", ""),
-                ("fine", "sub-cell (ours)", "C2", ""),
-            ):
-                rates = {
-                    level: share(e.results[key][f"f_{method}"], IDENTIFIED_DEG)
-                    for level in range(4)
-                    if (key := _key(kind, level, grid, head)) in e.results
-                }
-                lines += [
-                    {"level": level, "grid": grid, "method": method, "rate_percent": rate}
-                    for level, rate in rates.items()
-                ]
-                words = f"{word}, {GRID_LABELS[grid]}"
-                curves.append(Curve(list(rates), list(rates.values()), style, words, {"color": colour}))
+        root = "root-" if kind in _KINDS else ""
+        lines = [
+            {
+                "level": level,
+                "grid": grid,
+                "method": method,
+                "rate_percent": share(e.results[key][f"f_{method}"], IDENTIFIED_DEG),
+            }
+            for grid, method, level in itertools.product((ON, OFF), _METHODS, range(4))
+            if (key := _key(kind, level, grid, root if method == "author_mse" else "")) in e.results
+        ]
+        e.write(f"figure_6_{number}.csv", lines)
+        curves = curves_of(
+            lines,
+            "level",
+            "rate_percent",
+            lambda line: f"{_METHODS[line['method']]}, {GRID_LABELS[line['grid']]}",
+        )
         known = {
             level: e.published(_quantity(kind, level, IDENTIFIED_DEG))
             for case, level, _ in _CASES
@@ -140,15 +144,9 @@ def _rate_figures(e: Evaluation) -> None:
         if known:
             mark = {"ms": 8, "color": "red"}
             curves.append(Curve(list(known), list(known.values()), "x", "published (on the grid)", mark))
-        lowest = min(line["rate_percent"] for line in lines)
-        settings = {
-            "xlabel": label,
-            "ylabel": f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %",
-            "xticks": range(4),
-            "ylim": (0, 102) if kind == "false" else (min(50.0, lowest - 3.0), 101),
-        }
-        e.draw(f"figure_6_{number}.png", [Panel("", curves, settings, "best")], width=6.0, height=4.0)
-        e.write(f"figure_6_{number}.csv", lines)
+        words = f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %"
+        panel = Panel("", curves, {"xlabel": label, "ylabel": words, "xticks": range(4)}, "best")
+        e.draw(f"figure_6_{number}.png", [panel], width=6.0, height=4.0)
 
 
 def _readings(e: Evaluation, kind: str, level: float, limit: float, grid: str) -> Readings:
@@ -205,8 +203,8 @@ def evaluate(e: Evaluation) -> None:
     _compare_noise(e)
     _compare_objects(e)
     if f"both-3-mean-{ON}" in e.results:
-        for quantity, grid, author in itertools.product(("f", "theta"), (ON, OFF), (True, False)):
-            _noise_figure(e, grid, quantity, author=author)
+        for case in itertools.product((ON, OFF), ("f", "theta"), ("author", "printed")):
+            _noise_figure(e, *case)
     _false_figure(e)
     _rate_figures(e)
     add_patterns(e)

@@ -9,9 +9,8 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Evaluation
-from starid.lab.experiments.figures import Curve, Panel
+from starid.lab.experiments.figures import Curve, panels
 from starid.lab.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label
-from starid.plots import colours
 
 _CASES: Final = {
     "none": "no noise",
@@ -36,21 +35,25 @@ def add_patterns(e: Evaluation) -> None:
 
 
 def _draw_patterns(e: Evaluation, grid: str) -> None:
-    def logarithm(errors: Array) -> Array:
-        return np.asarray(1.0 + np.log10(np.maximum(errors[_TRIALS], _LEAST)), dtype=np.float64)
-
     trials = np.arange(_TRIALS.start + 1, _TRIALS.stop + 1)
-    panels: list[Panel] = []
-    for case, title in _CASES.items():
-        result = e.results[f"{case}-{grid}"]
-        psi = Curve(trials, logarithm(result["psi_author"]), "--", "ε_ψ", {"color": "blue"})
-        for name, symbol in (("f_author_mse", "ε_f / °"), ("theta_author_mse", "ε_θ / °")):
-            curves = [Curve(trials, logarithm(result[name]), "-", symbol, {"color": "red"}), psi]
-            settings = {"xlabel": "trial", "ylabel": "1 + log₁₀ ε"}
-            panels.append(Panel(title, curves, settings, "" if len(panels) > 1 else "upper right"))
+    errors = {"f_author_mse": "ε_f / °", "theta_author_mse": "ε_θ / °"}
+    curves = (
+        (
+            f"{title}: {words}",
+            Curve(
+                trials,
+                1.0 + np.log10(np.maximum(e.results[f"{case}-{grid}"][key][_TRIALS], _LEAST)),
+                style,
+                label,
+            ),
+        )
+        for (case, title), (name, words) in itertools.product(_CASES.items(), errors.items())
+        for key, style, label in ((name, "-", "error"), ("psi_author", "--", "ε_ψ"))
+    )
     title = f"LSI (MSE) as the author ran it, trials 560 to 600, frames {GRID_LABELS[grid]}"
     size = {"columns": 2, "width": 9.5, "height": 15.0, "sharex": True}
-    e.draw(f"figures_6_20_to_6_27_and_b_{grid}.png", panels, title=title, **size)
+    shown = panels(curves, "upper right", xlabel="trial", ylabel="1 + log₁₀ ε")
+    e.draw(f"figures_6_20_to_6_27_and_b_{grid}.png", shown, title=title, **size)
 
 
 def _below_thresholds(errors: Array, psi: Array, thresholds: Array) -> dict[str, Array]:
@@ -66,24 +69,20 @@ def _below_thresholds(errors: Array, psi: Array, thresholds: Array) -> dict[str,
 
 
 def _draw_thresholds(e: Evaluation, quantity: str, symbol: str, name: str) -> None:
+    """Write and draw the errors of the frames with ε_ψ below each threshold."""
     thresholds = np.arange(_STEP, 2.0 + 0.5 * _STEP, _STEP)
     columns: dict[str, Any] = {"threshold_psi": thresholds}
-    panels: list[Panel] = []
-    for group, title in _GROUPS.items():
-        cases = ["none", *(case for case in _CASES if case.startswith(group))]
-        for grid in (ON, OFF):
-            curves: dict[str, list[Curve]] = {"mean": [], "deviation": []}
-            for case, colour in zip(cases, ["black", *colours(3)], strict=True):
-                result = e.results[f"{case}-{grid}"]
-                found = _below_thresholds(result[f"{quantity}_author_mse"], result["psi_author"], thresholds)
-                for what, values in found.items():
-                    curves[what].append(Curve(thresholds, values, "-", _CASES[case], {"color": colour}))
-                    columns[f"{case}_{grid}_{what}_deg"] = values
-            for what, each in curves.items():
-                settings = {"xlabel": "threshold of ε_ψ", "ylabel": f"{what} of {symbol} / °"}
-                legend = "" if len(panels) % 4 else "best"
-                panels.append(Panel(f"{title}, {GRID_LABELS[grid]}", each, settings, legend))
-    e.draw(f"{name}.png", panels, columns=4, width=12.0, height=8.5, sharex=True)
+    curves: list[tuple[str, Curve]] = []
+    for (group, title), grid in itertools.product(_GROUPS.items(), (ON, OFF)):
+        for case in ("none", *(case for case in _CASES if case.startswith(group))):
+            result = e.results[f"{case}-{grid}"]
+            found = _below_thresholds(result[f"{quantity}_author_mse"], result["psi_author"], thresholds)
+            for what, values in found.items():
+                columns[f"{case}_{grid}_{what}_deg"] = values
+                curve = Curve(thresholds, values, "-", _CASES[case])
+                curves.append((f"{what} of {symbol} / °: {title}, {GRID_LABELS[grid]}", curve))
+    shown = panels(curves, "best", xlabel="threshold of ε_ψ")
+    e.draw(f"{name}.png", shown, columns=4, width=14.0, height=8.5, sharex=True)
     e.write(f"{name}.csv", columns)
 
 

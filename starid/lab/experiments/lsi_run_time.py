@@ -9,10 +9,8 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Array
-from starid.lab.experiments.classics import IN_TABLE_6_2, SHORT
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.lsi_trials import ON, frames_under_test, stars_of
-from starid.lab.experiments.tables import published
 
 _STAGES: Final = {
     "extraction": "feature extraction",
@@ -87,7 +85,7 @@ def compute(context: Context, part: Part) -> Results:
 
 
 def evaluate(e: Evaluation) -> None:
-    """Times beside table 6.1, and table 6.2 as the thesis quotes it."""
+    """Times beside table 6.1."""
     lines: list[dict[str, Any]] = []
     for part in e.parts:
         percent, grid = part.values["percent"], part.values["grid"]
@@ -113,7 +111,3 @@ def evaluate(e: Evaluation) -> None:
                 check="less" if checked else "",
             )
     e.write("table_6_1_times.csv", lines)
-    for name in IN_TABLE_6_2:
-        size, milliseconds = published("classics", f"table 6.2, {name}")
-        word = "the thesis's LSI" if name == "lsi" else SHORT[name]
-        e.compare(f"table 6.2, quoted by the thesis: {word}", text=f"{size:g} kB, {milliseconds:g} ms")

@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 
 from starid.lab.experiments.author_noise import identification_noise
-from starid.lab.experiments.comparison import markdown_table
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
 from starid.lab.experiments.fsf import track_filter
 from starid.lab.experiments.rsi_figures import draw_sequences
@@ -22,7 +21,6 @@ from starid.lab.experiments.rsi_trials import (
     START,
     measured_step,
     method_of,
-    noise_label,
     set_label,
     side_as_printed,
     statistics,
@@ -36,27 +34,8 @@ SETTLING: Final = 5
 
 _BYTES_PER_CELL: Final = 5
 _FIELD_DEG: Final = 40.0
-_ERRORS: Final = (
-    ("error_mean", "error_mean", 2, "ε_f mean / °"),
-    ("error_sigma", "error_sigma", 2, "σ"),
-    ("roll_mean", "roll_mean", 2, "ε_θ mean / °"),
-    ("roll_sigma", "roll_sigma", 2, "σ"),
-    ("psi_mean", "psi_mean", 2, "ε_ψ mean"),
-    ("psi_sigma", "psi_sigma", 2, "σ"),
-)
-"""Columns of tables H.1 and H.2: name of the published value, name of the computed one, decimals, head."""
-_UPDATES: Final = (
-    ("trigger_percent", "trigger_percent", 1, "triggers / %"),
-    ("exceeded_percent", "exceeded_percent", 1, "ε_ψ > τ / %"),
-    ("side_mean", "side_mean", 2, "Γ mean / °"),
-    ("side_sigma", "side_sigma", 3, "σ"),
-    ("region_kB", "region_kB", 2, "kB"),
-    ("search_ms", "search_ms_median", 3, "1NN / ms, mean / median"),
-    ("lasso_ms", "lasso_ms_median", 3, "LASSO / ms, mean / median"),
-)
-"""The same of tables 6.7 to 6.9."""
 _PUBLISHED: Final = (
-    *(name for name, *_ in _ERRORS),
+    *(f"{name}_{measure}" for name in ("error", "roll", "psi") for measure in ("mean", "sigma")),
     *("trigger_percent", "exceeded_percent", "side_mean", "side_sigma"),
     *("search_ms", "search_ms_sigma", "lasso_ms", "lasso_ms_sigma"),
 )
@@ -119,94 +98,39 @@ def _label(values: Mapping[str, Any]) -> str:
 def evaluate(e: Evaluation) -> None:
     """The tables beside ours, the figures, and the mean errors with memory against the published ones."""
     found = {part.key: statistics(e.results[part.key]["numbers"], SETTLING) for part in e.parts}
-    for part in e.parts:
-        side = found[part.key]["side_mean"]
-        cells = region_cells(side, _FIELD_DEG, part.values["overlap"])
-        found[part.key]["region_kB"] = 1e-3 * _BYTES_PER_CELL * cells
-    diagonal = [part for part in e.parts if part.values["false_stars"] == part.values["factor"]]
-    _write(e, found)
-    sides = _sides(e, diagonal, found)
-    if not e.context.quick:
-        draw_sequences(e, diagonal, SETTLING)
-    _compare(e, diagonal, found)
-    matrices = [_matrix(e, found, overlap) for overlap in e.parameters["overlaps"]]
-    e.note = {
-        "matrices": "\n\n".join(matrix for matrix in matrices if matrix),
-        "errors": _table("tables H.1 and H.2", _ERRORS, diagonal, found),
-        "updates": _table("tables 6.7, 6.8 and 6.9", _UPDATES, diagonal, found),
-        "sides": sides,
-    }
-
-
-def _write(e: Evaluation, found: Mapping[str, dict[str, float]]) -> None:
     lines = []
     for part in e.parts:
         v, known = part.values, _published(part.values)
-        method = method_of(v["tau"], v["memory"], v["side"])
+        cells = region_cells(found[part.key]["side_mean"], _FIELD_DEG, v["overlap"])
+        found[part.key]["region_kB"] = 1e-3 * _BYTES_PER_CELL * cells
         published = {f"published_{name}": known.get(name, "") for name in _PUBLISHED}
+        method = method_of(v["tau"], v["memory"], v["side"])
         lines.append({**v, "method": method, **found[part.key], **published})
     e.write("tables_6_7_6_8_6_9_h_1_h_2.csv", lines)
+    diagonal = [part for part in e.parts if part.values["false_stars"] == part.values["factor"]]
+    _write_sides(e, diagonal, found)
+    if not e.context.quick:
+        draw_sequences(e, diagonal, SETTLING)
+    _compare(e, diagonal, found)
 
 
-def _sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> str:
-    """Write and tabulate Γ by eq. 6.5 as printed, with the square root, and in table 6.8, for the first RSI method."""
-    least = RsiSettings().gamma_min_deg
+def _write_sides(e: Evaluation, parts: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:
+    """Write Γ by eq. 6.5 as printed, with the square root, and in table 6.8, for the first RSI method."""
+    settings = RsiSettings()
     tau = min(t for t, *_ in e.parameters["methods"] if t != LSI_ONLY)
-    lines, cells = [], []
+    lines = []
     for part in parts:
         v, known, s = part.values, _published(part.values), found[part.key]
         if v["overlap"] != e.parameters["overlaps"][0] or v["tau"] != tau or not known:
             continue
-        mean, sigma, published = s["mean_distance_deg"], s["sigma_distance_deg"], known["side_mean"]
-        printed, root = side_as_printed(mean, sigma, least), region_side(mean, sigma, RsiSettings())
-        line = {"factor": v["factor"], "scale": v["scale"], "mu_d_deg": mean, "sigma_d_deg": sigma}
-        line |= {"as_printed_deg": printed, "square_root_deg": root, "published_deg": published}
-        lines.append(line)
-        sides = [f"{side:.2f}" for side in (printed, root, published)]
-        label = f"μ = f = {v['factor']:g}, {noise_label(v['scale'])}"
-        cells.append([label, f"{mean:.2g}", f"{sigma:.2g}", *sides, f"{published - least:.2f}°"])
-    if not lines:
-        return ""
-    e.write("equation_6_5.csv", lines)
-    head = ["Γ / °: noise", "μ_d / °", "σ_d / °", "eq. 6.5 as printed", "Γ_min + √(μ_d·σ_d)", "table 6.8"]
-    return markdown_table([*head, "√(μ_d·σ_d) it needs"], cells)
-
-
-def _pair(theirs: float | None, ours: float, digits: int) -> str:
-    """Format the published value and ours in one cell."""
-    left = "—" if theirs is None else f"{theirs:.{digits}f}"
-    return f"{left} / " + ("—" if math.isnan(ours) else f"{ours:.{digits}f}")
-
-
-def _table(
-    title: str,
-    columns: Sequence[tuple[str, str, int, str]],
-    parts: Sequence[Part],
-    found: Mapping[str, dict[str, float]],
-) -> str:
-    lines = []
-    for part in parts:
-        s, theirs = found[part.key], _published(part.values)
-        cells = [_pair(theirs.get(name), s[ours], digits) for name, ours, digits, _ in columns]
-        lines.append([_label(part.values), *cells])
-    return markdown_table([f"{title}: published / ours", *(head for *_, head in columns)], lines)
-
-
-def _matrix(e: Evaluation, found: Mapping[str, dict[str, float]], overlap: float) -> str | None:
-    """Format the mean ε_f of the method with memory in all sets, arranged as in table 6.6."""
-    means = {
-        (v["false_stars"], v["factor"]): found[part.key]["error_mean"]
-        for part in e.parts
-        if (v := part.values)["overlap"] == overlap
-        and v["memory"]
-        and v["scale"] == e.parameters["scales"][0]
-    }
-    false_stars, factors = sorted({f for f, _ in means}), sorted({m for _, m in means})
-    if len(means) != len(false_stars) * len(factors):
-        return None
-    lines = [(f"f = {f}", *(f"{means[f, m]:.3f}" for m in factors)) for f in false_stars]
-    words = f"mean ε_f / °, p = {100 * overlap:g} %, with memory (sets of table 6.6)"
-    return markdown_table((words, *(f"μ = {m}" for m in factors)), lines)
+        distances = s["mean_distance_deg"], s["sigma_distance_deg"]
+        line = {"factor": v["factor"], "scale": v["scale"]}
+        line |= dict(zip(("mu_d_deg", "sigma_d_deg"), distances, strict=True))
+        line["as_printed_deg"] = side_as_printed(*distances, settings.gamma_min_deg)
+        line["square_root_deg"] = region_side(*distances, settings)
+        lines.append(line | {"published_deg": known["side_mean"]})
+    if lines:
+        e.write("equation_6_5.csv", lines)
 
 
 def _compare(e: Evaluation, diagonal: Sequence[Part], found: Mapping[str, dict[str, float]]) -> None:

@@ -185,25 +185,6 @@ def _compare_sides(e: Evaluation, overlap: float, m: int, tau: float) -> None:
     e.compare_line("6.8", str(overlap), where, published, measured)
 
 
-def _show_sequences(e: Evaluation, overlap: float, m: int, tau: float) -> None:
-    key = f"p{100 * overlap:g}-t{tau:g}"
-    author, printed, rigid = (
-        statistics(e.results[f"m{m}-{run}"][f"{reading}-{key}"], _UNFILTERED)
-        for reading, run in (("author", "author"), ("printed", "printed"), ("rigid", "printed"))
-    )
-    e.compare(
-        f"sequence, p = {100 * overlap:g} %, μ = f = {m}: {method_of(tau)}: mean ε_f",
-        text=RECURSION[overlap, m, tau]["error_mean"],
-        unit="°",
-        author=author["error_mean"],
-        printed=printed["error_mean"],
-        remark=f"Medians {author['error_median']:.2f}° and {printed['error_median']:.2f}°, beyond 1° "
-        f"{author['gross_percent']:.0f} and {printed['gross_percent']:.0f} %, triggers "
-        f"{author['trigger_percent']:.0f} and {printed['trigger_percent']:.0f} %; rigid motion, as printed "
-        f"{rigid['error_mean']:.2f}°.",
-    )
-
-
 def evaluate(e: Evaluation) -> None:
     """All numbers of tables 6.7, 6.8, H.1 and H.2, and the sequences."""
     factors = e.parameters["factors"]
@@ -211,7 +192,6 @@ def evaluate(e: Evaluation) -> None:
         (_compare_errors, e.parameters["tables"], _TAUS),
         (_compare_updates, e.parameters["tables"], _TAUS[1:]),
         (_compare_sides, e.parameters["tables"], _TAUS[1:]),
-        (_show_sequences, e.parameters["overlaps"], _TAUS),
     ):
         for overlap, m, tau in itertools.product(overlaps, factors, taus):
             compare(e, overlap, m, tau)

@@ -10,7 +10,6 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.fsf import frames_of_seven, noise_of
 from starid.lab.experiments.lsi_trials import OFF, error_of, frames_under_test, share
 from starid.thesis.database import DatabaseParameters, build_database
@@ -150,33 +149,3 @@ def evaluate(e: Evaluation) -> None:
             lines.append(line | {"as_the_author_ran_it": precision, "as_printed": recall})
             e.compare(f"{quantity}: precision, recall", printed=f"{precision:.2f}, {recall:.2f} %")
     e.write("sensitivity.csv", lines)
-    _draw(e)
-
-
-def _draw(e: Evaluation) -> None:
-    p = e.parameters
-    kappa = [e.results[f"kappa-{value:g}"]["errors"] for value in p["kappa"]]
-    lambdas = e.results["lambda"]["errors"]
-    words = ("as the author ran it", "as printed")
-    sides = [share(e.results[f"gamma-{value:g}"]["errors"], 0.3) for value in p["gamma"]]
-    by_kappa = [
-        Curve(p["kappa"], [share(one[j], 0.3) for one in kappa], "o-", word) for j, word in enumerate(words)
-    ]
-    by_lambda = [
-        Curve(_SHOWN_LAMBDAS, [share(one, 0.1) for one in lambdas[j]], "o-", word)
-        for j, word in enumerate(words)
-    ]
-    by_share = []
-    for epsilon in p["epsilon"]:
-        found = [e.results[f"epsilon-{epsilon:g}-share-{part:g}"]["indicators"][2] for part in p["share"]]
-        by_share.append(Curve(p["share"], 100.0 * np.array(found), "o-", f"ε = {epsilon:g}"))
-    panels = [
-        Panel("", curves, {"xlabel": x, "ylabel": y}, "best", cycle=True)
-        for x, y, curves in (
-            ("κ / mag", "share within 0.3° / %", by_kappa),
-            ("λ", "share within 0.1° / %", by_lambda),
-            ("Γ / °", "share / %", [Curve(p["gamma"], sides, "o-", "within 0.3°")]),
-            ("min_samples / n", "accuracy of the filter / %", by_share),
-        )
-    ]
-    e.draw("sensitivity.png", panels, columns=2, width=9.0, height=7.0)

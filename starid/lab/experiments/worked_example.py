@@ -14,12 +14,11 @@ from starid.lab.experiments.experiment import (
     author_database,
     star_catalog,
 )
+from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.lsi_trials import HALF_FRAME_DEG
-from starid.plots import figure, save
 from starid.thesis.metrics import boresight_error
 
 _CORNER: Final = (95.0, -85.0)
-_NAMES: Final = ("n", "A", "r", "σ_A", "σ_r")
 _COLUMNS: Final = ("n", "A", "r", "sigma_A", "sigma_r")
 _NEAREST: Final = 735
 _CELLS: Final = (509, 510, 511, 734, 735, 736, 959, 960, 961)
@@ -184,25 +183,22 @@ def evaluate(e: Evaluation) -> None:
         table |= {name: result[name] for name in (f"author_omega_{kind}", f"omega_{kind}")}
         table[f"published_omega_{kind}"] = e.published(f"ω ({word}) of the nine cells")
     e.write("dictionary.csv", table)
-    e.files.append(_draw(e.context, result))
+    _draw(e, result)
 
 
-def _draw(context: Context, result: Results) -> str:
-    """Draw the dictionary as in figure 5.1: corners, features and weights of the nine cells."""
-    fig, axis = figure(width=7.5, height=5.4)
+def _draw(e: Evaluation, result: Results) -> None:
+    """Draw figure 5.1: corners of the nine cells with their weights, of the observation and of the estimate."""
     corners = result["centres"] - HALF_FRAME_DEG
     weights = result["author_omega_mse"]
-    axis.scatter(corners[:, 0], corners[:, 1], s=20 + 900 * np.abs(weights), alpha=0.5)
-    axis.plot(*_CORNER, "r+", ms=12, mew=2, label="observation")
-    axis.plot(*(result["author_boresight_mse"] - HALF_FRAME_DEG), "kx", ms=9, mew=2, label="estimate (MSE)")
-    for cell, corner, vector, weight in zip(
-        result["cells"], corners, result["author_dictionary"], weights, strict=True
-    ):
-        values = ", ".join(f"{n} {v:.4g}" for n, v in zip(_NAMES, vector, strict=True))
-        words = f"{cell + 1}\n" + values.replace(", σ_A", "\nσ_A") + f"\nω {weight:.2f}"
-        place = {"xytext": (0, 14), "textcoords": "offset points", "ha": "center"}
-        axis.annotate(words, corner, fontsize=6.5, **place)
-    axis.margins(0.25)
-    axis.set(xlabel="α of the lower-left corner / °", ylabel="δ of the lower-left corner / °")
-    axis.legend(loc="lower left")
-    return save(fig, context.folder / "figure_5_1.png")
+    cells = (
+        Curve([x], [y], "o", f"{cell + 1}: ω = {weight:.2f}", {"ms": 4.0 + 20.0 * abs(weight)})
+        for (x, y), cell, weight in zip(corners, result["cells"], weights, strict=True)
+    )
+    estimate = result["author_boresight_mse"] - HALF_FRAME_DEG
+    points = (("r+", "observation", _CORNER), ("kx", "estimate (MSE)", estimate))
+    marks = (
+        Curve([x], [y], "", label, {"marker": style[1], "color": style[0], "ms": 12})
+        for style, label, (x, y) in points
+    )
+    settings = {"xlabel": "α of the lower-left corner / °", "ylabel": "δ of the lower-left corner / °"}
+    e.draw("figure_5_1.png", [Panel("", [*cells, *marks], settings, "best")], width=7.5, height=5.4)

@@ -19,8 +19,8 @@ WITHIN_S = 20.0
 class Page:
     """A page of a console."""
 
-    def __init__(self, emulation, head=None):
-        self.address = emulation.ready_fields["view"] + (f"&head={head}" if head is not None else "")
+    def __init__(self, emulation, head=None, field="view"):
+        self.address = emulation.ready_fields[field] + (f"&head={head}" if head is not None else "")
         self.messages = []
         self.frames = []
         self.history = None

@@ -30,7 +30,12 @@ def emulator():
     settings = [f"parameters.update_rate={UPDATE_RATE_HZ}"]
     with private_can_bus() as bus:
         command = emulator_command(
-            profile="ideal", serial="off", can=bus, seed=1, settings=settings, extra=["--view", "auto"]
+            profile="ideal",
+            serial="off",
+            can=bus,
+            seed=1,
+            settings=settings,
+            extra=["--view", "auto", "--view-token", "look"],
         )
         with EmulatorProcess(command) as process:
             yield process
@@ -153,6 +158,30 @@ def test_a_wrong_parameter_shows_the_refusal(page):
     ]
 
 
+def test_the_present_value_of_a_parameter_is_shown_with_its_unit_and_follows_the_telecommand(page):
+    send(page, "set_parameter", parameter=1, value=200)
+    note = "#telecommand-form [data-note=value]"
+    wait_for_text(page, note, "ms  1 … 5000  now 200")
+    send(page, "set_parameter", parameter=1, value=100)
+    wait_for_text(page, note, "ms  1 … 5000  now 100")
+    page.select_option("#telecommand-form [name=parameter]", "13")
+    page.wait_for_function(
+        "selector => document.querySelector(selector).textContent.startsWith('px ')", arg=note
+    )
+
+
+def test_a_page_for_viewing_only_has_no_control_that_commands(browser, emulator):
+    opened = browser.new_page(viewport={"width": 1280, "height": 720})
+    opened.set_default_timeout(WITHIN_MS)
+    opened.goto(emulator.ready["view_only"])
+    wait_for_text(opened, "#link", "view only")
+    for tab in ("telemetry", "telecommands", "faults", "truth"):
+        opened.click(f"[data-tab={tab}]")
+        for button in opened.locator(f"#{tab} button:visible").all():
+            assert button.text_content() == "save as session", tab
+    opened.close()
+
+
 def test_what_was_sent_is_saved_and_run_as_a_session(page, emulator, tmp_path):
     page.click("[data-tab=telecommands]")
     page.click("#clear-session")
@@ -207,7 +236,7 @@ def test_the_page_paints_at_once_and_every_tab_opens_in_both_themes(page):
 
 def test_content_fits_the_window_at_any_size(page):
     track(page)
-    for width, height in ((1280, 800), (1920, 1080), (3840, 2160)):
+    for width, height in ((1280, 720), (1280, 800), (1600, 1000), (1920, 1080), (3840, 2160)):
         page.set_viewport_size({"width": width, "height": height})
         boxes = page.evaluate(
             """() => ["top", "sky", "map", "charts", "side", "help", "theme"].map((id) => {
@@ -298,6 +327,10 @@ def test_a_page_whose_emulator_ended_is_grey_and_asks_for_the_address_of_the_nex
         assert page.evaluate("scrollY") == 0
         assert page.locator("#telecommand-form button").count() == 0
         assert page.locator("#past").is_hidden()
+        page.wait_for_function("() => starhil.charts.plots.every((plot) => plot.scale > 0)")
+        assert (
+            min(page.evaluate("starhil.charts.plots.map((plot) => plot.scale)")) >= 0.01
+        )  # nothing is plotted yet
     page.wait_for_selector("body.past #past:not([hidden])")
     assert "No connection to the emulator for " in page.locator("#past").text_content()
     with EmulatorProcess(command):

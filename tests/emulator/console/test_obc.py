@@ -7,10 +7,12 @@ from types import SimpleNamespace
 import pytest
 
 from starhil.emulator.console.obc import ConsoleObc, Exchange, toml
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.hil_tests.script import load_script
 from starhil.protocol.icd import load_unit
 from tests.candump import parse_candump
-from tests.emulator.console.pages import OPTIONS, Page
+from tests.emulator.console.pages import OPTIONS, WITHIN_S, Page
 
 LINKS_OFF = {"serial": {"port": "off"}, "can": {"channel": "off"}}
 
@@ -54,6 +56,62 @@ def test_only_the_rows_that_a_page_shows_are_read(run):
                 "device_status",
                 "quaternion",
             }
+
+    run(scenario, options=OPTIONS)
+
+
+async def as_obc(emulation, icd, bus):
+    """Request telemetry twice as an OBC on a link."""
+    if bus == "serial":
+        link = SerialHostLink(icd, emulation.ready_fields["serial"], dialect=emulation.serial_dialect())
+    else:
+        link = CanHostLink(
+            emulation.ready_fields["can"], device_address=emulation.device.parameters["can_address"]
+        )
+    client = AsyncObcClient(link, icd)
+    await client.start()
+    row = next(row for row in icd.telemetry.values() if row.answers == ("reply",))
+    for _ in range(2):
+        await client.transact(icd.request(row, b""), row.name, row.size)
+    await client.close()
+
+
+@pytest.mark.parametrize(
+    ("unit", "bus", "links"),
+    [
+        ("cubestar", "can", {"can": {"channel": "virtual:console-heard"}}),
+        ("cubestar", "serial", {"serial": {"port": "auto"}}),
+        ("sagitta", "serial", {"serial": {"port": "auto"}}),
+    ],
+)
+def test_the_requests_of_the_obc_are_counted_and_those_of_the_console_are_not(run, unit, bus, links):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        name = {"can": "CAN", "serial": "serial"}[bus]
+        async with Page(emulation) as page:
+            row = page.messages[0]["telemetry"][0]["name"]
+            await page.ask(do="subscribe", rows=[row])
+            await page.message("telemetry", lambda item: item["outcome"] == "ok")
+            assert (await page.ask(do="read", row=row))["outcome"] == "ok"
+            status = await page.message("status")
+            assert status["heard"] == [{"link": name, "requests": 0, "age_s": None}]
+            assert emulation.device.counters.telemetry == 0
+            await as_obc(emulation, emulation.icd, bus)
+            status = await page.message("status", lambda item: item["heard"][0]["requests"] == 2)
+            assert 0.0 <= status["heard"][0]["age_s"] < WITHIN_S
+            assert emulation.device.counters.telemetry == 2
+
+    run(scenario, options=OPTIONS, unit=unit, links={**LINKS_OFF, **links})
+
+
+def test_a_page_shows_the_present_values_of_parameters(run):
+    async def scenario(emulation, _line):
+        async with Page(emulation) as page:
+            known = {item["name"]: item for item in page.messages[0]["parameters"]}
+            emulation.device.parameters.set({"exposure": 250})
+            values = (await page.ask(do="parameters"))["values"]
+            assert (values["exposure"], known["exposure"]["unit"]) == (250, "ms")
+            assert known.keys() <= values.keys()
 
     run(scenario, options=OPTIONS)
 

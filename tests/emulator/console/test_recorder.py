@@ -1,6 +1,5 @@
 """The recording: read back with mcap's own reader."""
 
-import asyncio
 import base64
 import json
 
@@ -15,10 +14,9 @@ from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.protocol.icd import load_unit
 from tests.emulator.conftest import ORION, PREVIEW
-from tests.emulator.runs import Control, command
+from tests.emulator.runs import Control, command, every_row_read
 
 ICD = load_unit()
-WITHIN_S = 20.0
 JSON_TYPES = {"object": dict, "string": str, "number": (int, float), "integer": int, "boolean": bool}
 
 
@@ -45,10 +43,7 @@ async def record(emulation):
     await emulation.stepper.step(1.0)
     command(emulation, "set_mode", mode="lost_in_space")
     await emulation.stepper.step(2.0)
-    counters = emulation.device.counters
-    async with asyncio.timeout(WITHIN_S):
-        while counters.telemetry < len(emulation.device.icd.telemetry):
-            await asyncio.sleep(0.01)
+    await every_row_read(emulation)
 
 
 def test_images_truth_measurements_telemetry_and_events_are_read_back(run, tmp_path):

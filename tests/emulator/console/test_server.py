@@ -55,6 +55,32 @@ def test_reports_of_runs_need_the_token_and_the_files_of_the_page_do_not(run):
     run(scenario, options=OPTIONS)
 
 
+def test_a_page_with_the_view_token_sees_everything_and_commands_nothing(run):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(1.0)
+        async with Page(emulation, field="view_only") as page:
+            assert page.messages[0]["view_only"] is True
+            await page.ask(do="subscribe", frames=True, wire=True, rows=["device_status"])
+            await page.message("telemetry", lambda item: item["outcome"] == "ok")
+            assert (await page.ask(do="encode", row="set_mode", values={"mode": "standby"}))["ok"]
+            for request in (
+                {"do": "send", "row": "set_mode", "values": {"mode": "lost_in_space"}},
+                {"do": "read", "row": "device_status"},
+                {"do": "control", "request": {"do": "fault", "device": {"stuck": True}}},
+                {"do": "point", "kind": "fixed", "to": {}},
+                {"do": "clock", "speed": 1},
+                {"do": "clear_session"},
+            ):
+                assert "view only" in (await page.ask(**request))["error"]
+            assert emulation.device.modes.mode == "standby"
+            async with page.session.post(page.url("/runs"), json={"run": "1", "event": "end"}) as response:
+                assert response.status == 403
+        async with Page(emulation) as page:
+            assert page.messages[0]["view_only"] is False
+
+    run(scenario, options=replace(OPTIONS, view_token="for the wall & <screen>"))
+
+
 @pytest.mark.parametrize(
     ("headers", "status"),
     [({"Origin": "http://["}, 403), ({"Content-Type": "application/json; charset=foo"}, 400)],

@@ -11,8 +11,10 @@ from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
+from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import MemoryStorage, StorageError
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_stack import build_serial_stack
 from tests.emulator.wire import Wire
@@ -132,3 +134,85 @@ def test_a_stored_node_id_that_cannot_be_deleted_is_a_fault_of_the_store(node_be
         assert "lss: read-only" in caplog.text
 
     canopen_link(node_bench, test, Kept())
+
+
+def test_a_rate_that_is_set_back_before_the_acknowledge_is_sent_is_no_change(bench):
+    async def scenario():
+        uart = Wire()
+        link = SerialLink(bench.requests, uart)
+        await link.start()
+        before = bench.device.parameters["serial_baud"]
+        for baud in (57600, before):
+            bench.device.parameters.set({"serial_baud": baud})
+        await asyncio.sleep(0)
+        assert uart.take() == []
+        bench.device.parameters.set({"serial_baud": 57600})
+        await asyncio.sleep(0)
+        assert uart.take() == [57600]
+        await link.close()
+
+    asyncio.run(scenario())
+
+
+def test_after_a_gap_without_frames_the_next_one_is_sent_at_once(bench):
+    async def scenario():
+        bus = Wire()
+        link = CanLink(bench.requests, bus, frame_gap_s=0.001)
+        await link.start()
+        for _ in range(2):
+            bus.arrive(CanFrame(4 << 24 | 128 << 16 | 1 << 8 | 4))
+            assert len(bus.take()) == 1
+            await asyncio.sleep(0.02)
+        await link.close()
+
+    asyncio.run(scenario())
+
+
+def test_stored_parameters_that_cannot_be_read_are_a_fault_of_the_store(make_bench, caplog):
+    class Unreadable(MemoryStorage):
+        def load(self, group):
+            raise StorageError(f"{group}: damaged")
+
+    bench = make_bench().start()
+    canopen_link(bench, lambda _bus: None, Unreadable())
+    assert "damaged" in caplog.text
+
+
+def test_an_object_that_cannot_be_read_aborts_and_is_logged(node_bench, caplog):
+    def fail():
+        raise ProtocolError("no such value")
+
+    async def scenario():
+        bus = Wire()
+        link = CanopenLink(node_bench.requests, bus)
+        await link.start()
+        link.slave.dictionary.find(0x6001, 1).reader = fail
+        bus.take()
+        bus.arrive(CanFrame(0x600 + NODE, bytes.fromhex("4001600100000000"), extended=False))
+        assert [frame.data.hex() for frame in bus.take()] == ["8001600100000008"]
+        await link.close()
+
+    asyncio.run(scenario())
+    assert "SDO 6001h:01h: no such value" in caplog.text
+
+
+def test_an_image_that_the_pipeline_does_not_have_is_a_hardware_error(node_bench, monkeypatch):
+    imager = node_bench.device.images._imager
+    submit = imager.submit
+
+    def without_image(request, done):
+        if isinstance(request, ImageRequest):
+            done(ImageResult(0, 0, -1, b""))
+        else:
+            submit(request, done)
+
+    monkeypatch.setattr(imager, "submit", without_image)
+
+    def test(bus):
+        bus.take()
+        bus.arrive(CanFrame(0x600 + NODE, bytes.fromhex("2f40600501000000"), extended=False))
+        node_bench.step(5.0)
+        answers = [frame.data.hex() for frame in bus.take() if frame.id == 0x580 + NODE]
+        assert answers == ["8040600500000606"]
+
+    canopen_link(node_bench, test)

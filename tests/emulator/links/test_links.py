@@ -255,10 +255,10 @@ def test_ten_thousand_random_strings_do_no_harm(bench):
         counted = 0
         handle = bench.requests.handle
 
-        def watched(request):
+        def watched(request, **options):
             nonlocal counted
             counted += 1
-            replies = handle(request)
+            replies = handle(request, **options)
             row = bench.icd.row_by_id(request.id)
             if row is None:
                 assert replies[0].code is ErrorCode.INVALID_ID
@@ -292,10 +292,10 @@ def test_ten_thousand_random_frames_do_no_harm(bench):
         requests = 0
         handle = bench.requests.handle
 
-        def watched(request):
+        def watched(request, **options):
             nonlocal requests
             requests += 1
-            return handle(request)
+            return handle(request, **options)
 
         bench.requests.handle = watched
         for _ in range(JUNK):

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from starhil.emulator.pipeline.preview import compress, make_preview
+from starhil.emulator.pipeline.preview import compress, make_preview, unused_stars
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame, ObjectTruth, StarTruth
 from starhil.emulator.sky.objects import SkyObjects
@@ -57,6 +57,14 @@ def test_catalogue_stars_are_those_in_the_image_that_a_viewer_may_miss():
     found = overlay(magnitudes=(2.0, 7.0, 3.0), xy=((50.0, 40.0), (60.0, 20.0), (-5.0, 20.0)))
     assert found["catalogue"] == [[1, 50.0, 40.0, 2.0]]
     assert found["false_stars"] == [[3.0, 4.0]]
+
+
+def test_a_star_that_is_detected_but_not_in_the_solution_is_not_missing():
+    places = np.array([[50.0, 40.0], [60.0, 20.0], [150.0, 20.0], [151.0, 20.0]])
+    hip = np.array([1, 2, 3, 4])
+    detections = np.array([[50.1, 40.0], [59.0, 21.0], [150.9, 20.0], [10.0, 90.0]])
+    assert unused_stars(detections, [1, 0, 0, 0], hip, places) == [0, 2, 3, 0]
+    assert unused_stars(np.zeros((0, 2)), [], hip, places) == []
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.source import SlewSegment, SlewTruth
+from starhil.emulator.truth.standard_frames import euler_turn, unix_ns
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 from starid.earth import unix_time
@@ -318,6 +319,34 @@ def test_the_truth_has_the_dates_of_the_file(tmp_path: Path) -> None:
 # --- conventions ---
 
 
+@pytest.mark.parametrize(
+    ("date", "scale", "unix_s"),
+    [
+        ("2026-079T12:00:00.25Z", "UTC", START_UNIX_S),
+        ("2026-03-20T12:00:37.250", "TAI", START_UNIX_S),
+        ("2016-12-31T23:59:60.5", "UTC", 1_483_228_800.5),
+        ("1 jan 2017 0:00:00.125", "UTC", 1_483_228_800.125),
+    ],
+)
+def test_dates_have_their_nanoseconds(date: str, scale: str, unix_s: float) -> None:
+    assert unix_ns("", date, scale) == round(unix_s * 8) * 125_000_000
+
+
+@pytest.mark.parametrize("sequence", ["321", "XYZ", "313", "zyx"])
+def test_euler_angles_are_turns_about_the_turned_axes(sequence: str) -> None:
+    angles = [10.0, -20.0, 30.0]
+    matrix = np.eye(3)
+    for axis, angle in zip(
+        sequence.translate(str.maketrans("xyzXYZ", "123123")), np.radians(angles), strict=True
+    ):
+        one, two = [(1, 2), (2, 0), (0, 1)][int(axis) - 1]
+        turn = np.eye(3)
+        turn[one, one] = turn[two, two] = math.cos(angle)
+        turn[one, two], turn[two, one] = math.sin(angle), -math.sin(angle)
+        matrix = turn @ matrix
+    assert euler_turn("", sequence, np.array(angles)).matrix == pytest.approx(matrix, abs=1e-15)
+
+
 def test_frames_may_be_exchanged_and_rates_in_either(tmp_path: Path) -> None:
     """The transformation from the body to ICRF, with the rate of ICRF relative to the body in both frames."""
     for frame in ("INSTRUMENT_A", "ICRF"):
@@ -364,8 +393,8 @@ STK_HEAD = "stk.v.12.0\nBEGIN Attitude\n"
         (aem(REF_FRAME_A="TOD"), "frame 'TOD' is not known; known: ICRF"),
         (aem(REF_FRAME_A="ICRF", REF_FRAME_B="EME2000"), "both frames are inertial"),
         (aem(TIME_SYSTEM="MET"), "time system 'MET' is not known; known: UTC, TAI"),
-        (aem(ATTITUDE_TYPE="SPIN"), "ATTITUDE_TYPE 'SPIN' of version 2 is not read"),
-        (aem().replace("VERS = 2.0", "VERS = 1.0"), "'QUATERNION/ANGVEL' of version 1 is not read"),
+        (aem(ATTITUDE_TYPE="SPIN"), "ATTITUDE_TYPE 'SPIN' is not read; known: QUATERNION"),
+        (aem().replace("VERS = 2.0", "VERS = 1.0"), "of version 1, only ATTITUDE_TYPE QUATERNION is read"),
         (aem(ANGVEL_FRAME="RTN"), "ANGVEL_FRAME 'RTN' is neither"),
         (aem(ANGVEL_FRAME=""), "ANGVEL_FRAME is missing"),
         (aem("QUATERNION"), "7 numbers in a row of QUATERNION, which has 4"),
@@ -380,8 +409,10 @@ STK_HEAD = "stk.v.12.0\nBEGIN Attitude\n"
         (STK_HEAD + "CoordinateAxes Fixed\nScenarioEpoch 1 Jan 2026 0:00:00\nAttitudeTimeQuaternions\n0 0 0 0 1\n", "frame 'Fixed'"),
         (STK_HEAD + "ScenarioEpoch 1 Jan 2026 0:00:00\nAttitudeTimeYPRAngles\n", "format 'AttitudeTimeYPRAngles' is not read"),
         (STK_HEAD + "TimeFormat UTCG\nAttitudeTimeQuaternions\n", "needs a ScenarioEpoch and times in seconds"),
-        (STK_HEAD + "ScenarioEpoch 1 Jan 2026 0:00:00\nAttitudeTimeQuaternions\n0 0 0 1\n", "line 5: 3 numbers after the time, not 4"),
+        (STK_HEAD + "CoordinateAxes ICRF\nScenarioEpoch 1 Jan 2026 0:00:00\nAttitudeTimeQuaternions\n0 0 0 1\n", "3 numbers in a row of QUATERNION, which has 4"),
         (STK_HEAD, "no data of STK's kind 'Attitude'"),
+        (aem("QUATERNION", ["2026-03-20T12:00:00.x 0 0 0 1"]), "not a date"),
+        (aem("EULER_ANGLE", [f"{START} 0 0 0"], EULER_ROT_SEQ="ZQX"), "'ZQX' is not a sequence of three axes"),
     ],
 )  # fmt: skip
 def test_a_file_that_cannot_be_obeyed_is_an_error_that_says_why(tmp_path: Path, text: str, said: str) -> None:

@@ -22,7 +22,7 @@ const PLOTS = [
     series: [{ name: "roll", column: "error_roll", ink: "a" }, { name: "3σ", column: "sigma_roll", times: 3, hidden: true }],
   },
   {
-    title: "rate, °/s (true dashed)", symmetric: true, digits: 4, least: 0.01,
+    title: "rate, °/s, measured; true dashed", symmetric: true, digits: 4, least: 0.01,
     series: [
       { name: "x", column: "rate_x", ink: "a" }, { name: "y", column: "rate_y", ink: "b" }, { name: "z", column: "rate_z", ink: "c" },
       { name: "", column: "true_rate_x", ink: "a", dash: true }, { name: "", column: "true_rate_y", ink: "b", dash: true }, { name: "", column: "true_rate_z", ink: "c", dash: true },
@@ -139,7 +139,7 @@ export class Charts {
       padding: [0.5 * rem, 0.9 * rem, last ? 0 : 0.4 * rem, 0],
       scales: { x: { time: false, range: () => [this.from, this.to] }, y: { range: () => own.range } },
       axes: [
-        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - (this.window * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? ago(time - this.to) : "")) },
+        { ...axis, show: true, size: last ? 1.5 * rem : 2, splits: () => Array.from({ length: 7 }, (_, part) => this.to - (this.window * (6 - part)) / 6), values: (_, times) => times.map((time) => (last ? before(time - this.to) : "")) },
         { ...axis, size: 3.4 * rem, space: 1.6 * rem, values: (_, values) => values.map((item) => String(Number(item.toPrecision(6))).replace("-", "−")) },
       ],
       series,
@@ -197,7 +197,7 @@ export class Charts {
     const { plan, outputs } = plot;
     const x = times.map((at) => rows.at(at, "run_s"));
     const data = [x];
-    let highest = plan.least || 1e-9;
+    let highest = plan.least || 0;
     for (const series of plan.series) {
       const column = rows.column(series.column);
       const values = picked.map((group) => extreme(column, group, series.times || 1));
@@ -212,7 +212,7 @@ export class Charts {
       highest = Math.max(highest, Math.min(typical, 5 * highest));
       data.push(upper, upper.map((item) => (item === null ? null : -item)));
     }
-    this.setScale(plot, highest);
+    this.setScale(plot, highest || 1);
     plot.range = plan.symmetric ? [-plot.scale, plot.scale] : [0, plot.scale];
     plot.u.setData(data);
     plan.series.forEach((series, number) => {
@@ -296,7 +296,7 @@ function nice(value) {
   return NICE.find((step) => step * power >= value) * power;
 }
 
-function ago(seconds) {
+function before(seconds) {
   if (Math.abs(seconds) < 0.5) return "0";
   const text = seconds > -100 ? `${Math.round(-seconds)} s` : `${Math.round(-seconds / 6) / 10} min`;
   return `−${text}`;

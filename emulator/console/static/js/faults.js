@@ -17,14 +17,14 @@ export class Faults {
   build(hello) {
     this.cover = make("button", { type: "button", class: "primary large", id: "cover", title: "c", onclick: () => this.toggleCover() });
     const clear = make("button", { type: "button", class: "large", id: "clear-faults", title: "x", text: "clear all faults", onclick: () => this.clear() });
-    this.now = make("ul", { class: "chips", id: "active-faults" });
+    this.now = document.getElementById("active-faults");
     this.outcome = make("p", { class: "problem", id: "fault-outcome" });
     const scenario = make("select", { "aria-label": "scenario" }, ...hello.scenarios.map((name) => make("option", { value: name, text: name })));
-    const run = make("button", { type: "button", text: "run from now", onclick: () => this.request({ do: "scenario", name: scenario.value }) });
+    const run = make("button", { type: "button", class: "command", text: "run from now", onclick: () => this.request({ do: "scenario", name: scenario.value }) });
     const levels = hello.faults.map((level) => this.level(level));
     this.host.replaceChildren(
       make("div", { class: "bar" }, this.cover, clear),
-      make("div", { class: "bar" }, make("h2", { text: "Active now" })), this.now, this.outcome,
+      this.outcome,
       make("div", { class: "scroll" }, ...levels, make("fieldset", {}, make("legend", { text: "scenario" }), make("div", { class: "bar" }, scenario, run))),
     );
     this.update(this.active, true);
@@ -122,7 +122,7 @@ export class Faults {
       }
     }
     this.count = chips.length;
-    this.now.replaceChildren(...(chips.length ? chips : [make("li", { class: "dim none", text: "no fault" })]));
+    this.now.replaceChildren(...chips);
     this.store.emit("faults", chips.map((chip) => chip.textContent));
   }
 }

@@ -16,6 +16,12 @@ export function duration(seconds) {
   return `${part(Math.floor(whole / 3600))}:${part(Math.floor(whole / 60) % 60)}:${part(whole % 60)}.${tenth}`;
 }
 
+// The age of something, rounded.
+export function ago(seconds) {
+  if (seconds < 100) return `${Math.max(0, Math.round(seconds))} s ago`;
+  return seconds < 6000 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;
+}
+
 export function utc(seconds) {
   if (!Number.isFinite(seconds)) return "–";
   return new Date(seconds * 1000).toISOString().slice(0, 19).replace("T", " ");

@@ -2,7 +2,7 @@
 
 import { Charts } from "./charts.js";
 import { Faults } from "./faults.js";
-import { duration, fixed, make, setText, utc } from "./format.js";
+import { ago, duration, fixed, make, setText, utc } from "./format.js";
 import { Link, address } from "./link.js";
 import { SkyMap } from "./map.js";
 import { Runs } from "./runs.js";
@@ -30,7 +30,7 @@ function showLink(state) {
   if (state === "connected") lost = null;
   else if (lost === null && state === "disconnected") lost = Date.now();
   if (state === "connecting" && lost !== null) return;
-  setText($("link"), state);
+  setText($("link"), state === "connected" && store.hello && store.hello.view_only ? "view only" : state);
   $("link").dataset.state = state;
   showAge();
 }
@@ -120,6 +120,9 @@ store.on("hello", (hello) => {
   document.title = `starhil · ${hello.profile}`;
   $("head").replaceChildren(...hello.heads.map((name, number) => make("option", { value: String(number + 1), text: name, selected: number + 1 === hello.head })));
   $("head").hidden = hello.heads.length < 2;
+  document.body.classList.toggle("view-only", hello.view_only);
+  $("link").title = hello.view_only ? "the token of this page may look, but not command" : "connection to the emulator";
+  showLink("connected");
   $("unit").title = Object.entries(hello.links).map(([name, where]) => `${name} ${where}`).join("\n");
 });
 
@@ -128,6 +131,20 @@ store.on("faults", (names) => {
   setText($("active"), count ? `${count} fault${count === 1 ? "" : "s"}` : "no fault");
   $("active").title = count ? `injected: ${names.join(", ")}` : "injected faults";
   $("active").dataset.state = count ? "bad" : "idle";
+});
+
+// Which link the OBC uses, how many requests per second since the last report, and when it sent the last one.
+let asked = null;
+
+store.on("status", ({ heard, wall_s: now }) => {
+  const spoken = heard.filter((each) => each.age_s !== null).sort((a, b) => a.age_s - b.age_s);
+  const total = heard.reduce((sum, each) => sum + each.requests, 0);
+  if (asked && now - asked.now < 2) return;
+  const rate = asked && total >= asked.total ? (total - asked.total) / (now - asked.now) : 0;
+  asked = { total, now };
+  setText($("obc"), spoken.length ? `${spoken[0].link} ${fixed(rate, 1)}/s` : "silent");
+  setText($("obc-last"), spoken.length ? ago(spoken[0].age_s) : "–");
+  $("obc").parentElement.parentElement.title = heard.map((each) => `${each.link}: ${each.requests} requests${each.age_s === null ? "" : `, the last ${ago(each.age_s)}`}`).join("\n");
 });
 
 store.on("status", ({ status }) => {
@@ -146,6 +163,8 @@ store.on("status", ({ status }) => {
 function showValidity(valid, reason) {
   setText($("validity"), valid ? "valid" : reason.replaceAll("_", " "));
   $("validity").dataset.state = valid ? "good" : "bad";
+  const last = valid ? null : store.lastValid;
+  setText($("ra-label"), last === null ? "RA, measured" : `last valid ${ago((store.cursor ?? (store.status ? store.status.run_time_s : store.now)) - last)}`);
 }
 
 store.on("shown", () => {
@@ -255,4 +274,4 @@ document.addEventListener("click", (event) => {
   if (event.detail > 0 && event.target.closest("button, a")) document.activeElement.blur();
 });
 
-window.starhil = { store, sky, link };
+window.starhil = { store, sky, charts, link };

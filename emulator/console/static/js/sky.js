@@ -232,7 +232,6 @@ export class Sky {
   drawStars(context, head) {
     const names = this.store.hello.star_names;
     const size = Math.max(5, this.stage.clientWidth / 110);
-    const found = new Set(head.hips);
     context.font = this.font();
     context.lineWidth = 1.4 * pen();
     const labels = [];
@@ -240,13 +239,14 @@ export class Sky {
     const matched = colour("on-sky-identified");
     (head.detections || []).forEach(([x, y, magnitude], number) => {
       const hip = head.hips[number];
+      const name = names[hip || head.unused[number]];
       const [px, py] = this.place(x, y);
+      if (name && this.layers.identified && (magnitude < 2.6 || this.zoom > 2)) labels.push([name, px, py]);
       if (hip && this.layers.identified) {
         context.strokeStyle = matched;
         context.beginPath();
         context.arc(px, py, size, 0, 2 * Math.PI);
         context.stroke();
-        if (names[hip] && (magnitude < 2.6 || this.zoom > 2)) labels.push([names[hip], px, py]);
       } else if (this.layers.detections) {
         context.strokeStyle = unmatched;
         context.globalAlpha = hip ? 1 : 0.7;
@@ -259,7 +259,7 @@ export class Sky {
     if (!this.layers.missing || !head.catalogue) return;
     context.strokeStyle = colour("on-sky-missing");
     context.setLineDash([2, 3]);
-    for (const star of missing(head, found)) {
+    for (const star of missing(head)) {
       const [px, py] = this.place(star[1], star[2]);
       context.beginPath();
       context.arc(px, py, size * 1.15, 0, 2 * Math.PI);
@@ -345,14 +345,15 @@ export class Sky {
     };
     const magnitudes = new Map((head.catalogue || []).map((star) => [star[0], star[3]]));
     (head.detections || []).forEach(([x, y, magnitude, snr], number) => {
-      const hip = head.hips[number];
+      const hip = head.hips[number] || head.unused[number];
       near(x, y, () => {
         const measured = `measured ${fixed(magnitude, 2)} mag, SNR ${fixed(snr, 0)}\nx ${fixed(x, 2)}  y ${fixed(y, 2)}`;
         if (!hip) return `not identified\n${measured}`;
-        return `${names[hip] ? names[hip] + "  " : ""}HIP ${hip}  V ${fixed(magnitudes.get(hip), 2)}\n${measured}`;
+        const use = head.hips[number] ? "" : "detected, not used for the attitude\n";
+        return `${names[hip] ? names[hip] + "  " : ""}HIP ${hip}  V ${fixed(magnitudes.get(hip), 2)}\n${use}${measured}`;
       });
     });
-    for (const star of missing(head, new Set(head.hips))) {
+    for (const star of missing(head)) {
       near(star[1], star[2], () => `missing: ${names[star[0]] || ""} HIP ${star[0]}  V ${fixed(star[3], 2)}`);
     }
     for (const [x, y] of head.false_stars || []) near(x, y, () => "false star");
@@ -365,9 +366,10 @@ export class Sky {
   }
 }
 
-// Catalogue stars that were not identified although they are as bright as most identified ones, or V 4 if there are none.
-function missing(head, found) {
-  const matched = (head.catalogue || []).filter((star) => found.has(star[0])).map((star) => star[3]);
+// Catalogue stars that were not detected although they are as bright as most identified ones, or V 4 if there are none.
+export function missing(head) {
+  const [identified, found] = [new Set(head.hips), new Set([...head.hips, ...head.unused])];
+  const matched = (head.catalogue || []).filter((star) => identified.has(star[0])).map((star) => star[3]);
   matched.sort((a, b) => a - b);
   const limit = matched.length >= 4 ? matched[Math.floor(0.5 * matched.length)] : 4;
   return (head.catalogue || []).filter((star) => star[3] <= limit && !found.has(star[0]));

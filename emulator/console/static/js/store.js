@@ -145,6 +145,13 @@ export class Store {
     return this.cursor === null ? this.rows.end - 1 : this.rows.find(this.cursor);
   }
 
+  // Time of the last valid attitude up to the row that is shown; null if there is none.
+  get lastValid() {
+    let position = this.position;
+    while (position >= this.rows.start && this.rows.at(position, "valid") !== 1) position -= 1;
+    return position >= this.rows.start ? this.rows.at(position, "run_s") : null;
+  }
+
   // The image nearest to the shown time.
   get image() {
     const { images } = this;

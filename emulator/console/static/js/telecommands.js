@@ -1,7 +1,7 @@
 // A form for each telecommand, with a preview of its bytes, and the reply.
 
 import { address } from "./link.js";
-import { limits, make, setText, wall } from "./format.js";
+import { limits, make, setText, short, wall } from "./format.js";
 
 const KEPT_LINES = 200;
 
@@ -37,14 +37,26 @@ export class Telecommands {
     const row = this.rows.get(name);
     const fields = row.fields.map((field) => {
       const control = this.control(field);
-      return make("label", { class: "field", title: field.doc }, make("span", { text: field.name }), control, make("span", { class: "dim num", text: [field.unit, limits(field)].filter(Boolean).join("  ") }));
+      const note = make("span", { class: "dim num", "data-note": field.name, text: [field.unit, limits(field)].filter(Boolean).join("  ") });
+      return make("label", { class: "field", title: field.doc }, make("span", { text: field.name }), control, note);
     });
     this.problem = make("p", { class: "problem" });
     this.bytes = make("pre", { class: "bytes", id: "bytes" });
     const send = make("button", { type: "submit", class: "primary", id: "send", title: "Ctrl+Enter", text: `send ${name}` });
     this.form.replaceChildren(make("p", { class: "dim doc", text: row.doc }), ...fields, this.bytes, this.problem, send);
     this.form.oninput = () => this.preview();
+    this.form.onchange = () => this.showParameter();
     this.preview();
+    this.showParameter();
+  }
+
+  // Beside a value for a parameter: its unit, limits and present value.
+  async showParameter() {
+    const [select, note] = ["[data-parameters]", "[data-note=value]"].map((selector) => this.form.querySelector(selector));
+    if (!select || !note) return;
+    const { values } = await this.link.request({ do: "parameters" });
+    const { name, unit, min, max } = this.parameters.find((item) => String(item.id) === select.value);
+    setText(note, `${unit}  ${short(min)} … ${short(max)}  now ${values ? short(values[name]) : "–"}`);
   }
 
   control(field) {
@@ -52,7 +64,7 @@ export class Telecommands {
     if (field.kind === "enum") return make("select", { name }, ...field.values.map((item) => make("option", { value: item, text: item, selected: item === field.default })));
     if (field.kind === "flag") return make("select", { name }, make("option", { value: "false", text: "no" }), make("option", { value: "true", text: "yes", selected: field.default === true }));
     if (field.parameters) {
-      return make("select", { name }, ...this.parameters.map((item) => make("option", { value: String(item.id), text: `${item.id} ${item.name}  ${item.min} … ${item.max} ${item.unit}` })));
+      return make("select", { name, "data-parameters": true }, ...this.parameters.map((item) => make("option", { value: String(item.id), text: `${item.id} ${item.name}` })));
     }
     const initial = field.default ?? (field.kind === "bytes" ? "00".repeat(field.bytes) : field.kind === "text" ? "" : Math.max(0, field.min ?? 0));
     return make("input", { name, value: String(initial), autocomplete: "off", spellcheck: "false", inputmode: field.kind === "text" || field.kind === "bytes" ? "text" : "decimal" });
@@ -89,6 +101,7 @@ export class Telecommands {
     const values = this.values();
     const answer = await this.link.request({ do: "send", row, values });
     this.store.emit("sent", { row, values, kind: "command", ...answer });
+    this.showParameter();
   }
 
   submit() {

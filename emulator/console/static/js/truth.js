@@ -25,7 +25,7 @@ export class Truth {
     const json = make("textarea", { rows: "3", spellcheck: "false", "aria-label": "truth as JSON" });
     json.value = '{"kind": "live", "protocol": "udp", "port": 0}';
     const other = make("fieldset", {}, make("legend", { text: "file, feed or sequence: the keys of [truth], as JSON" }), json, make("button", {
-      type: "button", text: "use", onclick: () => {
+      type: "button", class: "command", text: "use", onclick: () => {
         try {
           this.answer(this.set(JSON.parse(json.value)));
         } catch (error) {
@@ -92,10 +92,10 @@ export class Truth {
     const feed = status.feed;
     const facts = [
       ["source", `${status.truth_kind}, ${truth.status}`],
-      ["right ascension", `${fixed(truth.ra_deg, 5, 10)}°`],
-      ["declination", `${fixed(truth.dec_deg, 5, 10)}°`],
-      ["roll", `${fixed(truth.roll_deg, 5, 10)}°`],
-      ["rate x, y, z", truth.rate_deg_s.map((item) => fixed(item, 4, 8)).join(" ") + " °/s"],
+      ["true right ascension", `${fixed(truth.ra_deg, 5, 10)}°`],
+      ["true declination", `${fixed(truth.dec_deg, 5, 10)}°`],
+      ["true roll", `${fixed(truth.roll_deg, 5, 10)}°`],
+      ["true rate x, y, z", truth.rate_deg_s.map((item) => fixed(item, 4, 8)).join(" ") + " °/s"],
       ["simulation time", duration(truth.run_time_s)],
       ["feed", feed ? `${feed.address}: ${feed.accepted} accepted, ${feed.refused} refused ${feed.last_fault || ""}` : "none"],
     ];

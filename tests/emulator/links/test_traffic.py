@@ -1,0 +1,81 @@
+"""The traffic on the links as a trace shows it, for units with and without each kind of link."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem
+from starhil.protocol.can_framing import CanFrame, encode_reply_frames
+from starhil.protocol.icd import load_unit
+from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.serial_interface import Dialect
+from tests.protocol.composed_links import CUBESPACE
+
+ICD = load_unit()
+MODE = ICD.telecommands["set_mode"]
+STATUS = ICD.telemetry["device_status"]
+ACK = CUBESPACE.encode_reply(Reply(ReplyKind.ACK, MODE.id), Dialect.A)
+
+
+def sent(item):
+    """Return an item that the device sends."""
+    return WireItem(0.0, "can", outgoing=True, item=item)
+
+
+LINES = {
+    "an 11-bit frame": ("cubestar", CanFrame(0x62C, b"\x40\x18\x10", extended=False), ("canopen", "node 44 SDO request", "62C#401810")),
+    "a remote frame": ("cubestar", CanFrame(0x72C, extended=False, remote=True), ("canopen", "node 44 heartbeat", "72C#R")),
+    "an acknowledge": ("cubestar", ACK, ("ack", "set_mode accepted", ACK.hex(" ").upper())),
+    "a 29-bit frame without CAN": ("nos3", CanFrame(0x08AA0401, b"\1"), ("part", "29-bit frame", "08AA0401#01")),
+    "bytes without a serial line": ("oresat", b"\x1f\x7f", ("part", "bytes", "1F 7F")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_what_passes_is_named_as_far_as_the_unit_has_such_a_link(name):
+    unit, item, expected = LINES[name]
+    line = Decoder(load_unit(unit), lambda: Dialect.A).line(sent(item))
+    assert (line["kind"], line["text"], line["raw"]) == expected
+    assert not line["own"]
+
+
+def test_frames_between_the_console_and_the_unit_are_its_own():
+    (frame,) = encode_reply_frames(Reply(ReplyKind.ACK, MODE.id, destination=CONSOLE_ADDRESS), 4)
+    assert Decoder(ICD, lambda: None).line(sent(frame))["own"]
+
+
+def test_segments_for_more_addresses_than_are_joined_are_forgotten():
+    decoder = Decoder(ICD, lambda: None)
+    data = STATUS.encode(STATUS.example(), saturate=True)
+
+    def frames(destination):
+        return encode_reply_frames(Reply(ReplyKind.TELEMETRY, STATUS.id, data, destination=destination), 4)
+
+    first, *others = frames(1)
+    decoder.events(sent(first))
+    for destination in range(2, MAX_ADDRESSES + 2):
+        (whole,) = [event for frame in frames(destination) for event in decoder.events(sent(frame))]
+        assert whole.data == data
+    found = [event for frame in others for event in decoder.events(sent(frame))]
+    assert data not in [getattr(event, "data", b"") for event in found]
+
+
+def test_a_bus_with_two_links_reports_what_arrives_once_and_nothing_without_an_observer():
+    links = [
+        SimpleNamespace(bus="can", wire=SimpleNamespace(), transport=SimpleNamespace(listener=None))
+        for _ in range(2)
+    ]
+    traffic, passed = Traffic(), []
+    for link in links:
+        traffic.add(link)
+    links[0].transport.listener("lost")
+    traffic.passed.connect(passed.append)
+    assert links[1].transport.listener is None
+    links[0].transport.listener("in")
+    for link in links:
+        link.wire.listener("out")
+    assert [(entry.bus, entry.outgoing, entry.item) for entry in passed] == [
+        ("can", False, "in"),
+        ("can", True, "out"),
+        ("can", True, "out"),
+    ]
