@@ -359,6 +359,8 @@ class Row(RowKeys):
     """Answers in order: `echo`, `reply`, `row:NAME`."""
     zeros: bool = False
     """Whether fields without a binding are sent as zeros."""
+    request: str = ""
+    """Text that requests the row on the serial line; empty: its header does."""
 
     def __repr__(self) -> str:
         """Return kind, ID and name."""

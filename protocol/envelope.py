@@ -191,13 +191,12 @@ class Header:
                 raise ProtocolError(text) from None
         return packed
 
-    def unpack(self, body: bytes) -> Envelope | None:
-        """Decode the header of a body; return None if the body is too short.
+    def unpack(self, body: bytes, klass: str = "") -> Envelope | None:
+        """Decode the header of a body of a class, if that is known; return None if the body is too short.
 
         Raises HeaderError for a wrong constant or an unknown class.
         """
         values: dict[str, int] = {}
-        klass = ""
         position = 0
         for role, size, order, signed, const, _, classes, bits in self._steps:
             if classes is not None and klass not in classes:

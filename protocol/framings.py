@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import binascii
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar, assert_never
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import (
+    ByteStuffing,
     CubeSpaceFraming,
     CustomFraming,
     DelimitedFraming,
@@ -369,6 +370,51 @@ class EscapedDeframer(_Collector[_Message]):
         self._in_junk = True
 
 
+class Stuffing:
+    """The bytes of a range as two: the first of the range, and the bits in which they differ.
+
+    ::
+
+    41 F0 7F F3   ->   41 F0 00 7F F0 03   (escape F0, mask 0F)
+    """
+
+    def __init__(self, model: ByteStuffing | None) -> None:
+        if model is not None and (not model.mask or model.escape & model.mask):
+            raise IcdError(
+                f"link.serial.framing.stuffing: mask {model.mask:#04x} must have bits, and only bits that escape "
+                f"{model.escape:#04x} does not have"
+            )
+        self._escape = None if model is None else model.escape
+        self._mask = 0 if model is None else model.mask
+
+    def encode(self, body: bytes) -> bytes:
+        """Return a body with the bytes of the range stuffed."""
+        if self._escape is None:
+            return body
+        stuffed = bytearray()
+        for byte in body:
+            in_range = byte & ~self._mask == self._escape
+            stuffed += bytes((self._escape, byte & self._mask)) if in_range else bytes((byte,))
+        return bytes(stuffed)
+
+    def decode(self, line: bytes) -> tuple[bytes, Sequence[int]]:
+        """Return the body in stuffed bytes, and where each of its bytes ends on the line.
+
+        An escape byte at the end is left out, because its second byte is missing.
+        """
+        if self._escape is None:
+            return line, range(1, len(line) + 1)
+        body, ends, position = bytearray(), [], 0
+        while position < len(line):
+            escaped = line[position] == self._escape
+            position += 1 + escaped
+            if position > len(line):
+                break
+            body.append(line[position - 1] | (self._escape if escaped else 0))
+            ends.append(position)
+        return bytes(body), ends
+
+
 class Counted(Framing):
     """`start`, a body whose size is given by its header or its row, `end`.
 
@@ -378,13 +424,14 @@ class Counted(Framing):
     DE AD   00 00 00 02                                   BE EF
     """
 
-    def __init__(self, start: list[int], end: list[int]) -> None:
+    def __init__(self, start: list[int], end: list[int], stuffing: ByteStuffing | None = None) -> None:
         self.start = bytes(start)
         self.end = bytes(end)
+        self.stuffing = Stuffing(stuffing)
 
     def encode(self, body: bytes) -> bytes:
         """Return start, body and end."""
-        return self.start + body + self.end
+        return self.start + self.stuffing.encode(body) + self.end
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer that after a bad message continues at the byte after its start."""
@@ -394,7 +441,7 @@ class Counted(Framing):
 class _CountedDeframer(_Collector[_Message]):
     def __init__(self, receiving: Receiving[_Message], framing: Counted) -> None:
         super().__init__(receiving)
-        self._start, self._end = framing.start, framing.end
+        self._start, self._end, self._stuffing = framing.start, framing.end, framing.stuffing
         self._buffer = bytearray()
         self._reported = 0
         """Number of bytes at the beginning of the buffer that a fault has already reported."""
@@ -430,22 +477,26 @@ class _CountedDeframer(_Collector[_Message]):
     def _read_message(self) -> bool:
         """Take the message at the start of the buffer; return whether to continue."""
         head = len(self._start)
+        body, ends = self._stuffing.decode(bytes(self._buffer[head:]))
         try:
-            size = self._measure(bytes(self._buffer[head:]))
+            size = self._measure(body)
         except BodySizeError as error:
             return self._reject(LinkFault(FaultKind.UART_PROTOCOL, str(error)), head)
         if size is None:
-            return len(self._buffer) - head > self._max_size and self._reject(self._overlong(), head)
+            return len(body) > self._max_size and self._reject(self._overlong(), head)
         if size > self._max_size:
             return self._reject(self._overlong(), head)
-        whole = head + size + len(self._end)
+        if len(body) < size:
+            return False
+        end = head + (ends[size - 1] if size else 0)
+        whole = end + len(self._end)
         if len(self._buffer) < whole:
             return False
-        if self._buffer[head + size : whole] != self._end:
-            found = bytes(self._buffer[head + size : whole]).hex(" ").upper()
+        if self._buffer[end:whole] != self._end:
+            found = bytes(self._buffer[end:whole]).hex(" ").upper()
             text = f"{found} instead of the end of a message"
             return self._reject(LinkFault(FaultKind.UART_PROTOCOL, text), whole)
-        result = self._interpret(bytes(self._buffer[head : head + size]))
+        result = self._interpret(body[:size])
         if isinstance(result, LinkFault):
             return self._reject(result, whole)
         self._drop(whole)
@@ -569,6 +620,33 @@ class _DelimitedDeframer(_Collector[_Message]):
         return self._incomplete(size) if size else None
 
 
+class FirstByteDeframer(Deframer[_Message]):
+    """Gives each message to the deframer of the start byte with which it begins; None: of all other bytes."""
+
+    def __init__(self, deframers: Mapping[int | None, Deframer[_Message]]) -> None:
+        self._deframers = deframers
+        self._other = deframers.get(None) or next(iter(deframers.values()))
+        self._current = self._other
+
+    @property
+    def busy(self) -> bool:
+        """Whether a message is incomplete."""
+        return self._current.busy
+
+    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
+        """Return the messages and faults that these bytes complete."""
+        events: list[_Message | LinkFault] = list(self.flush(now))
+        for byte in data:
+            if not self._current.busy:
+                self._current = self._deframers.get(byte, self._other)
+            events += self._current.feed(bytes((byte,)), now)
+        return events
+
+    def flush(self, now: float) -> list[LinkFault]:
+        """Abandon an incomplete message after a silence of the timeout."""
+        return self._current.flush(now)
+
+
 class _PluginFraming(Framing):
     """A framing of a plugin, whose failures are raised as an IcdError of one line."""
 
@@ -603,7 +681,7 @@ def build_framing(model: FramingModel, custom: Mapping[str, Callable[[], object]
         case SlipFraming():
             return Slip(model)
         case LengthFraming() | FixedFraming():
-            return Counted(model.start, model.end)
+            return Counted(model.start, model.end, model.stuffing)
         case DelimitedFraming():
             return Delimited(model)
         case CustomFraming():

@@ -35,6 +35,7 @@ from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import did_you_mean
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.text_messages import words
 from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import (
@@ -381,6 +382,14 @@ class _Reader:
                     raise IcdError(f"{where}: link.serial with framing cubespace has no echoes")
                 if can is not None:
                     raise IcdError(f"{where}: link.can has no echoes")
+                if serial is not None and (serial.format or serial.acknowledge or serial.refusal):
+                    raise IcdError(
+                        f"{where}: link.serial with `format`, `acknowledge` or `refusal` has no echoes"
+                    )
+            if row.request and serial is None:
+                raise IcdError(
+                    f"{self._path}: {row.kind} {row.name}: `request` is a text on link.serial, which the unit does not have"
+                )
         if serial is None or definition.link_is_unknown:
             return
         if isinstance(serial.framing, CubeSpaceFraming):
@@ -392,9 +401,12 @@ class _Reader:
                         name,
                     )
         try:
-            build_serial_stack(definition)
+            stack = build_serial_stack(definition)
         except IcdError as error:
             raise IcdError(f"{file}: {error}") from None
+        for row in definition.rows:
+            text_form = stack.request_formats.of(row.klass) in stack.text_formats
+            check_text_requests(row, definition, f"{file}: {row.kind} {row.name}", needed=text_form)
 
     def enum_of(self, name: str | None, where: str) -> EnumDefinition:
         """Return an enumeration of the unit or, if it has none of this name, of the device model."""
@@ -576,6 +588,7 @@ class _Reader:
                 },
                 answers=("reply",) if answers is None else tuple(answers),
                 zeros=model.unbound is not None,
+                request=model.request or "",
             )
 
     def _check_answers(self, row: Row) -> None:
@@ -587,6 +600,21 @@ class _Reader:
             if kind == "row" and (name not in self._rows or self._rows[name].kind != "telemetry"):
                 text = f"{where}: no telemetry row with this name{did_you_mean(name, self._rows)}"
                 raise MissingNameError(text, name)
+
+
+def check_text_requests(row: Row, definition: InterfaceDefinition, where: str, *, needed: bool) -> None:
+    """Check the text that requests a row; `needed` if requests of other rows of its format are texts."""
+    if not row.request:
+        if needed:
+            raise IcdError(
+                f"{where}: needs `request`, a text, as the other rows of its format on link.serial"
+            )
+        return
+    if row.kind == "telecommand" and row.size:
+        raise IcdError(f"{where}: `request` is a text without data; it has no fields")
+    same = next(item for item in definition.rows if words(item.request) == words(row.request))
+    if same is not row:
+        raise IcdError(f"{where}: request {row.request!r} is already that of {same.name}")
 
 
 def _readback(model: schema.RowModel) -> schema.RowModel:

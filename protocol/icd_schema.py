@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.conventions import Conventions, Order
-from starhil.protocol.link_schema import LinkModel, MessageClass
+from starhil.protocol.link_schema import LineText, LinkModel, MessageClass
 from starhil.protocol.values import (
     DefinitionModel,
     DeviceParameter,
@@ -196,6 +196,8 @@ class RowModel(RowKeys):
     telecommand is `set_NAME`, the telemetry row is `NAME`."""
     answer: list[str] | None = None
     """Answers, in order: `echo`, `reply`, `row:NAME`; default: the answers of the class."""
+    request: LineText | None = None
+    """Text that requests the row on the serial line, instead of header and data; the ID then stands only in exports and logs."""
 
 
 class ParameterModel(DefinitionModel):

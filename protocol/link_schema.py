@@ -24,6 +24,8 @@ HeaderType = Literal[
 ]
 CoveredPart = Literal["start", "header", "data"]
 SizedPart = Literal["start", "header", "data", "check", "end"]
+LineText = Annotated[str, Field(min_length=1, max_length=200, pattern="^[!-~]([ -~]*[!-~])?$")]
+"""Printable ASCII without spaces at its ends."""
 Role = Literal[
     "address", "source", "destination", "class", "id", "sequence", "length",
     "status", "ack", "final", "flags", "ticks", "time",
@@ -99,6 +101,15 @@ class SlipFraming(DefinitionModel):
         return first, second
 
 
+class ByteStuffing(DefinitionModel):
+    """Bytes of a range are sent as two: with `{ escape = 0xF0, mask = 0x0F }`, F3 is sent as F0 03."""
+
+    escape: Byte
+    """First byte of the range, and the byte sent before each stuffed byte."""
+    mask: Byte
+    """Bits in which the bytes of the range differ; only they are sent after `escape`."""
+
+
 class LengthFraming(DefinitionModel):
     """`start`, a message whose header field `length` gives its size, then `end`."""
 
@@ -108,6 +119,8 @@ class LengthFraming(DefinitionModel):
     """Bytes before the header."""
     end: list[Byte] = []
     """Bytes after the checksum."""
+    stuffing: ByteStuffing | None = None
+    """Byte stuffing between `start` and `end`; sizes and checksums are those of the message before it."""
 
 
 class FixedFraming(DefinitionModel):
@@ -119,6 +132,8 @@ class FixedFraming(DefinitionModel):
     """Bytes before the header."""
     end: list[Byte] = []
     """Bytes after the checksum."""
+    stuffing: ByteStuffing | None = None
+    """Byte stuffing between `start` and `end`; sizes and checksums are those of the message before it."""
     request_size: Annotated[int, Field(ge=1, le=4096)] | None = None
     """Bytes between `start` and `end` if all requests have the same size."""
 
@@ -292,6 +307,23 @@ class HeaderFieldModel(DefinitionModel):
     """Bits, lowest first."""
 
 
+class FormatModel(DefinitionModel):
+    """Another framing or checksum for the messages of a direction, or of some classes.
+
+    The first format that fits a message applies. If several remain in a direction, messages are told apart by their first
+    byte: each has another `start`, and at most one has none.
+    """
+
+    direction: Literal["request", "reply"] | None = None
+    """`request`, `reply`; default: both."""
+    classes: Annotated[list[str], Field(min_length=1)] | None = None
+    """Classes whose messages have the format; default: all others."""
+    framing: FramingModel | None = None
+    """Framing; default: the link's."""
+    check: CheckModel | None = None
+    """Checksum; default: the link's."""
+
+
 class SerialLinkModel(DefinitionModel):
     """The serial line."""
 
@@ -305,6 +337,12 @@ class SerialLinkModel(DefinitionModel):
     """Fields before the data of a request."""
     reply_header: list[HeaderFieldModel] = []
     """Fields before the data of a reply."""
+    format: list[FormatModel] = []
+    """Messages with another framing or checksum."""
+    acknowledge: LineText | None = None
+    """Text that acknowledges a telecommand, instead of header and data."""
+    refusal: LineText | None = None
+    """Text that refuses any request, instead of header and data; `{code}` is the error's number."""
     max_size: Annotated[int, Field(ge=1, le=65536)] | None = None
     """Longest message that a receiver accepts, in bytes; default: 512, or more if a row is longer."""
     timeout: Annotated[float, Field(gt=0)] = DEFAULT_TIMEOUT_S

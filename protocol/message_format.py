@@ -7,14 +7,18 @@ check. Messages of several formats are told apart by their first byte.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from functools import partial
+from typing import Final, TypeVar
 
 from starhil.protocol.checks import Check
 from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Envelope, Header, HeaderError
-from starhil.protocol.framings import BodySizeError, Framing
+from starhil.protocol.framings import BodySizeError, Deframer, FirstByteDeframer, Framing, Receiving
 from starhil.protocol.link_schema import FixedFraming, FramingModel, HeaderFieldModel
 from starhil.protocol.messages import FaultKind, LinkFault
+from starhil.protocol.values import IcdError
+
+_Message = TypeVar("_Message")
 
 
 class MessageFormat:
@@ -34,6 +38,8 @@ class MessageFormat:
         Name of the class of each code in the header.
     where
         Field path of the header for error messages.
+    classes
+        Classes whose messages have this format; empty: all that have no other.
     """
 
     def __init__(
@@ -45,10 +51,13 @@ class MessageFormat:
         byte_order: Order,
         codes: Mapping[int, str],
         where: str,
+        classes: Sequence[str] = (),
     ) -> None:
         self.framing: Final = framing
         self.check: Final = check
         self.kind: Final = model.kind
+        self.classes: Final = tuple(classes)
+        self._klass = classes[0] if len(classes) == 1 else ""
         self.request_size: Final = model.request_size if isinstance(model, FixedFraming) else None
         """Bytes of each request, if all have the same size."""
         overhead = {"start": len(framing.start), "check": check.size, "end": len(framing.end)}
@@ -73,7 +82,7 @@ class MessageFormat:
         header = self.header
         end = len(body) - self.check.size
         try:
-            envelope = header.unpack(body[: max(end, 0)])
+            envelope = header.unpack(body[: max(end, 0)], self._klass)
         except HeaderError as error:
             if {"header", "data"} <= self.check.covers and not self._checks(body, 0, end):
                 return self._bad_check(body[end:])
@@ -94,6 +103,11 @@ class MessageFormat:
             return LinkFault(FaultKind.UART_PROTOCOL, text)
         return envelope, body[envelope.size : end]
 
+    def text(self, body: bytes) -> bytes | LinkFault:
+        """Return the text of a body without header, or the fault of its check."""
+        end = len(body) - self.check.size
+        return body[:end] if end >= 0 and self._checks(body, 0, end) else self._bad_check(body[max(end, 0) :])
+
     def _checks(self, body: bytes, header_size: int, end: int) -> bool:
         if not self.check.size:
             return True
@@ -110,10 +124,57 @@ class MessageFormat:
         `data_size` returns the size of the data if the header carries no length. Raises BodySizeError.
         """
         try:
-            envelope = self.header.unpack(body)
+            envelope = self.header.unpack(body, self._klass)
             if envelope is None:
                 return None
             data = self.header.data_size(envelope) if "length" in self.header.roles else data_size(envelope)
         except HeaderError as error:
             raise BodySizeError(str(error)) from None
         return envelope.size + data + self.check.size
+
+
+class Formats:
+    """The formats of the messages of one direction; the last is that of messages without a class.
+
+    Raises IcdError if the messages of several formats cannot be told apart by their first byte.
+    """
+
+    def __init__(self, formats: Sequence[MessageFormat], direction: str) -> None:
+        self.all: Final = tuple(formats)
+        self.other: Final = self.all[-1]
+        where = f"link.serial.format: {direction}"
+        if any(not form.classes for form in self.all[:-1]):
+            raise IcdError(f"{where}: a format after one without `classes` fits no message")
+        starts: dict[int | None, str] = {}
+        for form in self.all if len(self.all) > 1 else ():
+            if form.kind not in ("length", "fixed", "delimited"):
+                raise IcdError(f"{where}: framing {form.kind} cannot stand beside another; set `direction`")
+            start = _first_byte(form)
+            if start in starts:
+                same = "no start" if start is None else f"a start with {start:02X}"
+                raise IcdError(f"{where}: several framings have {same}; their first bytes must differ")
+            starts[start] = form.kind
+
+    def of(self, klass: str) -> MessageFormat:
+        """Return the format of the messages of a class."""
+        return next((form for form in self.all if klass in form.classes), self.other)
+
+    def deframer(
+        self,
+        interpret: Callable[[MessageFormat, bytes], _Message | LinkFault | None],
+        measure: Callable[[MessageFormat, bytes], int | None],
+        max_size: int,
+        timeout_s: float,
+    ) -> Deframer[_Message]:
+        """Return a deframer for all formats; its functions are called with the format of the message."""
+        made = {
+            _first_byte(form): form.framing.deframer(
+                Receiving(partial(interpret, form), partial(measure, form), max_size, timeout_s)
+            )
+            for form in self.all
+        }
+        return made[_first_byte(self.other)] if len(made) == 1 else FirstByteDeframer(made)
+
+
+def _first_byte(form: MessageFormat) -> int | None:
+    return form.framing.start[0] if form.framing.start else None

@@ -15,8 +15,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Final, TypeVar
+from functools import cached_property, partial
+from typing import Final
 
 from starhil.protocol import cubespace
 from starhil.protocol.checks import Check, CheckFunction, build_check
@@ -35,12 +35,12 @@ from starhil.protocol.framings import (
 )
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
+    FormatModel,
     HeaderFieldModel,
-    LengthFraming,
     MessageClass,
     SerialLinkModel,
 )
-from starhil.protocol.message_format import MessageFormat
+from starhil.protocol.message_format import Formats, MessageFormat
 from starhil.protocol.messages import (
     BURST_ID,
     DEFAULT_MAX_SIZE,
@@ -55,9 +55,8 @@ from starhil.protocol.messages import (
     error_code,
 )
 from starhil.protocol.serial_interface import Dialect
+from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
-
-_Message = TypeVar("_Message")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +72,8 @@ class RowShape:
     """Number of data bytes in the reply."""
     answers: tuple[str, ...] = ("reply",)
     """`echo` and `reply`, in the order in which the device sends them."""
+    request: str = ""
+    """Text that requests the row; empty: its header does."""
 
 
 @dataclass
@@ -197,32 +198,75 @@ class SerialStack:
         self._rows_by_id: dict[int, RowShape] = {}
         for row in rows:
             self._rows_by_id.setdefault(row.id, row)
-        self.requests: Final = self._format(
-            "request_header", cubespace.REQUEST_HEADER if self.dialects else link.request_header
+        self._by_text = {words(row.request): row for row in rows if row.request}
+        self._unknown_id = max((row.id for row in rows), default=0) + 1
+        """ID of a request with an unknown text."""
+        self.texts: Final = TextReplies(link)
+        self.request_formats: Final = self._formats_of(
+            "request", cubespace.REQUEST_HEADER if self.dialects else link.request_header
         )
-        self.replies: Final = self._format("reply_header", link.reply_header)
+        self.reply_formats: Final = self._formats_of("reply", link.reply_header)
+        self.text_formats: Final = [
+            form
+            for form in self.request_formats.all
+            if any(row.request for row in rows if self.request_formats.of(row.klass) is form)
+        ]
+        """Formats of requests that are texts."""
+        self.requests: Final = self.request_formats.other
+        """Format of requests without a class."""
+        self.replies: Final = self.reply_formats.other
+        """Format of replies without a class, and of texts."""
         self._formats: Final = {dialect: self._dialect(dialect) for dialect in self.dialects}
         default = default_dialect(self.dialects)
         self._default_format: Final = self._one_format() if default is None else self._formats[default]
         self._check_headers()
         longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)
-        header = max(
-            head.size(name)
+        overhead = max(
+            head.size(name) + form.check.size
             for head in (self.request_header, self.reply_header)
             for name in ("", *self.classes.by_name)
+            for form in (*self.request_formats.all, *self.reply_formats.all)
         )
-        self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest + header + self.check.size)
+        self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest + overhead)
 
-    def _format(self, name: str, models: Sequence[HeaderFieldModel]) -> MessageFormat:
+    def _formats_of(self, direction: str, models: Sequence[HeaderFieldModel]) -> Formats:
+        found = []
+        for number, item in enumerate(self.link.format, 1):
+            self._check_format(item, f"link.serial.format {number}")
+            if item.direction in (None, direction):
+                found.append(self._format(f"{direction}_header", models, item))
+        if all(form.classes for form in found):
+            found.append(self._format(f"{direction}_header", models))
+        return Formats(found, direction)
+
+    def _check_format(self, item: FormatModel, where: str) -> None:
+        if item.framing is None and item.check is None:
+            raise IcdError(f"{where}: needs `framing` or `check`")
+        if self.dialects or isinstance(item.framing, CubeSpaceFraming):
+            raise IcdError(
+                f"{where}: framing cubespace has its own formats; it cannot be combined with others"
+            )
+        for name in item.classes or ():
+            if name not in self.classes.by_name:
+                known = ", ".join(self.classes.by_name) or "none"
+                raise IcdError(f"{where}: no class named {name!r} (known: {known})")
+
+    def _format(
+        self, name: str, models: Sequence[HeaderFieldModel], item: FormatModel | None = None
+    ) -> MessageFormat:
         framings, checks = self._plugin
+        framing, check, classes = self.link.framing, self.link.check, list[str]()
+        if item is not None:
+            framing, check, classes = item.framing or framing, item.check or check, item.classes or []
         return MessageFormat(
-            build_framing(self.link.framing, framings),
-            self.link.framing,
-            build_check(self.link.check, self.byte_order, checks),
+            build_framing(framing, framings),
+            framing,
+            build_check(check, self.byte_order, checks),
             models,
             self.byte_order,
             self.classes.requests if name == "request_header" else self.classes.replies,
             f"link.serial.{name}",
+            classes,
         )
 
     @property
@@ -269,11 +313,20 @@ class SerialStack:
                 if name not in self.classes.by_name:
                     known = ", ".join(self.classes.by_name) or "none"
                     raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
-            if isinstance(self.link.framing, LengthFraming) and "length" not in header.roles:
+            formats = self.request_formats if where == "request" else self.reply_formats
+            if any(form.kind == "length" for form in formats.all) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
         if self.request_header.counts:
             raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
-        if "id" not in self.request_header.roles:
+        texts = list(self.text_formats)
+        if self.texts.acknowledge is not None or self.texts.refusal is not None:
+            texts.append(self.replies)
+        for form in texts:
+            if form.kind in ("length", "fixed"):
+                raise IcdError(
+                    f"link.serial: texts need a framing with an end, such as delimited, not {form.kind}"
+                )
+        if "id" not in self.request_header.roles and len(self.text_formats) < len(self.request_formats.all):
             raise IcdError("link.serial.request_header: needs a field with role id")
         for role in ("source", "destination"):
             header, other = (
@@ -302,26 +355,30 @@ class SerialStack:
 
     def device(self) -> Deframer[Request]:
         """Return a receiver for the device's end."""
-        return self.framing.deframer(self.receiving(self._request_of, self._request_size))
+        return self.request_formats.deframer(
+            self._request_of, self._request_size, self.max_size, self.link.timeout
+        )
 
     def host(self, dialect: Dialect | None = None) -> HostReceiver:
         """Return a receiver for the OBC's end."""
         return HostReceiver(self, self.format(dialect))
 
-    def receiving(
-        self,
-        interpret: Callable[[bytes], _Message | LinkFault | None],
-        measure: Callable[[bytes], int | None],
-    ) -> Receiving[_Message]:
-        """Return how a deframer handles bodies: `measure` returns the size of one, `interpret` its message."""
-        return Receiving(interpret, measure, self.max_size, self.link.timeout)
-
     def encode_request(self, request: Request) -> bytes:
-        """Return a request as bytes on the line."""
-        return self.requests.framing.encode(self.request_body(request))
+        """Return a request as bytes on the line.
+
+        Raises ProtocolError for data or an unknown ID if requests are texts.
+        """
+        return self.request_formats.of(request.klass).framing.encode(self.request_body(request))
 
     def request_body(self, request: Request) -> bytes:
         """Return header, data and check of a request."""
+        form = self.request_formats.of(request.klass)
+        if form in self.text_formats:
+            row = self.row(request.klass, request.id)
+            if row is None or not row.request or request.data:
+                what = f"no text requests ID {request.id}" if row is None else "a text has no data"
+                raise ProtocolError(f"link.serial: {what}")
+            return form.close(b"", row.request.encode("ascii"))
         values = {"id": request.id, "sequence": request.sequence}
         if request.source:
             values["source"] = request.source
@@ -329,9 +386,7 @@ class SerialStack:
             values["flags"] = request.flags
         if "class" in self.request_header.roles:
             values["class"] = self.classes.request_code(request.klass)
-        return self.requests.close(
-            self.request_header.pack(values, request.klass, len(request.data)), request.data
-        )
+        return form.close(form.header.pack(values, request.klass, len(request.data)), request.data)
 
     def encode_reply(self, reply: Reply, dialect: Dialect | None = None) -> bytes:
         """Return a reply as bytes on the line; empty for a refusal that the unit's header cannot express.
@@ -349,6 +404,9 @@ class SerialStack:
                 reply.flags,
             )  # fmt: skip
             return self.encode_request(echo)
+        text = self.texts.encode(reply)
+        if text is not None:
+            return self.replies.framing.encode(self.replies.close(b"", text))
         refused = reply.kind is ReplyKind.NACK
         accepted = reply.kind is ReplyKind.ACK
         if self.dialects and (refused or accepted) and reply.id in self._silent:
@@ -374,10 +432,21 @@ class SerialStack:
                 reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
             )
         data = b"" if refused or (self.dialects and accepted) else reply.data
-        return form.framing.encode(self.replies.close(header.pack(values, reply.klass, len(data)), data))
+        if self.dialects:
+            return form.framing.encode(header.pack(values, reply.klass, len(data)) + data)
+        own = self.reply_formats.of(reply.klass)
+        return own.framing.encode(own.close(own.header.pack(values, reply.klass, len(data)), data))
 
-    def _request_of(self, body: bytes) -> Request | LinkFault:
-        opened = self.requests.open(body)
+    def _request_of(self, form: MessageFormat, body: bytes) -> Request | LinkFault:
+        if form in self.text_formats:
+            text = form.text(body)
+            if isinstance(text, LinkFault):
+                return text
+            row = self._by_text.get(words(text.decode("latin-1")))
+            if row is None:
+                return Request(RequestKind.TELECOMMAND, self._unknown_id)
+            return Request(row.kind, row.id, klass=row.klass)
+        opened = form.open(body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened
@@ -404,11 +473,11 @@ class SerialStack:
         row = self.row(klass, row_id)
         return item.kind if item is not None else row.kind if row is not None else None
 
-    def _request_size(self, body: bytes) -> int | None:
+    def _request_size(self, form: MessageFormat, body: bytes) -> int | None:
         """Return the size of a request that begins with these bytes, or None if more are needed."""
-        if self.requests.request_size is not None:
-            return self.requests.request_size
-        return self.requests.measure(body, self._request_data_size)
+        if form.request_size is not None:
+            return form.request_size
+        return form.measure(body, self._request_data_size)
 
     def _request_data_size(self, envelope: Envelope) -> int:
         row = self.row(envelope.klass, envelope.values["id"])
@@ -427,8 +496,11 @@ class HostReceiver:
     def __init__(self, stack: SerialStack, replies: ReplyFormat) -> None:
         self._stack = stack
         self._format = replies
-        self._deframer: Deframer[Reply] = replies.framing.deframer(
-            stack.receiving(self._reply_of, self._size)
+        limits = stack.max_size, stack.link.timeout
+        self._deframer: Deframer[Reply] = (
+            replies.framing.deframer(Receiving(self._reply_in_dialect, lambda _body: None, *limits))
+            if stack.dialects
+            else stack.reply_formats.deframer(self._reply_of, self._size, *limits)
         )
         self._pending: Request | None = None
         self._reply_size: int | None = None
@@ -457,35 +529,44 @@ class HostReceiver:
         self._echo = self._stack.request_body(request) if "echo" in answers else None
         self._only_echo = "reply" not in answers
 
-    def _size(self, body: bytes) -> int | None:
+    def _size(self, form: MessageFormat, body: bytes) -> int | None:
         """Return the size of the echo or reply that begins with these bytes, or None if more are needed."""
         if self._echo is not None:
             return len(self._echo)
-        return self._stack.replies.measure(body, self._data_size)
+        return form.measure(body, partial(self._data_size, form))
 
-    def _data_size(self, envelope: Envelope) -> int:
+    def _awaited(self, form: MessageFormat) -> Request | None:
+        """Return the request that a reply without an ID answers; None if its class has another format."""
+        pending = self._pending
+        return (
+            pending if pending is not None and self._stack.reply_formats.of(pending.klass) is form else None
+        )
+
+    def _data_size(self, form: MessageFormat, envelope: Envelope) -> int:
         values = envelope.values
         if values.get("status", 0) or not values.get("ack", 1):
             return 0
         row = self._stack.row(envelope.klass, values["id"]) if "id" in values else None
         if row is not None:
             return row.reply_size
-        if self._pending is None or self._reply_size is None:
+        if self._awaited(form) is None or self._reply_size is None:
             raise HeaderError("reply without a request")
         return self._reply_size
 
-    def _reply_of(self, body: bytes) -> Reply | LinkFault | None:
+    def _reply_of(self, form: MessageFormat, body: bytes) -> Reply | LinkFault | None:
         if self._echo is not None:
             return self._check_echo(body)
         stack = self._stack
-        if stack.dialects:
-            return self._reply_in_dialect(body)
-        opened = stack.replies.open(body)
+        text = form.text(body) if form is stack.replies else None
+        read = stack.texts.decode(text) if isinstance(text, bytes) else None
+        if read is not None:
+            return self._text_reply(*read)
+        opened = form.open(body)
         if isinstance(opened, LinkFault):
             return opened
         envelope, data = opened
         values = envelope.values
-        pending = self._pending
+        pending = self._awaited(form)
         row_id = values.get("id", None if pending is None else pending.id)
         if row_id is None:
             return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
@@ -493,6 +574,8 @@ class HostReceiver:
         if not klass and pending is not None and pending.id == row_id:
             klass = pending.klass
         kind = self._kind(envelope, klass, row_id)
+        if kind is ReplyKind.ACK and not values and stack.texts.acknowledge is not None:
+            return LinkFault(FaultKind.UART_PROTOCOL, f"{body[:16]!r} is no acknowledge")
         if values.get("final", 1) and kind is not ReplyKind.UNSOLICITED:
             self._pending = None
         return Reply(
@@ -509,6 +592,13 @@ class HostReceiver:
             uptime_ns=values["ticks"] * stack.reply_header.count_ns("ticks") if "ticks" in values else 0,
             time_ns=values["time"] * stack.reply_header.count_ns("time") if "time" in values else 0,
         )
+
+    def _text_reply(self, kind: ReplyKind, code: int) -> Reply | LinkFault:
+        pending = self._pending
+        if pending is None or (kind is ReplyKind.ACK and pending.kind is not RequestKind.TELECOMMAND):
+            return LinkFault(FaultKind.UART_PROTOCOL, f"{kind.value} without a request")
+        self._pending = None
+        return Reply(kind, pending.id, code=error_code(code), klass=pending.klass)
 
     def _check_echo(self, body: bytes) -> Reply | LinkFault | None:
         expected, self._echo = self._echo, None
@@ -638,6 +728,7 @@ def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
             row.size if row.kind == "telecommand" else 0,
             row.size if row.kind == "telemetry" else 0,
             serial_answers(icd, row),
+            row.request,
         )
         for row in icd.rows
     ]

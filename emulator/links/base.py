@@ -6,7 +6,7 @@ import asyncio
 import logging
 from abc import ABC, abstractmethod
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 
@@ -36,11 +36,12 @@ class Heard:
     requests: int = 0
     last_s: float | None = None
     """Time of the last one on the loop's clock, seconds; None before the first."""
+    _loop: asyncio.AbstractEventLoop = field(default_factory=asyncio.get_running_loop, repr=False)
 
     def count(self) -> None:
         """Count a request."""
         self.requests += 1
-        self.last_s = asyncio.get_running_loop().time()
+        self.last_s = self._loop.time()
 
 
 class BusLink(ABC, Generic[Item]):

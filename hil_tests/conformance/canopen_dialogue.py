@@ -84,6 +84,8 @@ from starhil.hil_tests.judge.canopen import multiplexer
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""
 
+SHOWN_STEPS: Final = 4
+"""Number of steps before a failed one in its message."""
 IDENTITY: Final = ("vendor", "product", "revision", "serial")
 """Parts of 1018h, from sub-index 1 on."""
 COB_IDS: Final = {"request": 0x600, "response": 0x580, "heartbeat": 0x700}
@@ -188,12 +190,16 @@ def hold(probe: CanopenProbe, lines: str, ask: Ask) -> None:
         probe.require(*needed.split())
     names = Names(probe)
     master = _Master(probe, lines, names)
-    for number, line in enumerate(lines.format_map(names).split(";"), 1):
+    steps = [step.strip() for step in lines.format_map(names).split(";")]
+    for number, step in enumerate(steps):
         try:
-            if _ends(master, line.strip(), ask):
+            if _ends(master, step, ask):
                 break
         except CaseFailed as failure:
-            raise CaseFailed(f"{failure.expected} (step {number}: {line.strip()})", failure.seen) from None
+            before = f", after {'; '.join(steps[max(0, number - SHOWN_STEPS) : number])}" if number else ""
+            raise CaseFailed(
+                f"{failure.expected} (step {number + 1}: {step}{before})", failure.seen
+            ) from None
     if "carry" in lines:
         master.put(names.carried.before.hex())
 

@@ -56,6 +56,10 @@ NMT_DIALOGUES: Final = (
         "nmt 128; 40 00 10 00 > 43 00 10 00 *; nmt 1; 40 00 10 00 > 43 00 10 00 *; nmt 2; 40 00 10 00 > silence",
         "CiA 301 7.3.2.2.5",
     ),
+    Dialogue(
+        "reset-communication", "reset communication restores the communication profile",
+        "set 1017:0 777 u16; reset; kept",
+    ),
 )  # fmt: skip
 ERROR_CONTROL_DIALOGUES: Final = (
     Dialogue(
@@ -109,14 +113,6 @@ def boot_up_once(probe: CanopenProbe) -> None:
     probe.reset_communication()
     data = probe.wait_for(0x700 + probe.node, 0.2, lambda data: data == b"\0")
     check(data is None, "one boot-up message", "two")
-
-
-@NMT.case("reset-communication", "reset communication restores the communication profile")
-def reset_communication(probe: CanopenProbe) -> None:
-    before = probe.number(0x1017)
-    probe.set(0x1017, 0, before ^ 0x55, 2)
-    probe.reset_communication()
-    check_equal(probe.number(0x1017), before, "1017h")
 
 
 @ERROR_CONTROL.case("heartbeat", "heartbeat with the state at its period")

@@ -82,6 +82,15 @@ class ReadableSettings:
             probe.send_command(command, data)
 
 
+def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:
+    """Return the smallest row whose errors show: of several bytes, in a class that can be refused, read without effect."""
+
+    def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
+        return row.action is not None, not can_refuse(row.klass), row.size < SHOWING, row.size
+
+    return min(unit.telemetry.values(), key=unsuitable)
+
+
 class LinkProbe(ABC):
     """Talks to a unit over a link.
 
@@ -110,15 +119,8 @@ class LinkProbe(ABC):
 
     @cached_property
     def lively(self) -> Row:
-        """Row that is requested to check that the unit answers.
-
-        The smallest whose errors show: of several bytes, in a class that can be refused, and read without effect.
-        """
-
-        def unsuitable(row: Row) -> tuple[bool, bool, bool, int]:
-            return row.action is not None, not self.can_refuse(row.klass), row.size < SHOWING, row.size
-
-        return min(self.unit.telemetry.values(), key=unsuitable)
+        """Row that is requested to check that the unit answers."""
+        return lively_row(self.unit, self.can_refuse)
 
     # --- the link ---
 

@@ -47,14 +47,15 @@ Run = Callable[[LinkProbe], None]
 
 
 def row_cases(
-    unit: Unit, *, lengths: bool = True, marks: bytes = b"", highest_id: int = 255
+    unit: Unit, *, lengths: bool = True, numbers: bool = True, marks: bytes = b"", highest_id: int = 255
 ) -> Iterator[Case[LinkProbe]]:
     """Yield the cases for the rows of a unit.
 
-    `lengths`: whether a message of a wrong length can be sent on the link. `marks`: bytes that are special on it, of which settings
+    `lengths`: whether a message of a wrong length can be sent on the link. `numbers`: whether requests carry IDs. `marks`: bytes that are special on it, of which settings
     are made. `highest_id`: the highest that a message can carry.
     """
-    yield from _identifiers(unit, highest_id)
+    if numbers:
+        yield from _identifiers(unit, highest_id)
     if lengths:
         yield from _lengths(unit)
     for row in unit.telemetry.values():

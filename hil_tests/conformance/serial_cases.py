@@ -22,11 +22,12 @@ from starhil.hil_tests.conformance.case import (
     check_equal,
     rule,
 )
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, lively_row
 from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases
 from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
 from starhil.hil_tests.conformance.wire_tables import Exchange, add_exchange_cases, filled
 from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.framings import Framing
 from starhil.hil_tests.judge.headers import Header
 from starhil.hil_tests.judge.rows import Row
 from starhil.hil_tests.judge.serial import Headed, SerialLine
@@ -49,11 +50,15 @@ Run = Callable[[SerialProbe], None]
 def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
     """Yield the cases for a unit with a serial link."""
     line = SerialLine(unit)
-    yield from _framing(line)
+    lively = lively_row(unit, line.envelope.can_refuse)
+    framing, envelope = line.request_format(lively.klass)
+    yield from _framing(line, framing, in_text=bool(lively.request))
     highest = 255
     if line.dialect is not None:
         yield from _cubespace(unit)
-    envelope = line.envelope
+    texts = [row for row in unit.rows if row.request]
+    if texts:
+        yield from _texts(texts)
     if isinstance(envelope, Headed):
         yield from _check(envelope)
         yield from _header(unit, envelope)
@@ -64,7 +69,11 @@ def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
         "timing", "pace", "a long reply takes at least its time on the line", pace, "8N1: ten bits a byte"
     )
     yield from row_cases(
-        unit, lengths=unit.serial.framing.kind != "fixed", marks=line.framing.marks, highest_id=highest
+        unit,
+        lengths=unit.serial.framing.kind != "fixed" and not texts,
+        numbers=not texts,
+        marks=framing.marks,
+        highest_id=highest,
     )
     yield case_in("recovery", "noise", "after noise and a pause the next request is answered", noise, rule(9))
 
@@ -92,8 +101,9 @@ def _answered(probe: SerialProbe, times: int = 1) -> None:
     probe.expect_silence("no more was requested")
 
 
-def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
-    marks = line.framing.marks
+def _framing(line: SerialLine, framing: Framing, *, in_text: bool) -> Iterator[Case[SerialProbe]]:
+    """Yield the cases of the framing of requests, which may be texts."""
+    marks = framing.marks
     plain = bytes(byte for byte in range(0x20, 0x60) if byte not in marks)
     clause = CLAUSE if line.dialect is None else CUBESPACE
 
@@ -122,14 +132,20 @@ def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
         probe.send(whole[: len(whole) // 2])
         probe.sleep_past_timeout()
         probe.send(whole[len(whole) // 2 :])
-        probe.expect_silence("the message has timed out")
+        if in_text:  # the second half is an unknown text
+            _expect_text_refused(probe)
+        else:
+            probe.expect_silence("the message has timed out")
         probe.sleep_past_timeout()
         probe.expect_alive()
 
     def overlong(probe: SerialProbe) -> None:
         size = probe.unit.serial.max_size or max(DEFAULT_MAX_SIZE, *(row.size for row in probe.unit.rows))
-        request = replace(probe.unit.request(probe.lively), data=plain[:1] * (size + 64))
-        probe.send(probe.line.encode(request))
+        request = probe.unit.request(probe.lively)
+        if in_text:
+            probe.send(framing.encode(_body(probe) + plain[:1] * (size + 64)))
+        else:
+            probe.send(probe.line.encode(replace(request, data=plain[:1] * (size + 64))))
         probe.expect_silence("the message was too long")
         probe.sleep_past_timeout()
         probe.expect_alive()
@@ -140,7 +156,7 @@ def _framing(line: SerialLine) -> Iterator[Case[SerialProbe]]:
         answer = probe.expect_telemetry(probe.lively)
         probe.sleep(probe.times.quiet_s)
         echo = sent if "echo" in probe.lively.answers else b""
-        whole = echo + probe.line.telemetry_frame(answer.body)
+        whole = echo + probe.line.telemetry_frame(answer.body, probe.lively.klass)
         end = (
             marks[:1] if probe.unit.serial.framing.kind == "slip" else b""
         )  # which may be omitted before a frame
@@ -229,11 +245,51 @@ def _refuses_31(text: str, probe: SerialProbe) -> None:
     check(answer.kind == "nack" and answer.code == code, f"refusal with code {code}", answer)
 
 
+# --- texts ---
+
+
+def _expect_text_refused(probe: SerialProbe) -> None:
+    """Take the refusal of an unknown text, or silence if the unit has no text for it."""
+    if not probe.can_refuse(""):
+        probe.expect_silence("no text refuses a request on this link")
+        return
+    probe.line.expect(probe.unit.request(probe.lively))
+    answer = probe.next_answer()
+    refused = answer.kind == "nack" and (not probe.has_codes or answer.code == probe.unit.code(INVALID_ID))
+    check(refused, "the text of a refusal for an unknown request", answer)
+
+
+def _texts(rows: list[Row]) -> Iterator[Case[SerialProbe]]:
+    """Yield the cases of requests that are texts: each as it is defined, and no other."""
+    known = {row.request for row in rows}
+
+    def others(text: str) -> list[str]:
+        letter = "x" if text[-1] != "x" else "y"
+        wrong = (text[:-1] + letter, letter + text[1:], text + letter, text[:-1], text.swapcase())
+        return [other for other in wrong if other.strip() and other not in known]
+
+    def refused(row: Row) -> Run:
+        def run(probe: SerialProbe) -> None:
+            framing, envelope = probe.line.request_format(row.klass)
+            for text in others(row.request):
+                if isinstance(envelope, Headed):
+                    probe.send(framing.encode(envelope.closed(b"", text.encode())))
+                _expect_text_refused(probe)
+                probe.drain()
+            probe.expect_alive()
+
+        return run
+
+    for row in rows:
+        title = f"the text {row.request!r} with a letter changed, added or left out is refused"
+        yield case_in("texts", row.name, title, refused(row), row, intrusive=not row.is_telemetry)
+
+
 # --- check ---
 
 
 def _body(probe: SerialProbe) -> bytes:
-    return probe.line.envelope.body(probe.unit.request(probe.lively))
+    return probe.line.request_format(probe.lively.klass)[1].body(probe.unit.request(probe.lively))
 
 
 def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
@@ -244,7 +300,7 @@ def _check(envelope: Headed) -> Iterator[Case[SerialProbe]]:
     def silent(change: Callable[[bytes], Iterator[bytes]]) -> Run:
         def run(probe: SerialProbe) -> None:
             for body in change(_body(probe)):
-                probe.send(probe.line.framing.encode(body))
+                probe.send(probe.line.request_format(probe.lively.klass)[0].encode(body))
             probe.expect_silence("the check is wrong")
             probe.sleep_past_timeout()  # a length that was changed may announce more bytes
             probe.drain()
@@ -314,7 +370,7 @@ def _silent_header(envelope: Headed, name: str, item: Any, values: list[int], wh
         for value in values:
             piece = value.to_bytes(size, item.order or probe.unit.byte_order)
             changed = header[:offset] + piece + header[offset + size :]
-            probe.send(probe.line.framing.encode(envelope.closed(changed, b"")))
+            probe.send(probe.line.request_format(klass)[0].encode(envelope.closed(changed, b"")))
         probe.expect_silence(what)
         probe.drain()
         probe.expect_alive()
@@ -383,7 +439,8 @@ def pace(probe: SerialProbe) -> None:
 def noise(probe: SerialProbe) -> None:
     rng = random.Random(7)  # noqa: S311 -- noise, not a secret
     # without its start byte, bytes are no CubeSpace message; in other framings any mark may end or begin one
-    left_out = probe.line.framing.marks[1:2] if probe.dialect is not None else probe.line.framing.marks
+    marks = probe.line.request_format(probe.lively.klass)[0].marks
+    left_out = marks[1:2] if probe.dialect is not None else marks
     for _ in range(20):
         probe.send(bytes(byte for byte in rng.randbytes(200) if byte not in left_out))
         probe.sleep(0.01)

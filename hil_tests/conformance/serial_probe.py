@@ -87,7 +87,7 @@ class SerialProbe(LinkProbe):
                 self.numbered.append(answer)
             if answer.kind == "unsolicited":
                 self._unsolicited.append(answer)
-                self.raw = self.raw.replace(self.line.telemetry_frame(answer.body), b"", 1)
+                self.raw = self.raw.replace(self.line.telemetry_frame(answer.body, answer.klass), b"", 1)
             else:
                 self._answers.append(answer)
         return True

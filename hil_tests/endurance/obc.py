@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.life import ADDRESSES
+from starhil.hil_tests.endurance.life import ADDRESSES, Outcome
 from starhil.hil_tests.endurance.node import Node
 from starhil.hil_tests.endurance.oracle import Oracle
-from starhil.hil_tests.endurance.outcome import Outcome
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort, objects_of
 from starhil.hil_tests.endurance.unit import Unit
 from starhil.hil_tests.endurance.violation import Violation, flag

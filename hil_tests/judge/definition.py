@@ -131,7 +131,10 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         can=icd.link.can,
         byte_order=icd.conventions.byte_order,
         classes=icd.classes,
-        unanswered=frozenset(getattr(serial.framing, "unanswered", ()) if serial is not None else ()),
+        unanswered=frozenset(
+            {row.name for row in icd.rows if not row.answers}
+            | set(getattr(serial.framing, "unanswered", ()) if serial is not None else ())
+        ),
         errors=icd.errors,
         first_telemetry_id=icd.first_telemetry_id,
         telecommand_crc=icd.conventions.telecommand_crc,
@@ -149,7 +152,7 @@ def _parameter(item: Any) -> Parameter:
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
     return Row(
         row.kind, row.id, row.name, tuple(_fields(row, icd)), row.klass, row.provenance, row.source, row.action, row.arguments,
-        row.answers, row.unsolicited,
+        row.answers, row.request, row.unsolicited,
     )  # fmt: skip
 
 

@@ -97,13 +97,13 @@ class Header:
             )
         return line
 
-    def read(self, body: bytes) -> Opened | None:
-        """Read a header; return None if more bytes are needed.
+    def read(self, body: bytes, klass: str = "") -> Opened | None:
+        """Read a header, of a message whose class may be known; return None if more bytes are needed.
 
         Raises ValueError for a constant or class that the definition does not have.
         """
         values: dict[str, int] = {}
-        klass, position = "", 0
+        position = 0
         for model in self._models:
             if model.classes is not None and klass not in model.classes:
                 continue

@@ -238,6 +238,8 @@ class Row:
         Action that a telecommand performs, and its fixed arguments.
     answers
         Answers in order: `echo`, `reply`.
+    request
+        Text that requests the row on a serial line; empty if a header does.
     unsolicited
         Rate in Hz at which it is sent without a request, or events after which it is sent; None if it is not.
     """
@@ -252,6 +254,7 @@ class Row:
     action: str | None = None
     arguments: Mapping[str, Value] = field(default_factory=dict)
     answers: tuple[str, ...] = ("reply",)
+    request: str = ""
     unsolicited: float | Sequence[str] | None = None
 
     def __repr__(self) -> str:

@@ -2,7 +2,7 @@
 
     request ──► body ──► framing ──► line          line ──► framing ──► body ──► answer
 
-    composed   | header by roles | data | check |                                  `Headed`
+    composed   | header by roles | data | check |       or a text                  `Headed`
     dialect a  | ID | data or error |           CubeComputer (AlbertaSat)         `Dialect`
     dialect b  | data or error |                CubeSense node (RADSAT)
     dialect c  | ID | data or error |           generation 2; 7F 07 0F 4F 2F name the kind (libCubeObc)
@@ -13,17 +13,20 @@ An answer without an ID belongs to the oldest request that has not been answered
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from starhil.hil_tests.judge.checks import check_function
 from starhil.hil_tests.judge.definition import Unit, plugin_check, plugin_framing
+from starhil.hil_tests.judge.formats import CODE, first_byte_of, format_models, text_answer
 from starhil.hil_tests.judge.framings import Framing, Taken
 from starhil.hil_tests.judge.framings.counted import Counted
 from starhil.hil_tests.judge.framings.delimited import Delimited
 from starhil.hil_tests.judge.framings.escaped import Escaped
 from starhil.hil_tests.judge.framings.slip import Slip
+from starhil.hil_tests.judge.framings.stuffed import Stuffed
 from starhil.hil_tests.judge.headers import Header, Opened
 from starhil.hil_tests.judge.messages import (
     BURST_ID,
@@ -77,20 +80,25 @@ class SerialLine:
     def __init__(self, unit: Unit, dialect: str | None = None) -> None:
         link = unit.serial
         self._unit = unit
-        self.framing: Framing
-        self.envelope: Envelope
+        self._requests_in: list[tuple[tuple[str, ...], Framing, Envelope]]
+        self._answers_in: list[tuple[tuple[str, ...], Framing, Envelope]]
         self.dialect: str | None = None
         self._requests = 0
         if link.framing.kind == "cubespace":
             self.dialect = link.framing.dialect or dialect or "b"
             escape, start, end = CUBESPACE
             starts = (start, *KINDS) if self.dialect == "c" else (start,)
-            self.framing = Escaped(escape, starts, end)
-            self.envelope = Dialect(unit, self.dialect)
+            self._requests_in = [((), Escaped(escape, starts, end), Dialect(unit, self.dialect))]
+            self._answers_in = self._requests_in
         else:
-            self.framing = _framing(unit)
-            self.envelope = Headed(unit, self.framing)
+            self._requests_in = list(_formats(unit, "request"))
+            self._answers_in = list(_formats(unit, "reply"))
+        self.envelope = self._answers_in[-1][2]
         self.clear()
+
+    def request_format(self, klass: str) -> tuple[Framing, Envelope]:
+        """Return framing and envelope of the requests of a class."""
+        return _of_class(self._requests_in, klass)
 
     def clear(self) -> None:
         """Forget everything received and asked."""
@@ -105,13 +113,15 @@ class SerialLine:
 
     def encode(self, request: Request) -> bytes:
         """Return a request as bytes on the line."""
-        return self.framing.encode(self.envelope.body(request))
+        framing, envelope = self.request_format(request.klass)
+        return framing.encode(envelope.body(request))
 
-    def telemetry_frame(self, body: bytes) -> bytes:
+    def telemetry_frame(self, body: bytes, klass: str) -> bytes:
         """Return the body of a telemetry answer as bytes on the line."""
-        if isinstance(self.framing, Escaped) and self.dialect == "c":
-            return self.framing.encode(body, TELEMETRY)
-        return self.framing.encode(body)
+        framing, _ = _of_class(self._answers_in, klass)
+        if isinstance(framing, Escaped) and self.dialect == "c":
+            return framing.encode(body, TELEMETRY)
+        return framing.encode(body)
 
     def expect(self, request: Request) -> None:
         """Note a request, in order."""
@@ -123,25 +133,27 @@ class SerialLine:
         answers = []
         while self.received:
             asked = self._asked[0] if self._asked else None
+            number = first_byte_of((framing for _, framing, _ in self._answers_in), self.received[0])
+            _, framing, envelope = self._answers_in[number]
             echo = (
                 None
                 if asked is None or self._echoed or not self._answers(asked, "echo")
-                else self.envelope.body(asked)
+                else envelope.body(asked)
             )
             measure = (
-                partial(self.envelope.size, asked=asked)
-                if echo is None
-                else partial(_size_of_echo, len(echo))
+                partial(envelope.size, asked=asked) if echo is None else partial(_size_of_echo, len(echo))
             )
-            taken = self.framing.take(self.received, measure)
+            taken = framing.take(self.received, measure)
             if taken is None:
                 break
-            answer = self._answer(taken, asked, echo)
+            answer = self._answer(envelope, taken, asked, echo)
             if answer is not None:
                 answers.append(answer)
         return answers
 
-    def _answer(self, taken: Taken, asked: Request | None, echo: bytes | None) -> Answer | None:
+    def _answer(
+        self, envelope: Envelope, taken: Taken, asked: Request | None, echo: bytes | None
+    ) -> Answer | None:
         if taken.junk or (echo is not None and taken.body != echo):
             answer = Answer("malformed", data=taken.body)
         elif asked is not None and echo is not None:
@@ -150,7 +162,7 @@ class SerialLine:
                 return None
             answer = Answer("ack", row_id=asked.id, klass=asked.klass)
         else:
-            answer = self.envelope.answer(taken, asked)
+            answer = envelope.answer(taken, asked)
         ends = answer.final and answer.kind not in ("unsolicited", "burst")
         if ends and asked is not None and (answer.row_id in (None, asked.id) or answer.kind == "malformed"):
             self._asked.popleft()
@@ -166,15 +178,29 @@ def _size_of_echo(size: int, _begun: bytes) -> int:
     return size
 
 
-def _framing(unit: Unit) -> Framing:
-    model = unit.serial.framing
+def _of_class(
+    formats: list[tuple[tuple[str, ...], Framing, Envelope]], klass: str
+) -> tuple[Framing, Envelope]:
+    return next((item[1:] for item in formats if klass in item[0]), formats[-1][1:])
+
+
+def _formats(unit: Unit, direction: str) -> Iterator[tuple[tuple[str, ...], Framing, Envelope]]:
+    """Yield classes, framing and envelope of each format of a direction; without classes for all others, last."""
+    elsewhere: tuple[str, ...] = ()
+    for model in format_models(unit.serial, direction):
+        framing = _framing(unit, model.framing)
+        yield model.classes, framing, Headed(unit, framing, model.check, model.classes, elsewhere)
+        elsewhere += model.classes
+
+
+def _framing(unit: Unit, model: Any) -> Framing:
     match model.kind:
         case "escaped":
             return Escaped(model.escape, (model.start,), model.end)
         case "slip":
             return Slip(model)
         case "length" | "fixed":
-            return Counted(model.start, model.end)
+            return Counted(model.start, model.end) if model.stuffing is None else Stuffed(model)
         case "delimited":
             return Delimited(model)
         case _:
@@ -182,16 +208,28 @@ def _framing(unit: Unit) -> Framing:
 
 
 class Headed:
-    """A header by roles, and a check."""
+    """A header by roles, and a check; or a text, which needs no header.
+
+    `classes` are those whose messages have this check, empty for all others; `elsewhere` those with another format.
+    """
 
     has_unsolicited = True
 
-    def __init__(self, unit: Unit, framing: Framing) -> None:
+    def __init__(
+        self,
+        unit: Unit,
+        framing: Framing,
+        check: Any,
+        classes: tuple[str, ...] = (),
+        elsewhere: tuple[str, ...] = (),
+    ) -> None:
         link = unit.serial
         self._unit = unit
+        self._klass = classes[0] if len(classes) == 1 else ""
+        self._classes, self._elsewhere = classes, elsewhere
         self._start = framing.start
-        self._compute = check_function(link.check, unit.byte_order, partial(plugin_check, unit))
-        self.covers = getattr(link.check, "covers", [])
+        self._compute = check_function(check, unit.byte_order, partial(plugin_check, unit))
+        self.covers = getattr(check, "covers", [])
         self.check_size = len(self._compute(b""))
         sizes = {"start": len(self._start), "check": self.check_size, "end": len(framing.end)}
         coded = [item for item in unit.classes if item.code is not None]
@@ -202,13 +240,21 @@ class Headed:
         self.requests = Header(link.request_header, unit.byte_order, requests, sizes)
         self.replies = Header(link.reply_header, unit.byte_order, replies, sizes)
         self._codes = dict(requests)
-        self.has_codes = "status" in self.replies.roles()
+        self.has_codes = "status" in self.replies.roles() or CODE in (link.refusal or "")
         self.sequence_bits = self.requests.width("sequence")
         self.numbers = 1 << self.replies.width("sequence")
         self._numbered = self.replies.counted()
 
     def body(self, request: Request) -> bytes:
-        """Return header, data and check of a request."""
+        """Return header, data and check of a request, or its text and check.
+
+        Raises ValueError for a request that no text expresses.
+        """
+        row = self._unit.row(request)
+        if row is not None and row.request and not request.data:
+            return self.closed(b"", row.request.encode())
+        if (row is not None and row.request) or not self.requests.roles():
+            raise ValueError(f"no text requests {request} with {len(request.data)} bytes")
         values = {"id": request.id, "class": self._codes.get(request.klass, 0), "sequence": request.sequence}
         return self.closed(self.requests.write(values, request.klass, len(request.data)), request.data)
 
@@ -222,7 +268,7 @@ class Headed:
 
     def size(self, begun: bytes, asked: Request | None) -> int | None:
         """Return the size of header, data and check."""
-        opened = self.replies.read(begun)
+        opened = self.replies.read(begun, self._klass)
         if opened is None:
             return None
         data = self.replies.data_size(opened)
@@ -234,8 +280,10 @@ class Headed:
     def _request(self, opened: Opened, asked: Request | None) -> Request:
         """Return the request that an answer names, or the one that was asked if it names none."""
         if "id" not in opened.values:
-            if asked is None:
+            if asked is None or asked.klass in self._elsewhere:
                 raise ValueError("an answer without a request")
+            if self._classes and asked.klass not in self._classes:
+                raise ValueError("an answer in the format of another class")
             return asked
         klass = opened.klass or (asked.klass if asked is not None and asked.id == opened.values["id"] else "")
         return Request(opened.values["id"], klass=klass)
@@ -243,8 +291,13 @@ class Headed:
     def answer(self, taken: Taken, asked: Request | None) -> Answer:
         """Return the answer in header, data and check, all of which must be right."""
         end = len(taken.body) - self.check_size
+        text = taken.body[: max(end, 0)]
+        if not self._classes and self.closed(b"", text) == taken.body:
+            found = text_answer(self._unit.serial, text, asked, taken.body)
+            if found is not None:
+                return found
         try:
-            opened = self.replies.read(taken.body[: max(end, 0)])
+            opened = self.replies.read(text, self._klass)
             request = None if opened is None else self._request(opened, asked)
         except ValueError:
             opened = request = None
@@ -266,6 +319,8 @@ class Headed:
         row = self._unit.row(request)
         klass = request.klass or (row.klass if row is not None else "")
         telemetry = row.is_telemetry if row is not None else self._unit.is_telemetry(klass, request.id)
+        if not telemetry and not values and self._unit.serial.acknowledge is not None:
+            return Answer("malformed", data=taken.body)  # a text, but not the acknowledge
         kind: AnswerKind = "telemetry" if telemetry else "ack"
         if _refused(opened):
             kind = "nack"
@@ -278,8 +333,9 @@ class Headed:
         return Answer(kind, code, data, request.id, klass, 0, final, time_s, taken.body, number)
 
     def can_refuse(self, klass: str) -> bool:
-        """Return whether the header of a class has a status or an acknowledge bit."""
-        return bool(self.replies.roles(klass) & {"status", "ack"})
+        """Return whether there is a text for refusals, or the header of a class has a status or an acknowledge bit."""
+        refusal = self._unit.serial.refusal
+        return refusal is not None or bool(self.replies.roles(klass) & {"status", "ack"})
 
 
 def _refused(opened: Opened) -> bool:

@@ -10,11 +10,26 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.link_schema import MessageClass
+from starhil.protocol.link_schema import FixedFraming, LengthFraming, MessageClass
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import IcdError
 
 CLASS_SHIFT: Final = 8
 """Position of the class code, in bits."""
+
+
+def check_one_format(stack: SerialStack, target: str) -> None:
+    """Raise IcdError for a serial link with texts, several formats or byte stuffing, which code for a target does not have."""
+    framing = stack.link.framing
+    stuffed = isinstance(framing, LengthFraming | FixedFraming) and framing.stuffing is not None
+    for what, there in (
+        ("requests that are texts", stack.text_formats),
+        ("acknowledges and refusals that are texts", stack.link.acknowledge or stack.link.refusal),
+        ("several formats of messages (`format`)", stack.link.format),
+        ("byte stuffing", stuffed),
+    ):
+        if there:
+            raise IcdError(f"link.serial: {what} cannot be exported to {target}")
 
 
 def row_key(classes: Sequence[MessageClass], klass: str, row_id: int) -> int:

@@ -17,6 +17,7 @@ from starhil.protocol.export.templates import text_of
 from starhil.protocol.link_schema import (
     CountedMessage,
     CubeSpaceFraming,
+    FormatModel,
     HeaderFieldModel,
     SerialLinkModel,
 )
@@ -70,7 +71,7 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     if icd.link.serial is not None:
         cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
         serial = icd.link.serial
-        found.append(_serial(icd, serial) if cubespace else _composed(serial, icd.conventions.byte_order))
+        found.append(_serial(icd, serial) if cubespace else _composed(icd, serial))
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
@@ -127,7 +128,8 @@ def _errors(icd: InterfaceDefinition) -> Section:
     return _section("errors", ((f"{number} ({number:02X}h)", name) for name, number in numbers.items()))
 
 
-def _composed(link: SerialLinkModel, order: Order) -> Section:
+def _composed(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
+    order = icd.conventions.byte_order
     rows = (
         (message, *cells)
         for message, header in (("request", link.request_header), ("reply", link.reply_header))
@@ -135,7 +137,26 @@ def _composed(link: SerialLinkModel, order: Order) -> Section:
         for cells in _header_cells(field, order)
     )
     framing, check = _settings(link.framing), _settings(link.check)
-    return _section("composed", rows, baud=link.baud, framing=framing, check=check)
+    formats = " ".join(_format_text(item) for item in link.format)
+    texts = "; ".join(f"`{row.name}` by `{row.request}`" for row in icd.rows if row.request)
+    answers = [
+        f"{what} by the text `{text}`"
+        for what, text in (("acknowledged", link.acknowledge), ("refused", link.refusal))
+        if text is not None
+    ]
+    said = [f"Rows are requested by texts: {texts}."] * bool(texts)
+    said += [f"Requests are {' and '.join(answers)}."] * bool(answers)
+    return _section(
+        "composed", rows, baud=link.baud, framing=framing, check=check, formats=formats, texts=" ".join(said)
+    )
+
+
+def _format_text(item: FormatModel) -> str:
+    """Describe in a sentence which messages have another framing or check."""
+    whose = f" of class {' or '.join(item.classes)}" if item.classes else ""
+    what = {"request": "Requests", "reply": "Replies"}.get(item.direction or "", "Messages")
+    parts = (("framing", item.framing), ("check", item.check))
+    return f"{what}{whose}: {', '.join(f'{name} {_settings(model)}' for name, model in parts if model is not None)}."
 
 
 def _settings(model: BaseModel) -> str:

@@ -62,6 +62,26 @@ check = { kind = "crc", type = "u16", poly = 0x1021, init = 0xFFFF, reflect = tr
 request_header = [{ role = "id", type = "u8" }]
 reply_header = [{ role = "id", type = "u8" }, { role = "status", type = "u8" }]
 """,
+    "stuffed": """
+framing = { kind = "length", start = [0xF1], stuffing = { escape = 0xF0, mask = 0x0F } }
+check = { kind = "crc", type = "u8", poly = 0x07, covers = ["start", "header", "data"] }
+request_header = [{ role = "length", type = "u16" }, { role = "id", type = "u8" }]
+reply_header = [{ role = "length", type = "u16" }, { role = "id", type = "u8" }, { role = "status", type = "u8" }]
+""",
+    "formats": """
+framing = { kind = "delimited", start = [0x24], end = [0x0D, 0x0A], encoding = "hex" }
+check = { kind = "xor" }
+request_header = [{ role = "length", type = "u16" }, { role = "id", type = "u8" }]
+reply_header = [
+    { role = "length", type = "u16", includes = ["header", "data", "check"] },
+    { role = "id", type = "u8" }, { role = "status", type = "u8" },
+]
+
+[[link.serial.format]]
+direction = "reply"
+framing = { kind = "length", start = [0xEB, 0x90] }
+check = { kind = "crc", type = "u16", poly = 0x1021, init = 0xFFFF }
+""",
 }
 ROWS: Final = """
 [unit]

@@ -24,7 +24,7 @@ MUTANTS = read_mutants()
 SUITES = {"serial": serial_suite, "can": can_suite, "canopen": canopen_suite}
 MECHANISMS = (
     "checks", "framings", "headers", "scalar types", "scaling", "bits", "enumerations", "lengths", "segmentation",
-    "PDO mapping", "unsolicited telemetry",
+    "PDO mapping", "unsolicited telemetry", "byte stuffing", "formats", "texts",
 )  # fmt: skip
 
 

@@ -16,7 +16,7 @@ from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_mutants import MUTANTS
 
 GEN2 = "cubestar-gen2"
-UNITS = ("sagitta", "nos3", "st16", GEN2)
+UNITS = ("sagitta", "nos3", "st16", "st200", GEN2)
 SUITES = {"serial": serial_suite, "can": can_suite}
 ON_CAN = {case.id: case for case in can_suite(read_unit(GEN2))}
 MUTANTS_ON_CAN = [

@@ -8,7 +8,7 @@ from typing import Any, Final
 from starhil.protocol.checks import reversed_bits
 from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Header, HeaderField
-from starhil.protocol.export.packets import row_key
+from starhil.protocol.export.packets import check_one_format, row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
 from starhil.protocol.link_schema import (
     CrcCheck,
@@ -33,6 +33,7 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
 
     Raises IcdError for a part of the link that is Python code or not supported.
     """
+    check_one_format(stack, "C")
     framing = "counted" if stack.link.framing.kind in ("length", "fixed") else stack.link.framing.kind
     header = max(stack.request_header.size(name) for name in ("", *stack.classes.by_name))
     marks = len(stack.framing.start) + len(stack.framing.end) + _MARKS

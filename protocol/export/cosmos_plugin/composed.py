@@ -8,7 +8,7 @@ from pprint import pformat
 from typing import Any
 
 from starhil.protocol.envelope import Header
-from starhil.protocol.export.packets import CLASS_SHIFT, row_key
+from starhil.protocol.export.packets import CLASS_SHIFT, check_one_format, row_key
 from starhil.protocol.export.templates import part_of, text_of
 from starhil.protocol.link_schema import (
     CrcCheck,
@@ -33,6 +33,7 @@ def link_text(stack: SerialStack) -> str:
 
     Raises IcdError for a framing or check from a plugin.
     """
+    check_one_format(stack, "a COSMOS plugin")
     framing, check = stack.link.framing, stack.link.check
     for what, model in (("framing", framing), ("check", check)):
         if isinstance(model, CustomFraming | CustomCheck):

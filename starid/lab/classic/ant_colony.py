@@ -8,7 +8,7 @@ in the circle: an ant goes to the next star with a probability that grows with t
 its length, and leaves more pheromone the shorter its path is. The paths of all guide stars' circles are stored in
 order of length; a binary search finds those as long as the observed one, and the lengths of the single steps decide.
 
-own choice: the path begins at the centre of the circle, so that it has one sense, and 3 to 13 other stars are in the
+own choice: the path begins at the centre of the circle, so that it has one sense, and 2 to 13 other stars are in the
 circle, whose radius is 0.3 of the width of the field. As many ants as stars make 12 rounds; exponents 1 for
 pheromone and 5 for 1/length; the share that evaporates begins at a half and falls by a twentieth in each round
 without a shorter path. The random numbers are the same for all circles.
@@ -18,7 +18,7 @@ is a match.
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from starid.lab.classic.solver import ClassicIdentifier, Database, Observed
 RADIUS_SHARE: Final = 0.3
 """Radius of a circle as a share of the width of the field."""
 
-LEAST: Final = 4
+LEAST: Final = 3
 MOST: Final = 14
 """Least and largest number of stars in a circle, with its centre."""
 
@@ -127,9 +127,6 @@ def _search(guide: Paths, seen: Paths, tolerance: float) -> Indices:
 
 class AntColonyIdentifier(ClassicIdentifier):
     """The adaptive ant colony algorithm behind the common interface of all identifiers."""
-
-    min_group: ClassVar[int] = LEAST
-    min_stars: ClassVar[int] = LEAST
 
     def _build(self) -> Database:
         self._radius = RADIUS_SHARE * self.width_rad

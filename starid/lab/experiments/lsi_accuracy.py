@@ -62,7 +62,8 @@ def _maps(e: Evaluation, percents: list[float]) -> None:
     scales = [(f"p{p:g}", f"p = {p:g} %, 0° … {limit:g}°", limit) for p in mapped for limit in _MAP_SCALES]
     turned = f"p{e.parameters['roll_percent']:g}-roll"
     turns = [(f"{turned}{roll:g}", f"camera turned by {roll:g}°", 1.0) for roll in e.parameters["rolls"]]
-    figures = [(1, "mse", 2, scales), (2, "1se", 2, scales), (3, "mse", 1, turns)]
+    figures = [(1, "mse", 2, scales), (2, "1se", 2, scales)]
+    figures += [] if e.context.quick else [(3, "mse", 1, turns)]
     for (number, kind, columns, shown), grid in itertools.product(figures, (ON, OFF)):
         maps = [
             _map(title, e.results[f"{key}-{grid}"][f"f_author_{kind}"], limit) for key, title, limit in shown

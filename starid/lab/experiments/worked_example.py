@@ -107,17 +107,10 @@ def compute(context: Context, part: Part) -> Results:
 
 def _compare_estimate(e: Evaluation, result: Results, kind: str) -> None:
     word = _LABELS[kind]
-    corners = {
-        name: result[key] - HALF_FRAME_DEG
-        for name, key in (
-            ("author", f"author_boresight_{kind}"),
-            ("printed", f"boresight_{kind}"),
-            ("ours", "fine"),
-        )
-    }
-    errors: dict[str, Any] = {
-        name: float(boresight_error(corner[0], corner[1], *_CORNER)) for name, corner in corners.items()
-    }
+    author, printed, ours = (
+        result[name] - HALF_FRAME_DEG for name in (f"author_boresight_{kind}", f"boresight_{kind}", "fine")
+    )
+    errors = [float(boresight_error(corner[0], corner[1], *_CORNER)) for corner in (author, printed, ours)]
     e.compare(
         f"ω ({word}) of the nine cells",
         author=result[f"author_omega_{kind}"],
@@ -132,19 +125,10 @@ def _compare_estimate(e: Evaluation, result: Results, kind: str) -> None:
         author=result[f"author_epsilon_{kind}"],
         remark=f"On the normalised scale, as printed, {float(result[f'psi_{kind}']):.3f}.",
     )
-    e.compare(
-        f"corner of the estimated frame ({word}), α, δ", author=corners["author"], printed=corners["printed"]
-    )
+    e.compare(f"corner of the estimated frame ({word}), α, δ", author=author, printed=printed)
     error = f"error of the estimate ε_f ({word})"
-    e.compare(error, **errors)
-    e.compare(
-        f"{error}, sub-cell search of the whole database",
-        text=e.published(error)[0],
-        unit="°",
-        digits=4,
-        check="less",
-        ours=errors["ours"],
-    )
+    e.compare(error, author=errors[0], printed=errors[1], ours=errors[2])
+    e.compare(f"{error}, sub-cell search of the whole database", ours=errors[2])
 
 
 def evaluate(e: Evaluation) -> None:

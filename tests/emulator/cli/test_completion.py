@@ -34,7 +34,7 @@ def completed(monkeypatch: pytest.MonkeyPatch, shell: str, line: str) -> str:
         ("starhil run --scenario b", ["bad_day"]),
         ("starhil run --truth-", ["--truth-log"]),
         ("starhil session e", ["errors"]),
-        ("starhil unit describe s", ["sagitta", "st16"]),
+        ("starhil unit describe s", ["sagitta", "st16", "st200"]),
         ("starhil docs con", ["console", "control"]),
         ("starid identify --out", ["--output"]),
     ],

@@ -108,7 +108,39 @@ def test_sagitta_reads_as_its_flight_driver_writes():
     sent = line.encode(unit.request(unit.telemetry["solution"]))
     assert sent[:4].hex() == "c0210218"
     assert sent[-1] == 0xC0
-    assert line.framing.encode(b"\xc0\xdb\x00").hex() == "c0dbdcdbdd00c0"
+    assert line.request_format("")[0].encode(b"\xc0\xdb\x00").hex() == "c0dbdcdbdd00c0"
+
+
+def test_st200_reads_as_its_flight_driver_does():
+    """hyp_st200.c: commands end in CR, READY is a text, F1 begins a record, F0 03 is F3, CRC-8 with polynomial 07."""
+    unit = read_unit("st200")
+    line, record, command = SerialLine(unit), unit.telemetry["record"], unit.telecommands["set_keep_alive"]
+    assert line.encode(unit.request(record)) == b"show record\r"
+    assert line.encode(unit.request(command)) == b"set keep-alive off\r"
+    frame = bytes.fromhex("f10102") + bytes(8) + bytes.fromhex("f3") + bytes(39) + b"\x07"
+    register = 0
+    for byte in frame:
+        register ^= byte
+        for _ in range(8):
+            register = (register << 1 ^ (0x107 if register & 0x80 else 0)) & 0xFF
+    assert register < 0xF0
+    sent = frame.replace(b"\xf3", b"\xf0\x03") + bytes((register,))
+    for place in range(len(sent) + 1):
+        line.clear()
+        line.expect(unit.request(record))
+        damaged = sent[:place] + bytes(byte ^ 1 for byte in sent[place : place + 1]) + sent[place + 1 :]
+        kinds = [answer.kind for answer in line.feed(damaged)]
+        assert kinds == ["telemetry"] if damaged == sent else "telemetry" not in kinds, place
+    for text, kind in (
+        (b"READY\r\n", "ack"),
+        (b"READY \r\n", "malformed"),
+        (b"READY\n\r\n", "malformed"),
+        (b"ERROR 3\r\n", "nack"),
+        (b"ERROR x\r\n", "malformed"),
+    ):
+        line.clear()
+        line.expect(unit.request(command))
+        assert [answer.kind for answer in line.feed(text)] == [kind], text
 
 
 def test_nos3_answers_follow_the_echo_of_the_request():

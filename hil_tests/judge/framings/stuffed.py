@@ -1,0 +1,64 @@
+"""Byte stuffing without an end mark: the bytes of a range are sent as two (Hyperion ST200, libgs hyp_st200.c).
+
+    | start | body, E to E | M as E and its bits in M |          escape E, mask M
+      F1      41 F0 00 7F F0 03  (the body 41 F0 7F F3)           F0        0F
+
+The header byte is not stuffed; the size is that of the row, or given by the header.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from starhil.hil_tests.judge.framings import Measure, Taken, junk
+
+
+class Stuffed:
+    """`start`, the stuffed body of a known size, `end`."""
+
+    def __init__(self, model: Any) -> None:
+        self.start, self.end = bytes(model.start), bytes(model.end)
+        escape, mask = model.stuffing.escape, model.stuffing.mask
+        self._pairs = {
+            byte: bytes((escape, byte & mask)) for byte in range(256) if byte | mask == escape | mask
+        }
+        self._originals = {pair: byte for byte, pair in self._pairs.items()}
+        self._escape = escape
+        self.marks = self.start + bytes((escape, escape | mask)) + self.end
+
+    def encode(self, body: bytes) -> bytes:
+        """Return the stuffed body between its marks."""
+        return self.start + b"".join(self._pairs.get(byte, bytes((byte,))) for byte in body) + self.end
+
+    def take(self, received: bytearray, measure: Measure) -> Taken | None:
+        """Remove a message that must begin at once; a byte of the range that is not stuffed makes it junk."""
+        begun = bytes(received[: len(self.start)])
+        if begun != self.start[: len(begun)]:
+            return junk(received)
+        body, position = bytearray(), len(self.start)
+        while True:
+            try:
+                size = measure(bytes(body))
+            except ValueError:
+                return junk(received)
+            if size is not None and len(body) >= size:
+                break
+            pair = bytes(received[position : position + 2])
+            if not pair or (pair[0] == self._escape and len(pair) < 2):
+                return None
+            if pair in self._originals:
+                body.append(self._originals[pair])
+                position += 2
+            elif pair[0] in self._pairs:
+                return junk(received)
+            else:
+                body.append(pair[0])
+                position += 1
+        whole = position + len(self.end)
+        if len(received) < whole:
+            return None
+        ends_well = bytes(received[position:whole]) == self.end
+        if not ends_well:
+            return junk(received)
+        del received[:whole]
+        return Taken(bytes(body))
