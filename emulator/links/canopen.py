@@ -29,7 +29,7 @@ from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
-from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
+from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import Reply
@@ -343,5 +343,5 @@ def open_canopen(
     requests: Requests, transport: Transport[CanFrame], state_dir: Path | None, seed: int
 ) -> CanopenLink:
     """Return a link that stores its parameters in `state_dir`, or in memory if this is None."""
-    storage = MemoryStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
+    storage = ParameterStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
     return CanopenLink(requests, transport, storage, seed)
