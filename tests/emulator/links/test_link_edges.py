@@ -10,7 +10,7 @@ from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
-from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen import ParameterStorage, StorageError
@@ -34,7 +34,7 @@ def test_each_corrupted_item_is_counted_once_and_shown_as_it_is_sent():
     clock = SteppedClock()
     faults = WireFaults(sent.append, SerialDamage(), clock, Scheduler(), seed=1)
     faults.listener = seen.append
-    faults.settings = WireFaultSettings(corrupt=1.0)
+    faults.settings = WireFault(corrupt=1.0)
     for _ in range(3):
         faults.send(bytes(4))
     assert faults.corrupted == 3
