@@ -23,7 +23,7 @@ from starhil.protocol.canopen.communication import (
     set_limits,
     variable,
 )
-from starhil.protocol.canopen.dictionary import Deferred, Dictionary, decode, encode, type_size
+from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Value, encode, type_size
 from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
@@ -76,6 +76,8 @@ def placements(icd: InterfaceDefinition, placed: PlacedObject) -> Iterator[Place
     if placed.requests:
         for row in icd.rows:
             yield _request(row, (index, row.id))
+    elif placed.telemetry is not None and placed.type is not None:
+        yield _whole(icd, placed, icd.telemetry[placed.telemetry], DATA_TYPES[placed.type])
     elif placed.telemetry is not None:
         yield from _record(icd, placed, icd.telemetry[placed.telemetry])
     elif placed.parameters:
@@ -101,6 +103,21 @@ def _request(row: Row, key: Key) -> Placement:
     item = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
     item.description = row.doc
     return Placement(item, (row.name,), Reading(row))
+
+
+def _whole(icd: InterfaceDefinition, placed: PlacedObject, row: Row, data_type: int) -> Placement:
+    """Return the entry that holds all data of a telemetry row, and executes a telecommand when written."""
+    if type_size(data_type) != row.size:
+        raise IcdError(
+            f"canopen.toml: {placed.index:04X}h: {row.name} has {row.size} bytes, not the size of {placed.type}"
+        )
+    key, command = (placed.index, 0), None
+    item = variable(placed.name, *key, data_type, "ro", mappable=True)
+    if placed.telecommand is not None:
+        command = icd.telecommands[placed.telecommand]
+        item = _command(placed.name, key, command, placed.type).variable
+        item.access_type = "rw"
+    return Placement(item, (placed.name,), Reading(row), telecommand=command)
 
 
 def _record(icd: InterfaceDefinition, placed: PlacedObject, row: Row) -> Iterator[Placement]:
@@ -240,25 +257,9 @@ def _slot_of(icd: InterfaceDefinition, reference: str) -> tuple[Row, Slot, list[
 
 
 class DeviceDictionary(Dictionary):
-    """Object dictionary of a device, built from its interface definition.
+    """Object dictionary of a device, built from its interface definition and the indices of its layout.
 
-    Parameters
-    ----------
-    icd
-        The interface definition.
-    layout
-        Indices of its rows, fields and parameters.
-    application
-        Device behind the dictionary; none for one that is only described, so that nothing reads it.
-
-    Attributes
-    ----------
-    readings
-        Key of an entry → the part of a telemetry row that it reads.
-    sources
-        Telemetry row → keys of the entries that contain it.
-    parameters
-        Parameter → key of its entry.
+    Without an application it is only described: nothing may read or write the entries of a device.
     """
 
     def __init__(
@@ -269,6 +270,7 @@ class DeviceDictionary(Dictionary):
         self.application = cast("Application", application)
         self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
+        """Telemetry row → keys of the entries that contain it."""
         self.parameters: dict[str, Key] = {}
         self._names: dict[str, Key] = {}
         self._placed: dict[tuple[str, str, int | None], Key] = {}
@@ -379,7 +381,7 @@ class DeviceDictionary(Dictionary):
         if reading.slot is None:
             return data
         if reading.packed is not None:
-            return _pack(reading, reading.packed, reading.slot, data)
+            return encode(item.variable, _narrowed(reading, reading.packed, reading.slot, data))
         value = in_order(reading.slot, data[span_of(reading.slot)])
         return value.rstrip(b"\0") if item.variable.data_type == datatypes.VISIBLE_STRING else value
 
@@ -405,20 +407,20 @@ class DeviceDictionary(Dictionary):
 
     def _read_parameter(self, item: Placement, parameter: Parameter) -> bytes:
         value = parameter.to_number(self.application.parameter(parameter.name))
-        return encode(item.variable.data_type or 0, value)
+        return encode(item.variable, value)
 
     def _write_parameter(self, item: Placement, parameter: Parameter, data: bytes) -> None:
         try:
-            value = parameter.check(decode(item.variable.data_type or 0, data))
+            value = parameter.check(cast("Value", item.variable.decode_raw(data)))
         except MessageError as error:
             raise abort_of(error) from None
         self.application.set_parameter(parameter.name, value)
 
     def _read_image(self, item: Placement, name: str, attribute: str) -> bytes:
-        return encode(item.variable.data_type or 0, getattr(self.application.image(name), attribute))
+        return encode(item.variable, getattr(self.application.image(name), attribute))
 
 
-def _pack(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> bytes:
+def _narrowed(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> int:
     """Return a field of a telemetry row as a narrower integer."""
     field = reading.fields[0]
     if field.width:
@@ -434,7 +436,7 @@ def _pack(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> byt
     if packed.wrap:
         raw &= (1 << bits) - 1
     low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if packed.type[0] == "i" else (0, (1 << bits) - 1)
-    return encode(DATA_TYPES[packed.type], min(max(raw, low), high))
+    return min(max(raw, low), high)
 
 
 def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:

@@ -5,6 +5,7 @@ import pytest
 from starhil.emulator.device.cycle import MAX_PENDING
 from starhil.emulator.device.quantities import getter_of
 from starhil.emulator.device.snapshot import Snapshot
+from starhil.emulator.pipeline.messages import Failure
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth
 from starhil.protocol.messages import ErrorCode
@@ -146,3 +147,19 @@ def test_the_age_of_a_frame_counts_from_the_middle_of_its_exposure(bench):
     age_s = (bench.clock.now_ns() - measured.mid_ns) / 1e9
     assert getter_of("frame.age")(Snapshot(bench.device)) == age_s
     assert 0.0 < age_s < 2.5
+
+
+def test_a_pipeline_that_fails_makes_frames_invalid_and_is_logged_once_until_it_works_again(bench, caplog):
+    good, answers = bench.pipeline.handle, []
+
+    def submit(request, done):
+        done(answers[0] if answers else good(request))
+
+    bench.imager.submit = submit
+    bench.command("set_mode", mode="lost_in_space")
+    for answer, valid in ((Failure("out of memory"), False), (None, True), (Failure("out of memory"), False)):
+        answers[:] = [] if answer is None else [answer]
+        bench.step(3.0)
+        reading = bench.read("precise_attitude")
+        assert (reading["valid"], reading["reason"]) == (valid, "ok" if valid else "processing_error")
+    assert caplog.text.count("out of memory") == 2

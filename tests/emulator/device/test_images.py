@@ -9,7 +9,7 @@ import pytest
 
 from starhil.emulator.device.file_download import msdos_time
 from starhil.emulator.device.images import StoredImage
-from starhil.emulator.pipeline.messages import Failure
+from starhil.emulator.pipeline.messages import Failure, ImageRequest, ImageResult
 from starhil.protocol.messages import ErrorCode, ReplyKind, Request
 
 
@@ -341,3 +341,51 @@ def test_packets_of_a_burst_are_read_one_by_one(bench):
     bench.command("set_hole_map_1", map=bytes((0b101,)) + bytes(15))
     bench.send("start_burst")
     assert bench.read("file_packet")["number"] == 1
+
+
+@pytest.fixture
+def held(bench, monkeypatch):
+    """Hold back what the pipeline is asked from now on; return the requests, each with its callback."""
+    requests = []
+    monkeypatch.setattr(
+        bench.imager, "submit", lambda request, done: requests.append((request, done)), raising=False
+    )
+    return requests
+
+
+def images(requests):
+    """Let the pipeline answer the requests for images."""
+    for request, done in requests:
+        if isinstance(request, ImageRequest):
+            done(ImageResult(request.edge, request.edge, 7, bytes(request.edge**2)))
+
+
+def test_an_image_that_the_pipeline_delivers_late_is_stored_when_it_comes(bench, held):
+    assert bench.command("save_image", image_size="size_64") is ErrorCode.OK
+    bench.step(5.0)
+    assert bench.read("image_status")["status"] != "ok"
+    images(held)
+    assert bench.read("image_status") == {"percent": 100, "status": "ok"}
+    assert bench.device.images.stored.frame == 7
+
+
+@pytest.mark.parametrize("wait_s", [0.05, 0.7, 5.0])
+def test_a_reset_ends_a_capture_and_what_comes_of_it_later_is_dropped(bench, held, wait_s):
+    bench.command("save_image", image_size="size_64")
+    bench.step(wait_s)
+    bench.device.reset("watchdog")
+    bench.step(5.0)
+    images(held)
+    bench.step(5.0)
+    assert bench.device.images.stored is None
+    assert not bench.device.images.busy
+
+
+def test_no_chunk_is_loaded_while_the_image_is_being_opened(bench, held):
+    bench.command("set_mode", mode="lost_in_space")
+    open_last = bench.device.images.open_last(64)
+    assert bench.command("advance_image_download", next_frame=0) is ErrorCode.BUSY
+    bench.step(5.0)
+    images(held)
+    assert bench.command("advance_image_download", next_frame=0) is ErrorCode.OK
+    assert open_last.done

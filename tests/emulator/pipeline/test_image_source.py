@@ -16,11 +16,11 @@ from starhil.emulator.pipeline.messages import (
     Failure,
     FrameRequest,
     ImageRequest,
-    PipelineReady,
     SolverSettings,
+    camera_constants,
 )
 from starhil.emulator.pipeline.pipeline import Pipeline, make_pipeline
-from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
@@ -68,7 +68,7 @@ def profile(tmp_path, photographs):
 def request(pipeline: Pipeline, profile: Profile, index: int) -> FrameRequest:
     icd = load_unit()
     parameters = Parameters(icd, profile_defaults(profile, icd))
-    parameters.adopt_defaults(camera_constants(PipelineReady(pipeline.camera.to_dict(), 0, 0.0)))
+    parameters.adopt_defaults(camera_constants(pipeline.camera.to_dict()))
     settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
     return FrameRequest(index, NOWHERE, 0.5, 1.0, settings=settings)
 
@@ -97,7 +97,8 @@ def test_without_repeat_the_images_are_used_up(profile):
     assert "the 3 images" in failed.text
 
 
-def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photographs):
+def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photographs, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     dark = np.full(photographs[0].shape, 40, np.uint16)
     dark[100:110, 200:210] = 90
     write_image(tmp_path / "dark.png", dark)
@@ -118,7 +119,10 @@ def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photograp
         ("images.dark=other.png", "dark frame of 20×20"),
     ],
 )
-def test_images_that_cannot_serve_fail_the_start_in_one_line(profile, tmp_path, setting, message):
+def test_images_that_cannot_serve_fail_the_start_in_one_line(
+    profile, tmp_path, setting, message, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     write_image(tmp_path / "other.png", np.arange(400, dtype=np.uint16).reshape(20, 20))
     failed = make_pipeline(pipeline_setup(load_profile(str(profile), [setting])))

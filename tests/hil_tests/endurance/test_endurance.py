@@ -324,3 +324,21 @@ def test_an_error_that_both_ends_of_the_codec_share_is_found(monkeypatch):
     monkeypatch.setattr(Row, "decode", lambda row, data, **options: decode(row, data[::-1], **options))
     status = load_unit("cubestar").telemetry["device_status"]
     assert violation_of(request_on("serial", status)).startswith("device_status.")
+
+
+def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
+    (tmp_path / "unit.toml").write_text(
+        '[unit]\nname = "x"\nversion = "1"\ndoc = "d"\nprovenance = "ours"\n'
+        '[[telemetry]]\nid = 2\nname = "now"\ndoc = "d"\nfields = [{ name = "m", type = "enum8", enum = "mode", value = "mode" }]\n'
+        '[link.serial]\nframing = { kind = "slip" }\ncheck = { kind = "xor" }\n'
+        'request_header = [{ role = "id", type = "u8" }]\n'
+        'reply_header = [{ role = "id", type = "u8" }, { role = "status", type = "u8" }]\n'
+    )
+    icd = load_unit(tmp_path)
+    life = make_life(icd, str(tmp_path), links_of(icd), 1, 200)
+    sent = [step for step in life.steps if step["do"] == "request"]
+    assert sum(step["row"] == ["", 2, "telemetry"] for step in sent) > 50
+    assert "nmt" not in {step["do"] for step in life.steps}
+    outcome = run_once(life)
+    assert outcome.violation == ""
+    assert outcome.readings > 20

@@ -1,0 +1,171 @@
+"""Which cases run, what becomes of their outcomes, and what of them is printed."""
+
+from __future__ import annotations
+
+import io
+
+import pytest
+from rich.console import Console
+
+from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
+from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, all_cases
+from starhil.hil_tests.conformance.report import print_outcome, print_summary
+from starhil.hil_tests.conformance.runner import Outcome, Verdict, run_case, run_cases, select_cases
+from starhil.hil_tests.errors import BenchError
+
+
+def case(case_id: str, run=lambda _probe: None, *, intrusive: bool = False) -> Case:
+    return Case(
+        case_id, case_id.rpartition(".")[0], f"title of {case_id}", "a clause", run, intrusive=intrusive
+    )
+
+
+CASES = [
+    case("serial.framing.start"),
+    case("serial.framing.end"),
+    case("serial.modes.set", intrusive=True),
+    case("can.id.type"),
+]
+
+
+@pytest.mark.parametrize(
+    ("patterns", "safe_only", "chosen"),
+    [
+        ([], False, [0, 1, 2, 3]),
+        ([], True, [0, 1, 3]),
+        (["serial.framing"], False, [0, 1]),
+        (["*.type", "serial.framing.end"], False, [1, 3]),
+        (["serial.m*"], True, []),
+    ],
+)
+def test_cases_are_chosen_by_names_and_patterns(patterns, safe_only, chosen):
+    assert select_cases(CASES, patterns, safe_only=safe_only) == [CASES[number] for number in chosen]
+
+
+def test_a_pattern_without_a_case_is_an_error_that_lists_the_areas():
+    with pytest.raises(
+        BenchError, match=r"no conformance case matches 'serial.frame'; areas: can.id, serial.framing"
+    ):
+        select_cases(CASES, ["serial.framing", "serial.frame"])
+
+
+@pytest.mark.parametrize(
+    ("request_", "links"),
+    [
+        ({"serial": "/dev/x"}, {"serial"}),
+        ({"can": "vcan0"}, {"can"}),
+        ({"can": "vcan0", "canopen_node": 44}, {"can", "canopen"}),
+        ({"unit": "oresat", "can": "vcan0", "canopen_node": 44}, {"canopen"}),
+    ],
+)
+def test_the_cases_are_those_of_the_links_that_are_given(request_, links):
+    assert {item.id.partition(".")[0] for item in all_cases(ConformanceRequest(**request_))} == links
+
+
+@pytest.mark.parametrize(
+    ("request_", "message"),
+    [
+        ({}, r"no link: use --serial DEV"),
+        ({"unit": "nos3", "can": "vcan0"}, "has no CAN link"),
+        ({"unit": "nos3", "serial": "x", "dialect": "b"}, "--dialect b: unit .* has no reply dialects"),
+    ],
+)
+def test_a_request_without_cases_is_rejected(request_, message):
+    with pytest.raises(BenchError, match=message):
+        all_cases(ConformanceRequest(**request_))
+
+
+class Probe:
+    """A probe of a device that passes everything but what a test sets."""
+
+    def __init__(self, **changed) -> None:
+        self.log: list[str] = []
+        self.calls: list[str] = []
+        self._changed = changed
+
+    def __getattr__(self, name):
+        def act(*_args, **_keys):
+            self.calls.append(name)
+            return self._changed[name]() if name in self._changed else None
+
+        return act
+
+
+def fail():
+    raise CaseFailed("nothing more", "another answer")
+
+
+def skip(_probe):
+    raise CaseSkipped("no such row")
+
+
+def test_a_case_that_passes_but_leaves_something_behind_fails():
+    outcome = run_case(Probe(end=fail), CASES[0])
+    assert (outcome.status, outcome.expected, outcome.seen) == ("failed", "nothing more", "another answer")
+
+
+def test_no_cases_are_no_run():
+    probe = Probe()
+    assert run_cases(probe, []) == []
+    assert probe.calls == []
+
+
+def test_settings_that_cannot_be_read_or_restored_are_outcomes_of_the_run():
+    outcomes = run_cases(Probe(prepare=fail, restore=fail), [CASES[2], case("serial.x.y", skip)])
+    assert [(outcome.id, outcome.status) for outcome in outcomes] == [
+        ("serial.settings.found", "failed"), ("serial.modes.set", "passed"), ("serial.x.y", "skipped"), ("serial.settings.kept", "failed"),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("seen", "text"),
+    [
+        ("nothing", "nothing answers on /dev/x"),
+        ("1F", "no star sensor answers on /dev/x: 1F; check --dialect, --baud and the addresses"),
+    ],
+)
+def test_a_device_that_does_not_answer_ends_the_run(seen, text):
+    outcomes = run_cases(Probe(silence=lambda: seen), CASES[:2], port="/dev/x")
+    assert [(outcome.status, outcome.seen) for outcome in outcomes] == [
+        ("failed", text),
+        *[("not run", f"not run: {text}")] * 2,
+    ]
+
+
+OUTCOMES = [
+    Outcome.of(CASES[number], verdict, 0.25)
+    for number, verdict in enumerate(
+        (
+            Verdict("passed"),
+            Verdict("failed", "an answer", "no\x1banswer"),
+            Verdict("skipped", seen="no such row"),
+            Verdict("not run", seen="not run: x"),
+        )
+    )
+]
+
+
+def printed(act) -> list[str]:
+    console = Console(file=io.StringIO(), width=200, color_system=None)
+    act(console)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+@pytest.mark.parametrize(("verbose", "marks"), [(True, "✓✗--"), (False, "✗-")])
+def test_a_line_for_each_case_says_what_was_expected_and_seen(verbose, marks):
+    lines = printed(
+        lambda console: [print_outcome(console, outcome, verbose=verbose) for outcome in OUTCOMES]
+    )
+    assert "".join(line[0] for line in lines if not line.startswith(" ")) == marks
+    assert "    expected an answer" in lines
+    assert any(line.startswith("    seen     no") and "\x1b" not in line for line in lines)
+    assert any(line.endswith("title of serial.modes.set [a clause]  no such row") for line in lines)
+
+
+def test_the_summary_counts_by_area():
+    head, *areas, total = printed(lambda console: print_summary(console, OUTCOMES))
+    assert head.split() == ["area", "cases", "passed", "failed", "skipped", "not", "run", "seconds"]
+    assert [line.split() for line in areas] == [
+        ["serial.framing", "2", "1", "1", "0", "0", "0.5"], ["serial.modes", "1", "0", "0", "1", "0", "0.2"], ["can.id", "1", "0", "0", "0", "1", "0.2"],
+    ]  # fmt: skip
+    assert total == "4 cases: 1 passed, 1 failed, 1 skipped, 1 not run"

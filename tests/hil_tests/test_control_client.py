@@ -1,0 +1,128 @@
+"""The client of the control channel: requests, rejections, a channel that ends, and the reset to power-on."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Callable
+
+import pytest
+
+from starhil.hil_tests import control
+from starhil.hil_tests.control import ControlClient, Truth
+from starhil.hil_tests.errors import BenchError
+
+Answer = Callable[[dict], dict | None]
+
+
+class Channel:
+    """A control channel whose requests a function answers; None closes it."""
+
+    def __init__(self, server: socket.socket, answer: Answer) -> None:
+        self.asked: list[dict] = []
+        self._server, self._answer = server, answer
+        threading.Thread(target=self._serve, daemon=True).start()
+
+    def _serve(self) -> None:
+        peer, _ = self._server.accept()
+        with peer, peer.makefile("rw") as lines:
+            for line in lines:
+                self.asked.append(json.loads(line))
+                reply = self._answer(self.asked[-1])
+                if reply is None:
+                    return
+                lines.write(json.dumps(reply) + "\n")
+                lines.flush()
+
+
+@pytest.fixture
+def channel():
+    """Serve one client over TCP; return the channel and its address."""
+    servers = []
+
+    def serve(answer: Answer) -> tuple[Channel, str]:
+        server = socket.create_server(("127.0.0.1", 0))
+        servers.append(server)
+        return Channel(server, answer), f"127.0.0.1:{server.getsockname()[1]}"
+
+    yield serve
+    for server in servers:
+        server.close()
+
+
+def test_a_request_is_a_line_and_its_answer_is_returned_without_its_flag(channel):
+    served, address = channel(lambda _request: {"ok": True, "mode": "standby"})
+    with ControlClient(address) as client:
+        assert client.do("status", of=1) == {"mode": "standby"}
+    assert served.asked == [{"do": "status", "of": 1}]
+
+
+def test_a_channel_on_a_socket_in_a_folder_is_used(tmp_path):
+    path = tmp_path / "control"
+    with socket.socket(socket.AF_UNIX) as server:
+        server.bind(str(path))
+        server.listen()
+        Channel(server, lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
+        with ControlClient(f"unix:{path}") as client:
+            assert Truth(client).attitude() == (0.0, 0.0, 0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        ({"ok": False, "error": "no such fault"}, "control channel: fault: no such fault"),
+        (None, "control channel: fault: closed by the emulator"),
+    ],
+)
+def test_a_rejection_and_the_end_of_the_channel_are_reported(channel, answer, message):
+    _, address = channel(lambda _request: answer)
+    with ControlClient(address) as client, pytest.raises(BenchError, match=message):
+        client.do("fault")
+
+
+@pytest.mark.parametrize("address", ["unix:/no/such/socket", "127.0.0.1:1"])
+def test_a_channel_that_is_not_there_is_reported(address):
+    with pytest.raises(BenchError, match=f"control channel {address}: "):
+        ControlClient(address)
+
+
+@pytest.mark.parametrize(("clock", "polls"), [("real", 3), ("stepped", 1)])
+def test_a_reset_ends_when_the_device_has_booted_which_takes_steps_of_a_stepped_clock(channel, clock, polls):
+    modes = iter(["boot", "boot", "standby"])
+
+    def answer(request):
+        return (
+            {"ok": True, "clock": clock, "mode": next(modes)} if request["do"] == "status" else {"ok": True}
+        )
+
+    served, address = channel(answer)
+    with ControlClient(address) as client:
+        client.reset()
+    assert [request["do"] for request in served.asked] == [
+        "clear_faults",
+        "set_truth",
+        "fault",
+        *["status"] * polls,
+    ]
+    assert served.asked[2]["device"] == {"reset": "power_on"}
+
+
+def test_a_device_that_does_not_boot_is_reported(channel, monkeypatch):
+    monkeypatch.setattr(control, "BOOT_WITHIN_S", 0.05)
+    _, address = channel(lambda _request: {"ok": True, "clock": "real", "mode": "boot"})
+    with ControlClient(address) as client, pytest.raises(BenchError, match=r"has not booted within 0\.05 s"):
+        client.reset()
+
+
+def test_the_truth_is_set_and_read_at_a_time(channel):
+    served, address = channel(lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
+    with ControlClient(address) as client:
+        truth = Truth(client)
+        truth.point(83.8, -1.2, 30.0)
+        assert truth.error([0.0, 0.0, 0.0, 1.0], 5.0).total_arcsec == 0.0
+    attitude = {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 30.0}
+    assert served.asked == [
+        {"do": "set_truth", "truth": {"kind": "fixed", "attitude": attitude}},
+        {"do": "truth", "unix_s": 5.0},
+    ]
