@@ -39,6 +39,7 @@ def test_truth_as_json_is_where_the_stars_are(
     options = ("--ra", "83.8", "--dec", "-1.2", "--roll", "30", "--seed", "1", "-o", str(target), "--json")
     assert run(monkeypatch, *options) == 0
     truth = json.loads(capsys.readouterr().out)
+    assert truth["exposure_s"] == 0.2
     attitude = Attitude.from_quaternion(truth["quaternion_xyzw"])
     assert (attitude.ra_deg, attitude.dec_deg, attitude.roll_deg) == pytest.approx((83.8, -1.2, 30.0))
     stars = np.array([[star["x_px"], star["y_px"]] for star in truth["stars"]])
