@@ -10,36 +10,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Final, Protocol
+from typing import Final, TypeAlias
 
 from starhil.emulator.errors import EmulatorError
 from starid.files import read_number
 
 NANOSECONDS: Final = 1_000_000_000
-"""Nanoseconds in a second."""
 
 MAX_SCALE: Final = 1000.0
-
-
-class Clock(Protocol):
-    """Source of the simulation time."""
-
-    @property
-    def name(self) -> str:
-        """Name of the clock on the command line."""
-
-    @property
-    def speed(self) -> float:
-        """Simulation time per wall time; 0 if time passes only on request."""
-
-    def now_ns(self) -> int:
-        """Return the simulation time, nanoseconds."""
-
-    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
-        """Let time pass since a time of the monotonic wall clock, up to `limit_ns`; before this, it is zero."""
-
-    def start(self) -> None:
-        """Let time pass without a limit."""
 
 
 class ScaledClock:
@@ -49,6 +27,7 @@ class ScaledClock:
         if not 0.0 < speed <= MAX_SCALE:
             raise EmulatorError(f"clock: scale {speed:g} is outside 0 … {MAX_SCALE:g}; try scaled:10")
         self.speed = speed
+        """Simulation time per wall time; 0 if time passes only on request."""
         self._origin_ns = 0
         self._limit_ns: int | None = 0
 
@@ -110,7 +89,36 @@ class SteppedClock:
         self._now_ns = now_ns
 
 
-def make_clock(text: str) -> RealClock | ScaledClock | SteppedClock:
+class LatchedClock:
+    """A clock that stops while an entry of a tape is processed."""
+
+    def __init__(self, source: ScaledClock) -> None:
+        self.source = source
+        self.name = source.name
+        self.speed = source.speed
+        self._now_ns = 0
+
+    def now_ns(self) -> int:
+        """Return the time of the last entry, nanoseconds."""
+        return self._now_ns
+
+    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
+        """Switch on the running clock."""
+        self.source.switch_on(wall_ns, limit_ns)
+
+    def start(self) -> None:
+        """Start the running clock."""
+        self.source.start()
+
+    def latch(self) -> None:
+        """Set this clock to the current time."""
+        self._now_ns = self.source.now_ns()
+
+
+Clock: TypeAlias = ScaledClock | SteppedClock | LatchedClock
+
+
+def make_clock(text: str) -> ScaledClock | SteppedClock:
     """Return the clock named `real`, `scaled:FACTOR` or `stepped`."""
     kind, _, factor = text.partition(":")
     if text == "real":
@@ -130,7 +138,6 @@ class DeviceTime:
     """Unix time of the device: simulation time plus an offset, which telecommand 2 sets."""
 
     clock: Clock
-    """Source of the simulation time."""
     offset_ns: int = 0
     """Unix time at simulation time zero, nanoseconds."""
     was_set: bool = False

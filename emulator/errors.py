@@ -5,8 +5,24 @@ A docstring mentions it only where the reader needs to know more than that.
 
 from __future__ import annotations
 
-from starhil.protocol.errors import OneLineError
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from starhil.protocol.errors import OneLineError, reason
 
 
 class EmulatorError(OneLineError):
     """Invalid input or an unusable file or port; the message is one line with what, where and the remedy."""
+
+
+@contextmanager
+def explained(
+    what: str, remedy: str = "", *, errors: tuple[type[Exception], ...] = (OSError,)
+) -> Iterator[None]:
+    """Raise an error of the system as one line, `what (reason); remedy`; an invalid host or path is a ValueError."""
+    try:
+        yield
+    except errors as error:
+        is_of_file = isinstance(error, OSError) and error.filename is not None
+        why = getattr(error, "strerror", None) if is_of_file else reason(error)
+        raise EmulatorError(f"{what} ({why})" + (f"; {remedy}" if remedy else "")) from None

@@ -11,20 +11,14 @@ from starhil.emulator.device.device import Device
 from starhil.emulator.device.parameters import memory_bits
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.base import Link
-from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values if they are valid fields of `SkyObjects`.
-
-    Raises
-    ------
-    ValueError
-        A field is invalid; the message names it and the allowed values.
-    """
+    """Return the values if they are valid fields of `SkyObjects`; ValueError names the field and the allowed values."""
     try:
         SkyObjects.from_dict(values)
     except EmulatorError as error:
@@ -34,10 +28,6 @@ def check_sky(values: dict[str, Any]) -> dict[str, Any]:
 
 SkyValues = Annotated[dict[str, Any], AfterValidator(check_sky)]
 """Fields of `SkyObjects` as decoded from TOML or JSON."""
-
-Probability = Annotated[float, Field(ge=0.0, le=1.0)]
-Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
-
 
 NO_ERROR: Final = 0
 """Value in `device_error` that means no error."""
@@ -75,27 +65,6 @@ class DeviceFault(Strict):
     """Flip a bit in memory; undone by a restart or by restoring the parameters."""
 
 
-class WireFault(Strict):
-    """Faults of a link; see `WireFaultSettings`."""
-
-    drop: Probability = 0.0
-    """Probability that an outgoing serial reply or CAN frame is lost."""
-    corrupt: Probability = 0.0
-    """Probability that one of its bits is flipped."""
-    junk: Probability = 0.0
-    """Probability that random bytes, or a CAN frame with a random CAN ID, are sent before it."""
-    delay_s: Seconds = 0.0
-    """Delay of everything that is sent."""
-    split: Annotated[int, Field(ge=0, le=4096)] = 0
-    """Size of the chunks in which serial replies are sent; 0: not split."""
-    gap_s: Seconds = 0.02
-    """Pause between the chunks."""
-
-    def settings(self) -> WireFaultSettings:
-        """Return the settings for a link."""
-        return WireFaultSettings(**self.model_dump())
-
-
 class FaultRequest(Strict):
     """One `fault` request; omitted levels keep their faults."""
 
@@ -110,18 +79,11 @@ class FaultRequest(Strict):
 
 
 class Faults:
-    """The currently injected faults.
-
-    Parameters
-    ----------
-    links
-        The links of the device, also those that are opened later.
-    """
+    """The currently injected faults, also of links that are opened later."""
 
     def __init__(self, device: Device, links: Sequence[Link]) -> None:
         self._device = device
         self._links = links
-        self._optical: dict[str, Any] = {}
 
     @property
     def _wires(self) -> list[tuple[str, WireFaults[Any]]]:
@@ -132,13 +94,12 @@ class Faults:
         self.check(request)
         device = self._device
         if request.optical is not None:
-            self._optical = dict(request.optical)
-            device.surroundings.set_faults(self._optical)
+            device.surroundings.faults = dict(request.optical)
         faults = {"serial": request.serial, "can": request.can}
         for name, wire in self._wires:
             fault = faults[name]
             if fault is not None:
-                wire.settings = fault.settings()
+                wire.settings = fault
         if request.device is not None:
             device.unresponsive = request.device.stuck
             if request.device.reset is not None:
@@ -146,14 +107,12 @@ class Faults:
             if request.device.error is not None:
                 device.modes.fail(request.device.error)
             if request.device.upset is not None:
-                self._upset(request.device.upset)
+                upset = request.device.upset
+                if upset.parameter is not None:
+                    device.upset_parameter(upset.parameter, upset.bit)
+                elif upset.star is not None:
+                    device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
         device.signals.faults_changed.emit(request.model_dump(mode="json", exclude_unset=True))
-
-    def _upset(self, upset: UpsetFault) -> None:
-        if upset.parameter is not None:
-            self._device.upset_parameter(upset.parameter, upset.bit)
-        elif upset.star is not None:
-            self._device.cycle.upset_catalog(CatalogUpset(upset.star, upset.component, upset.bit))
 
     def check(self, request: FaultRequest) -> None:
         """Check that the faults of a request can be injected."""
@@ -191,20 +150,19 @@ class Faults:
 
     def clear(self) -> None:
         """End all faults; the error mode ends only by telecommand, and flipped parameters by a restart."""
-        self._optical = {}
         device = self._device
-        device.surroundings.set_faults({})
+        device.surroundings.faults = {}
         device.unresponsive = False
         device.cycle.restore_catalog()
         for _, wire in self._wires:
-            wire.settings = WireFaultSettings()
+            wire.settings = WireFault()
         device.signals.faults_changed.emit({})
 
     def describe(self) -> dict[str, Any]:
         """Return the current faults by level."""
         found: dict[str, Any] = {}
-        if self._optical:
-            found["optical"] = dict(self._optical)
+        if self._device.surroundings.faults:
+            found["optical"] = self._device.surroundings.faults
         if self._device.unresponsive:
             found["device"] = {"stuck": True}
         if self._device.cycle.upsets:
@@ -212,5 +170,5 @@ class Faults:
             found.setdefault("device", {})["upset_stars"] = stars
         for name, wire in self._wires:
             if not wire.settings.none:
-                found[name] = vars(wire.settings)
+                found[name] = wire.settings.model_dump()
         return found

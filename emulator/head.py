@@ -32,9 +32,8 @@ from starhil.emulator.links.base import Link
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.links.traffic import Traffic
-from starhil.emulator.pipeline.imager import PipelineImager
-from starhil.emulator.pipeline.messages import PipelineReady
-from starhil.emulator.pipeline_setup import camera_constants
+from starhil.emulator.pipeline.messages import PipelineReady, camera_constants
+from starhil.emulator.pipeline_setup import PipelineImager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import ClockPump
 from starhil.emulator.revival import PipelineRevival
@@ -54,16 +53,9 @@ log = logging.getLogger("starhil.run")
 
 
 class Head:
-    """One device of a run.
+    """One device of a run, with its pipeline, which is not started yet, and the truth of the body on which it is mounted.
 
-    Parameters
-    ----------
-    imager
-        Its pipeline, which is not started yet.
-    truth
-        Truth of the body on which the head is mounted.
-    on_warm
-        Called when the pipeline is ready, also after a restart.
+    `on_warm` is called when the pipeline is ready, also after a restart.
     """
 
     def __init__(
@@ -229,7 +221,7 @@ class Head:
     def pipeline_ready(self, warm: PipelineReady) -> None:
         """Pass the camera of a ready pipeline to the device."""
         self.warm = warm
-        self.device.pipeline_ready(camera_constants(warm))
+        self.device.pipeline_ready(camera_constants(warm.camera))
         self._on_warm()
 
     def start_time(self) -> None:

@@ -13,15 +13,7 @@ class RepeatedKeyError(ValueError):
 
 
 def parse_json(line: bytes | str) -> Any:
-    """Decode one line.
-
-    Raises
-    ------
-    RepeatedKeyError
-        An object has a key twice; the message names it.
-    ValueError, RecursionError
-        The line is not JSON.
-    """
+    """Decode one line; RepeatedKeyError names a repeated key, ValueError and RecursionError mean that it is not JSON."""
     return json.loads(line, object_pairs_hook=_without_repeats)
 
 
@@ -39,20 +31,8 @@ async def read_lines(
 ) -> AsyncIterator[bytes | None]:
     """Yield each line until the peer closes; None for a line above the reader's limit, which is dropped.
 
-    Parameters
-    ----------
-    reader
-        Stream of lines.
-    end
-        Line terminator; one byte if `within_s` is given.
-    within_s
-        Time within which a line that has begun must be complete, seconds; a peer may be silent between lines. The first
-        byte of a line is read apart then and does not count towards the reader's limit.
-
-    Raises
-    ------
-    TimeoutError
-        A line was not complete in time.
+    A line that has begun must be complete within `within_s` seconds, or TimeoutError is raised; a peer may be silent between
+    lines. The terminator is then one byte, and the first byte of a line does not count towards the reader's limit.
     """
     too_long = False
     while True:

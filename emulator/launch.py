@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starhil.emulator.clock import make_clock
-from starhil.emulator.console.obc import MakeClient, ObcClient
+from starhil.emulator.console.obc import MakeClient
 from starhil.emulator.control.channel import ControlServer
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.errors import EmulatorError
@@ -57,12 +57,7 @@ class RunOptions:
 class Emulator:
     """A run with truth logs, recording, scenario, control channel and console.
 
-    Parameters
-    ----------
-    profiles
-        Profiles of the heads; truth and clock are those of the first.
-    worker
-        Pipeline worker that was started earlier; by default one is started here.
+    Truth and clock are those of the first profile. A pipeline worker may have been started earlier.
     """
 
     def __init__(
@@ -70,16 +65,15 @@ class Emulator:
         profiles: Sequence[Profile],
         options: RunOptions | None = None,
         worker: WorkerProcess | None = None,
+        wiring: Wiring | None = None,
     ) -> None:
         check_heads(profiles)
         self.options = options = options or RunOptions()
-        wiring = None
         if options.record is not None:
             if len(profiles) > 1:
                 raise EmulatorError("--record: records one head; run the others separately, or omit it")
-            wiring = Recorder(options.record, Wiring(make_clock(profiles[0].run.clock)))
+            wiring = Recorder(options.record, wiring or Wiring(make_clock(profiles[0].run.clock)))
         self.run = Run(profiles, wiring, worker, previews=options.watched)
-        """Clock, truth and heads."""
         self.ended = asyncio.Event()
         """Set to end the run."""
         self.control: ControlServer | None = None
@@ -101,7 +95,7 @@ class Emulator:
     async def start(self) -> None:
         """Open files, links and control channel, switch the devices on and start time."""
         with self._rejecting():
-            await self._start()
+            await self._start(self.options, self.run)
 
     @contextmanager
     def _rejecting(self) -> Iterator[None]:
@@ -111,8 +105,7 @@ class Emulator:
             self._rejected = True
             raise
 
-    async def _start(self) -> None:
-        options, run = self.options, self.run
+    async def _start(self, options: RunOptions, run: Run) -> None:
         if run.recorder is not None:
             from starhil.emulator.replay import prepare_recording
 
@@ -191,39 +184,31 @@ class Emulator:
         make_client = self.options.make_client
         clients = [await open_obc(head, make_client, self._closers) for head in self.run.heads]
         if self.options.mcap is not None:
-            self._open_recorders(self.options.mcap, clients)
+            from starhil.emulator.console.recorder import McapRecorder
+
+            for head, client in zip(self.run.heads, clients, strict=True):
+                path = path_of_head(self.options.mcap, head.number)
+                recorder = McapRecorder(head, client, path, overwrite=self.options.overwrite)
+                self._closers.append(recorder.close)
+                self._files.append(recorder.file)
+                recorder.start()
         if self.options.view != "off":
-            await self._open_server(control, clients)
+            from starhil.emulator.console.console import Console
+            from starhil.emulator.console.runs import Runs
+            from starhil.emulator.console.server import ConsoleServer
+            from starhil.emulator.console.stepping import StepRunner
 
-    def _open_recorders(self, path: Path, clients: Sequence[ObcClient]) -> None:
-        """Start recording each head to its own MCAP file."""
-        from starhil.emulator.console.recorder import McapRecorder
-
-        for head, client in zip(self.run.heads, clients, strict=True):
-            own_path = path_of_head(path, head.number)
-            recorder = McapRecorder(head, client, own_path, overwrite=self.options.overwrite)
-            self._closers.append(recorder.close)
-            self._files.append(recorder.file)
-            recorder.start()
-
-    async def _open_server(self, control: ControlServer, clients: Sequence[ObcClient]) -> None:
-        """Serve a console for each head."""
-        from starhil.emulator.console.console import Console
-        from starhil.emulator.console.runs import Runs
-        from starhil.emulator.console.server import ConsoleServer
-        from starhil.emulator.console.stepping import StepRunner
-
-        stepping, runs = StepRunner(control.execute), Runs()
-        self._closers.append(stepping.pause)
-        consoles = []
-        for head, client in zip(self.run.heads, clients, strict=True):
-            console = Console(self.run, head, client, stepping, runs)
-            self._closers.append(console.close)
-            console.start()
-            consoles.append(console)
-        server = ConsoleServer(consoles, self.options.view_token)
-        self._closers.append(server.close)
-        self.ready_fields |= await server.start(self.options.view)
+            stepping, runs = StepRunner(control.execute), Runs()
+            self._closers.append(stepping.pause)
+            consoles = []
+            for head, client in zip(self.run.heads, clients, strict=True):
+                console = Console(self.run, head, client, stepping, runs)
+                self._closers.append(console.close)
+                console.start()
+                consoles.append(console)
+            server = ConsoleServer(consoles, self.options.view_token)
+            self._closers.append(server.close)
+            self.ready_fields |= await server.start(self.options.view)
 
 
 def path_of_head(path: Path, number: int) -> Path:

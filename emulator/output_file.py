@@ -46,14 +46,8 @@ class Output:
 class OutputFile:
     """A file of complete, unbuffered records; only one emulator at a time can write to it. If it is rejected, it is unchanged.
 
-    Parameters
-    ----------
-    name
-        What the file is, for messages: `truth log`.
-    path
-        The file; created if it does not exist.
-    output
-        The output of which this file is a part; after a failure, no part is written. By default it is the whole.
+    The name says what it is, for messages: `truth log`. It may be part of a larger output, of which nothing is
+    written after a failure.
     """
 
     def __init__(

@@ -13,17 +13,7 @@ PR_SET_PDEATHSIG: Final = 1
 def end_with_parent(parent: int | None = None, number: int = signal.SIGKILL) -> None:
     """Have the kernel send this process a signal when the thread that started it ends.
 
-    Parameters
-    ----------
-    parent
-        Process ID of the expected parent. If it ended before this call, the signal is raised here.
-    number
-        Signal number.
-
-    Raises
-    ------
-    OSError
-        `prctl` failed.
+    If the process `parent` ended before this call, the signal is raised here. OSError if `prctl` failed.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, int(number)) != 0:

@@ -1,14 +1,18 @@
-"""The image pipeline of a profile, and the camera constants that it reports."""
+"""The image pipeline of a profile."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TypeAlias
 
-from starhil.emulator.pipeline.imager import PipelineImager, ProcessImager, ThreadImager
-from starhil.emulator.pipeline.messages import PipelineReady, PipelineSetup
-from starhil.emulator.pipeline.worker_process import WorkerProcess
+from starhil.emulator.pipeline.error_model import ErrorModelImager
+from starhil.emulator.pipeline.imager import WorkerImager
+from starhil.emulator.pipeline.messages import PipelineSetup
+from starhil.emulator.pipeline.worker_process import WorkerProcess, WorkerThread
 from starhil.emulator.profile import Profile
-from starhil.protocol.values import Value
+
+PipelineImager: TypeAlias = WorkerImager | ErrorModelImager
+"""An image pipeline that can be started, and started again after an unexpected end."""
 
 
 def make_imager(
@@ -17,14 +21,12 @@ def make_imager(
     """Return the pipeline of a profile; a worker that was started earlier is used, or ended."""
     setup = pipeline_setup(profile, repeatable=repeatable, previews=previews)
     if profile.run.worker == "process":
-        return ProcessImager(setup, worker or WorkerProcess())
+        return WorkerImager(setup, worker or WorkerProcess())
     if worker is not None:
         worker.end()
     if profile.run.worker == "error_model":
-        from starhil.emulator.pipeline.error_model import ErrorModelImager
-
         return ErrorModelImager(setup)
-    return ThreadImager(setup)
+    return WorkerImager(setup, WorkerThread())
 
 
 def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool = False) -> PipelineSetup:
@@ -44,19 +46,3 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         dark_frames=profile.device.dark_frames,
         images=profile.images.resolved(profile.folder),
     )
-
-
-def camera_constants(warm: PipelineReady) -> dict[str, Value]:
-    """Return the camera parameters of a calibrated unit: focal length, centre and distortion, in pixels."""
-    camera = warm.camera
-    k1, k2, p1, p2, _ = camera["distortion"]
-    focal_x, focal_y = camera["focal_px"]
-    return {
-        "focal_length": (focal_x * focal_y) ** 0.5,
-        "centroid_x": camera["centre_px"][0],
-        "centroid_y": camera["centre_px"][1],
-        "k1": k1,
-        "k2": k2,
-        "p1": p1,
-        "p2": p2,
-    }

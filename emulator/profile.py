@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.toml_file import read_toml
+from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import (
     Date,
     FixedConfig,
@@ -24,7 +24,6 @@ from starhil.emulator.truth.config import (
     TruthConfig,
 )
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.names import find, not_found
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starid.earth import unix_time
 
@@ -373,19 +372,9 @@ LINK_PARAMETERS: Final[dict[str, str]] = {
 """Device parameters whose defaults are set under another key of a profile."""
 
 
-def find_profile(name_or_path: str, relative_to: Path | None = None) -> Path:
-    """Return the path of a profile given by name or path."""
-    path = find("profile", name_or_path)
-    if relative_to is not None and not path.is_absolute():
-        path = relative_to / path
-    if not path.exists():
-        raise EmulatorError(not_found("profile", name_or_path))
-    return path
-
-
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
     """Read a profile and the profiles it extends, and apply `section.key=value` overrides."""
-    path = find_profile(name_or_path)
+    path = find_toml("profile", name_or_path)
     values = _read_extended(path, 0)
     if any(override.startswith("camera.") for override in overrides):
         _drop_calibration(values)
@@ -432,7 +421,7 @@ def _read_extended(path: Path, depth: int) -> dict[str, Any]:
         raise EmulatorError(
             f"profile {path}: extends: more than {MAX_EXTENDS_DEPTH} deep; does a profile extend itself?"
         )
-    below = _read_extended(find_profile(base, path.parent), depth + 1)
+    below = _read_extended(find_toml("profile", base, path.parent), depth + 1)
     if "camera" in values:
         _drop_calibration(below)
     return merge(below, values)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from collections.abc import Sequence
 from typing import Any, Final
 
-from starhil.emulator.clock import NANOSECONDS, Clock, SteppedClock
+from starhil.emulator.clock import NANOSECONDS, Clock, LatchedClock, SteppedClock
 from starhil.emulator.device.scheduler import Event, Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.pipeline.imager import Imager
-from starhil.emulator.tape import LatchedClock, Recorder
+from starhil.emulator.tape import Recorder
 from starhil.protocol.transports.base import Transport
 
 log = logging.getLogger("starhil.run")
@@ -85,16 +86,8 @@ class ClockPump:
 class StepPump:
     """Runs events on request, once time passes; before each, it waits for the pipelines and for the links to send.
 
-    Parameters
-    ----------
-    devices
-        Scheduler and pipeline of each device on the clock. Simultaneous events run in the
-        order of the devices.
-    transports
-        Transports of the links. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not wait for its
-        transport until it reads again.
-    time_passes
-        Set when every pipeline is ready; steps wait for it.
+    Simultaneous events run in the order of the devices. If a peer reads nothing for `PEER_PATIENCE_S`, steps do not
+    wait for its transport until it reads again.
     """
 
     def __init__(
@@ -136,15 +129,12 @@ class StepPump:
 
     def _pop_next(self, end_ns: int) -> Event | None:
         """Remove and return the earliest event of all devices that is due at `end_ns`, or None."""
-        due = [
-            (due_ns, scheduler)
-            for scheduler in self._schedulers
-            if (due_ns := scheduler.next_due_ns()) is not None
-        ]
-        if not due:
-            return None
-        _, earliest = min(due, key=lambda item: item[0])
-        return earliest.pop_due(end_ns)
+
+        def due_ns(scheduler: Scheduler) -> float:
+            due_ns = scheduler.next_due_ns()
+            return math.inf if due_ns is None else due_ns
+
+        return min(self._schedulers, key=due_ns).pop_due(end_ns)
 
     async def _settle(self) -> None:
         """Wait for the pipelines and the links, and let other tasks of the loop run."""

@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field, RootModel, ValidationError, model_validat
 from starhil.emulator.clock import NANOSECONDS, SteppedClock
 from starhil.emulator.control.scenario import Scenario, load_scenario
 from starhil.emulator.device.device import Background, outcome
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.head import Head
@@ -136,19 +136,17 @@ class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
 
 def prepare_recording(folder: Path, profile: Profile, scenario: str) -> None:
     """Make the folder of a recording, with copies of all inputs of the run that may change later."""
-    try:
+    failed, remedy = f"--record {folder}: cannot be used", "choose another folder"
+    with explained(failed, remedy):
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
-            raise EmulatorError(f"--record {folder}: not empty; choose another folder")
-    except OSError as error:
-        raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+            raise EmulatorError(f"--record {folder}: not empty; {remedy}")
     try:
-        _copy_inputs(folder, profile, scenario)
-    except (EmulatorError, OSError) as error:
+        with explained(failed, remedy):
+            _copy_inputs(folder, profile, scenario)
+    except EmulatorError:
         shutil.rmtree(folder, ignore_errors=True)  # everything in it is from here
-        if isinstance(error, EmulatorError):
-            raise
-        raise EmulatorError(f"--record {folder}: {error.strerror}; choose another folder") from None
+        raise
 
 
 def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
@@ -178,10 +176,7 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
 class Player(Wiring):
     """Connects a run to a recording instead of the world.
 
-    Parameters
-    ----------
-    ends_at_once
-        Whether slow writes ended at once in the recorded run, as on the stepped clock.
+    `ends_at_once`: whether slow writes ended at once in the recorded run, as on the stepped clock.
     """
 
     plays = repeatable = True
@@ -277,17 +272,11 @@ class PlayedImager:
         await self._inner.settle()
 
     async def deliver(self) -> None:
-        """Deliver the next reply.
-
-        Raises
-        ------
-        _DeviationError
-            The device has sent fewer requests than in the recorded run.
-        """
+        """Deliver the next reply; _DeviationError if the device has sent fewer requests than in the recorded run."""
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
-            raise _DeviationError("the device requests fewer frames than in the recorded run")
+            raise _DeviationError("it requests fewer frames than in the recorded run")
         self.pending -= 1
         self._arrived.popleft()()
 
@@ -317,12 +306,9 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
 
 def _read(path: Path) -> str:
     """Read a file of a recording; an error names it."""
-    try:
-        return read_text(path)
-    except OSError as error:
-        raise EmulatorError(f"replay {path}: {error.strerror}") from None
-    except UnicodeDecodeError as error:
-        raise EmulatorError(f"replay {path}: damaged ({error.reason})") from None
+    with explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError)):
+        text = read_text(path)
+    return text  # noqa: RET504 (mypy expects that the block may be left without a result)
 
 
 def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
@@ -336,24 +322,19 @@ def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
     """Yield the entries of a tape, each with file and line."""
     path = folder / EVENTS_FILE
-    try:
-        with open_regular(path) as file:
-            for number, line in enumerate(file, start=1):
-                if not line.endswith(b"\n"):
-                    return  # the run was killed while it wrote
-                where = f"{path}: line {number}"
-                yield where, _validated(_Line, line, where).root
-    except OSError as error:
-        raise EmulatorError(f"replay {path}: {error.strerror}") from None
+    with explained(f"replay {path}: cannot be read"), open_regular(path) as file:
+        for number, line in enumerate(file, start=1):
+            if not line.endswith(b"\n"):
+                return  # the run was killed while it wrote
+            where = f"{path}: line {number}"
+            yield where, _validated(_Line, line, where).root
 
 
 async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
     """Play a recording on the stepped clock, and compare sent items and measurements with it.
 
-    Parameters
-    ----------
-    profile
-        Profile of the device, instead of the recorded one; `run` except the algorithm, and `links`, are as recorded.
+    The device may have another profile than the recorded one; `run` except the algorithm, and `links`, are as
+    recorded.
     """
     recorded, ends = read_run(folder)
     player = Player(ends_at_once=recorded.run.clock == "stepped")
@@ -418,7 +399,8 @@ class _Playing:
             try:
                 await self.entry(entry)
             except _DeviationError as deviation:
-                report.differences.append(f"{where}: {deviation}")
+                at = f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently"
+                report.differences.append(f"{where}: {at}: {deviation}")
                 return recording
             except (EmulatorError, ProtocolError, StaridError) as error:
                 raise EmulatorError(f"replay {where}: {error}") from None
@@ -430,54 +412,38 @@ class _Playing:
         return recording
 
     async def entry(self, entry: Entry) -> None:
-        """Play one entry at the current time.
-
-        Raises
-        ------
-        _DeviationError
-            The device behaves differently, so that the entry cannot be played.
-        """
+        """Play one entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
+        head, player, truth = self._head, self._player, self._truth
         match entry:
-            case _Plain():
-                await self._plain(entry)
             case _Item():
-                receive = self._player.receivers.get(entry.link)
+                receive = player.receivers.get(entry.link)
                 if receive is None:
-                    raise _DeviationError(_deviation(entry, f"the link {entry.link} is off"))
-                self._player.pass_item(entry.link, entry.item, outgoing=False)
+                    raise _DeviationError(f"the link {entry.link} is off")
+                player.pass_item(entry.link, entry.item, outgoing=False)
                 receive(entry.item)
             case _Feed():
-                if self._truth.feed is None:
-                    raise _DeviationError(_deviation(entry, "there is no live feed"))
-                await self._truth.feed.process(entry.data.encode("latin-1"))
+                if truth.feed is None:
+                    raise _DeviationError("there is no live feed")
+                await truth.feed.process(entry.data.encode("latin-1"))
             case _Truth():
-                await self._truth.set(entry.config, entry.start_s)
+                await truth.set(entry.config, entry.start_s)
             case _Fault():
-                self._head.faults.inject(entry.request)
-
-    async def _plain(self, entry: _Plain) -> None:
-        """Play an entry that consists of its time."""
-        device, player = self._head.device, self._player
-        match entry.do:
-            case "event":
-                due = device.scheduler.pop_due(player.clock.now_ns())
+                head.faults.inject(entry.request)
+            case _Plain(do="event"):
+                due = head.device.scheduler.pop_due(player.clock.now_ns())
                 if due is None:
-                    raise _DeviationError(_deviation(entry, "no event is due"))
+                    raise _DeviationError("no event is due")
                 call_guarded("event", due.action, due.due_ns)
-            case "reply" if player.pipeline is not None:
+            case _Plain(do="reply") if player.pipeline is not None:
                 await player.pipeline.deliver()
-            case "stored":
+            case _Plain(do="stored"):
                 if not player.writes:
-                    raise _DeviationError(_deviation(entry, "nothing is being written"))
+                    raise _DeviationError("nothing is being written")
                 player.writes.popleft()()
-            case "ready":
-                self._head.pipeline_ready(self._warm)
-            case "clear_faults":
-                self._head.faults.clear()
-
-
-def _deviation(entry: Entry, why: str) -> str:
-    return f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently: {why}"
+            case _Plain(do="ready"):
+                head.pipeline_ready(self._warm)
+            case _Plain(do="clear_faults"):
+                head.faults.clear()
 
 
 def _compare_sent(
@@ -568,10 +534,7 @@ def _compare_truth(recorded: Path, now: Path, report: ReplayReport, *, to_the_en
 
 
 def _rows(path: Path) -> list[dict[str, str]]:
-    try:
-        with TextIOWrapper(open_regular(path), encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
-    except OSError as error:
-        raise EmulatorError(f"replay {path}: {error.strerror}") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise EmulatorError(f"replay {path}: damaged ({error})") from None
+    unreadable = explained(f"replay {path}: cannot be read", errors=(OSError, UnicodeDecodeError, csv.Error))
+    with unreadable, TextIOWrapper(open_regular(path), encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    return rows  # noqa: RET504 (as above)

@@ -15,8 +15,8 @@ from typing import Final
 from starhil.emulator.device.device import PIPELINE_ENDED, Device
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import one_line
-from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.messages import PipelineReady
+from starhil.emulator.pipeline_setup import PipelineImager
 
 log = logging.getLogger("starhil.run")
 
@@ -62,12 +62,8 @@ class PipelineRevival:
         while self._lost and self._attempts < len(PAUSES_S):
             pause_s = PAUSES_S[self._attempts]
             self._attempts += 1
-            log.warning(
-                "image pipeline: restarting in %g s (attempt %d of %d)",
-                pause_s,
-                self._attempts,
-                len(PAUSES_S),
-            )
+            progress = f"attempt {self._attempts} of {len(PAUSES_S)}"
+            log.warning("image pipeline: restarting in %g s (%s)", pause_s, progress)
             await asyncio.sleep(pause_s)
             await self._restart()
         if self._lost:

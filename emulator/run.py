@@ -26,9 +26,8 @@ from starhil.emulator.clock import NANOSECONDS, SteppedClock, make_clock
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import close_all
 from starhil.emulator.head import Head, check_links
-from starhil.emulator.pipeline.imager import PipelineImager
 from starhil.emulator.pipeline.worker_process import WorkerProcess
-from starhil.emulator.pipeline_setup import make_imager
+from starhil.emulator.pipeline_setup import PipelineImager, make_imager
 from starhil.emulator.profile import Profile
 from starhil.emulator.pump import StepPump
 from starhil.emulator.tape import Recorder, Wiring
@@ -42,12 +41,8 @@ from starhil.protocol.icd_bindings import unbound
 class Run:
     """A run of one or several heads.
 
-    Parameters
-    ----------
-    profiles
-        Profiles of the heads; truth and clock are those of the first.
-    worker
-        Pipeline worker of the first head that was started earlier; by default it is started here.
+    Truth and clock are those of the first profile. The pipeline worker of the first head may have been started
+    earlier.
     """
 
     def __init__(
@@ -62,7 +57,6 @@ class Run:
         self.wiring = wiring or Wiring(make_clock(self.profile.run.clock))
         self.clock = self.wiring.clock
         self.recorder = self.wiring if isinstance(self.wiring, Recorder) else None
-        """Records the run; None if it is not recorded."""
         self.stepper: StepPump | None = None
         """Advances the stepped clock, once the run has begun; None with another clock."""
         self.time_passes = asyncio.Event()

@@ -18,9 +18,7 @@ class Signal(Generic[Message]):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        """What is reported, for the log."""
         self.observers: list[Callable[[Message], object]] = []
-        """The connected functions."""
 
     def connect(self, observer: Callable[[Message], object]) -> None:
         """Call a function with each further message."""

@@ -40,10 +40,7 @@ class LockError(EmulatorError):
 def lock_name(kind: str, name: bytes) -> socket.socket:
     """Lock a name of some kind in this network namespace until the socket is closed.
 
-    Raises
-    ------
-    LockError
-        Another emulator uses the name, or the operating system cannot make the lock.
+    LockError if another emulator uses the name, or the operating system cannot make the lock.
     """
     address = f"\0starhil-{kind}-{hashlib.sha256(name).hexdigest()}".encode()
     lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from starhil.emulator.clock import Clock
+from starhil.emulator.clock import Clock, LatchedClock, ScaledClock
 from starhil.emulator.device.device import Background
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.output_file import Output, OutputFile
@@ -63,32 +63,6 @@ class Wiring:
         return inner
 
 
-class LatchedClock:
-    """A clock that stops while an entry is processed."""
-
-    def __init__(self, source: Clock) -> None:
-        self.source = source
-        self.name = source.name
-        self.speed = source.speed
-        self._now_ns = 0
-
-    def now_ns(self) -> int:
-        """Return the time of the last entry, nanoseconds."""
-        return self._now_ns
-
-    def switch_on(self, wall_ns: int, limit_ns: int) -> None:
-        """Switch on the running clock."""
-        self.source.switch_on(wall_ns, limit_ns)
-
-    def start(self) -> None:
-        """Start the running clock."""
-        self.source.start()
-
-    def latch(self) -> None:
-        """Set this clock to the current time."""
-        self._now_ns = self.source.now_ns()
-
-
 def as_json(item: bytes | CanFrame) -> Any:
     """Return an item of a link as JSON."""
     if isinstance(item, CanFrame):
@@ -105,23 +79,16 @@ def from_json(value: Any) -> bytes | CanFrame:
 
 
 class Recorder(Wiring):
-    """Writes the tape of a run.
-
-    Parameters
-    ----------
-    inner
-        Connects the run to the world.
-    """
+    """Writes the tape of a run, which `inner` connects to the world."""
 
     repeatable = True
 
     def __init__(self, folder: Path, inner: Wiring) -> None:
-        self._latched = LatchedClock(inner.clock) if inner.clock.speed > 0.0 else None
+        self._latched = LatchedClock(inner.clock) if isinstance(inner.clock, ScaledClock) else None
         super().__init__(self._latched or inner.clock)
         self._inner = inner
         self.folder = folder
         self.file: OutputFile | None = None
-        """The tape; None before it is opened."""
         self.output = Output(f"recording {folder}")
         """All files of the recording."""
         self._held: list[Callable[[], None]] | None = []

@@ -6,22 +6,28 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
+from starhil.protocol.names import Kind, find, not_found
 from starid.files import read_text
 
 
-def read_toml(path: Path, what: str) -> dict[str, Any]:
-    """Read a TOML file.
+def find_toml(kind: Kind, name_or_path: str, relative_to: Path = Path()) -> Path:
+    """Return the path of a file given by the name of a bundled one, or by a path."""
+    failed = f"{kind} {name_or_path!r}: cannot be read"  # RuntimeError: the home folder of an unknown user
+    with explained(failed, "give another path", errors=(OSError, RuntimeError)):
+        path = relative_to / find(kind, name_or_path)
+        found = path.exists()
+    if not found:
+        raise EmulatorError(not_found(kind, name_or_path))
+    return path
 
-    Parameters
-    ----------
-    what
-        Kind of file, for messages: `profile`, `scenario`.
-    """
+
+def read_toml(path: Path, what: str) -> dict[str, Any]:
+    """Read a TOML file; `what` is its kind, for messages: `profile`, `scenario`."""
     try:
-        return tomllib.loads(read_text(path))
-    except OSError as error:
-        raise EmulatorError(f"{what} {path}: cannot be read ({error.strerror}); give a TOML file") from None
+        with explained(f"{what} {path}: cannot be read", "give a TOML file"):
+            text = read_text(path)
+        return tomllib.loads(text)
     except UnicodeDecodeError as error:
         raise EmulatorError(f"{what} {path}: not UTF-8 ({error.reason}); give a TOML file") from None
     except tomllib.TOMLDecodeError as error:

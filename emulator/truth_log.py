@@ -79,14 +79,8 @@ def compare(measurement: Measurement) -> dict[str, Any]:
 class TruthLog:
     """A CSV file with one row per exposure; rows are written complete and unbuffered.
 
-    Parameters
-    ----------
-    path
-        The file; created if it does not exist.
-    wall_times
-        Whether to fill the columns in `WALL_TIMES`.
-    output
-        The recording of which the file is a part; by default it is none.
+    The columns in `WALL_TIMES` are filled if `wall_times`. `output` is the recording of which the file is a part, if
+    any.
     """
 
     def __init__(

@@ -11,22 +11,13 @@ from starhil.protocol.names import did_you_mean
 from starid.errors import plain
 
 
-def explain(
-    error: ValidationError, model: type[BaseModel], *, under: tuple[str, ...] = (), also: tuple[str, ...] = ()
-) -> str:
-    """Describe the first validation error in one line: key, problem and remedy.
+def explain(error: ValidationError, model: type[BaseModel], *, also: tuple[str, ...] = ()) -> str:
+    """Describe the first validation error of a model in one line: key, problem and remedy.
 
-    Parameters
-    ----------
-    error, model
-        The error, and the model that rejected the input.
-    under
-        Path of keys in the model to the validated input.
-    also
-        Further keys allowed at the top level.
+    `also` are further keys allowed at the top level.
     """
     first = _most_helpful_error(error)
-    loc = (*under, *first["loc"])
+    loc = first["loc"]
     path, models = _along(model, loc)
     if first["type"] == "extra_forbidden":
         path, above = _along(model, loc[:-1])

@@ -239,64 +239,60 @@ class _Assembler:
         """Drop the message with this key; return whether there was one."""
         return self._open.pop(key, None) is not None
 
-    def add(self, key: int, payload: bytes, now: float) -> tuple[bytes | None, LinkFault | None]:
-        """Add a segment; return the message if it is complete, and the fault if there is one.
+    def add(self, key: int, payload: bytes, now: float) -> Iterator[bytes | LinkFault]:
+        """Add a segment; yield the fault if there is one, and the message if it is complete.
 
         A segment out of order breaks its message. Further segments are skipped up to one whose counter is 0,
         which ends the message, or at least the first segment's counter, which starts a new one.
         """
         if not payload:
             self.drop(key)
-            return None, LinkFault(FaultKind.CAN_LENGTH, f"{key:08X}: segment without its counter")
+            yield LinkFault(FaultKind.CAN_LENGTH, f"{key:08X}: segment without its counter")
+            return
         chunk, left = payload[:-1], payload[-1]
         message = self._open.get(key)
         if message is None:
-            return None, self._open_message(key, chunk, left, now)
-        in_order = (
-            not message.broken and left == message.left - 1 and (not left or len(chunk) == SEGMENT_DATA)
-        )
-        if not in_order:
-            return None, self._out_of_order(key, message, chunk, left, now)
+            yield from self._open_message(key, chunk, left, now)
+            return
+        if message.broken or left != message.left - 1 or (left and len(chunk) != SEGMENT_DATA):
+            yield from self._out_of_order(key, message, chunk, left, now)
+            return
         message.data += chunk
         message.left, message.time = left, now
-        if len(message.data) + left > self._max_size:
-            message.broken = bool(left)
-            if not left:
-                del self._open[key]
-            return None, LinkFault(
-                FaultKind.CAN_OVERLONG, f"{key:08X}: message longer than {self._max_size} bytes"
-            )
-        if left:
-            return None, None
-        del self._open[key]
-        return bytes(message.data), None
+        overlong = len(message.data) + left > self._max_size
+        message.broken = overlong
+        if overlong:
+            yield LinkFault(FaultKind.CAN_OVERLONG, f"{key:08X}: message longer than {self._max_size} bytes")
+        if not left:
+            del self._open[key]
+            if not overlong:
+                yield bytes(message.data)
 
-    def _open_message(self, key: int, chunk: bytes, left: int, now: float) -> LinkFault | None:
+    def _open_message(self, key: int, chunk: bytes, left: int, now: float) -> Iterator[LinkFault]:
         if left == 0 or len(chunk) != SEGMENT_DATA:
-            return LinkFault(
+            yield LinkFault(
                 FaultKind.CAN_SEQUENCE,
                 f"{key:08X}: segment counter {left} with {len(chunk)} bytes is not the first of a message",
             )
-        fault = None
+            return
         if len(self._open) >= MAX_OPEN_MESSAGES:
             oldest = min(self._open, key=lambda other: self._open[other].time)
             del self._open[oldest]
-            fault = LinkFault(FaultKind.CAN_OVERLONG, f"{oldest:08X}: too many incomplete messages")
+            yield LinkFault(FaultKind.CAN_OVERLONG, f"{oldest:08X}: too many incomplete messages")
         self._open[key] = _Assembly(left, left, now, bytearray(chunk))
-        return fault
 
     def _out_of_order(
         self, key: int, message: _Assembly, chunk: bytes, left: int, now: float
-    ) -> LinkFault | None:
-        text = f"{key:08X}: segment counter {left} with {len(chunk)} bytes, expected {message.left - 1}"
-        fault = None if message.broken else LinkFault(FaultKind.CAN_SEQUENCE, text)
+    ) -> Iterator[LinkFault]:
+        if not message.broken:
+            text = f"{key:08X}: segment counter {left} with {len(chunk)} bytes, expected {message.left - 1}"
+            yield LinkFault(FaultKind.CAN_SEQUENCE, text)
         message.broken = True
         message.time = now
         if left >= message.first and len(chunk) == SEGMENT_DATA:
             self._open[key] = _Assembly(left, left, now, bytearray(chunk))
         elif left == 0:
             del self._open[key]
-        return fault
 
 
 _Event = TypeVar("_Event")
@@ -305,7 +301,9 @@ _Event = TypeVar("_Event")
 class _Receiver(ABC, Generic[_Event]):
     """Base of both ends: CAN frames in, messages and faults out."""
 
-    def __init__(self, address: int, max_size: int, timeout_s: float) -> None:
+    def __init__(
+        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
+    ) -> None:
         self.address = address
         """Address of this end; may change at any time."""
         self._assembler = _Assembler(max_size, timeout_s)
@@ -345,11 +343,6 @@ class CanDeviceReceiver(_Receiver[Request]):
     Frames to other addresses are ignored.
     """
 
-    def __init__(
-        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
-    ) -> None:
-        super().__init__(address, max_size, timeout_s)
-
     def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Request | LinkFault]:
         is_telemetry = can_id.id >= FIRST_TELEMETRY_ID
         match can_id.type:
@@ -365,11 +358,12 @@ class CanDeviceReceiver(_Receiver[Request]):
             case MessageType.TELEMETRY_REQUEST if is_telemetry:
                 yield Request(RequestKind.TELEMETRY, can_id.id, frame.data, can_id.source)
             case MessageType.TELECOMMAND_EXTENDED if not is_telemetry:
-                data, fault = self._assembler.add(frame.id, frame.data, now)
-                if fault is not None:
-                    yield fault
-                if data is not None:
-                    yield Request(RequestKind.TELECOMMAND, can_id.id, data, can_id.source)
+                for item in self._assembler.add(frame.id, frame.data, now):
+                    yield (
+                        item
+                        if isinstance(item, LinkFault)
+                        else Request(RequestKind.TELECOMMAND, can_id.id, item, can_id.source)
+                    )
             case _:
                 yield LinkFault(
                     FaultKind.CAN_TYPE,
@@ -402,7 +396,7 @@ class CanHostReceiver(_Receiver[Reply]):
         max_size: int = DEFAULT_MAX_SIZE,
         timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
-        super().__init__(address, max_size, timeout_s)
+        super().__init__(address, max_size=max_size, timeout_s=timeout_s)
         self._device = device
 
     def _concerns(self, can_id: CanId) -> bool:
@@ -444,8 +438,5 @@ class CanHostReceiver(_Receiver[Reply]):
     def _add_segment(
         self, kind: ReplyKind, key: int, can_id: CanId, data: bytes, now: float
     ) -> Iterator[Reply | LinkFault]:
-        whole, fault = self._assembler.add(key, data, now)
-        if fault is not None:
-            yield fault
-        if whole is not None:
-            yield Reply(kind, can_id.id, whole, source=can_id.source)
+        for item in self._assembler.add(key, data, now):
+            yield item if isinstance(item, LinkFault) else Reply(kind, can_id.id, item, source=can_id.source)

@@ -33,11 +33,14 @@ def figure(
 
 
 def save(fig: Any, path: Path) -> str:
-    """Write a figure as PNG, close it, and return the file name."""
+    """Write a figure in the format of the suffix (PNG without one), close it, and return the file name."""
     import matplotlib.pyplot as plt
 
-    write_atomically(path, lambda part: fig.savefig(part, format="png", dpi=130))
-    plt.close(fig)
+    form = path.suffix.removeprefix(".").lower() or "png"
+    try:
+        write_atomically(path, lambda part: fig.savefig(part, format=form, dpi=130))
+    finally:
+        plt.close(fig)
     return path.name
 
 

@@ -112,17 +112,10 @@ def attribute_docstrings(model: type, *, grouped: bool = False) -> dict[str, str
     SystemExit
         A field has no docstring; the message names it.
     """
-    module = ast.parse(textwrap.dedent(inspect.getsource(model)))
-    body = next(node.body for node in module.body if isinstance(node, ast.ClassDef))
     found: dict[str, str] = {}
-    for statement, after in zip(body, [*body[1:], None], strict=True):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            text = (
-                after.value.value
-                if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
-                else ""
-            )
-            found[statement.target.id] = plain_text(str(text))
+    for kind in reversed(model.__mro__):
+        if kind.__module__.startswith(("starhil.", "starid.")):
+            found |= {name: text or found.get(name, "") for name, text in _own_docstrings(kind).items()}
     if grouped:
         text = ""
         for name in reversed(found):
@@ -132,6 +125,18 @@ def attribute_docstrings(model: type, *, grouped: bool = False) -> dict[str, str
         raise SystemExit(
             f"{model.__module__}.{model.__qualname__}.{bare[0]}: has no docstring; write one under it"
         )
+    return found
+
+
+def _own_docstrings(kind: type) -> dict[str, str]:
+    """Return the docstring under each field that a class itself declares; empty if there is none."""
+    module = ast.parse(textwrap.dedent(inspect.getsource(kind)))
+    body = next(node.body for node in module.body if isinstance(node, ast.ClassDef))
+    found: dict[str, str] = {}
+    for statement, after in zip(body, [*body[1:], None], strict=True):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            found[statement.target.id] = plain_text(str(after.value.value)) if is_text else ""
     return found
 
 
@@ -310,14 +315,12 @@ def sky() -> str:
 
 def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> list[Row]:
     """Return a row for each field of a dataclass of the sky."""
-    from starhil.emulator.sky.objects import _RANGES
-
     texts = attribute_docstrings(kind, grouped=True)
     rows: list[Row] = []
     for field in dataclasses.fields(kind):
         if field.name in (skipped or {}):
             continue
-        low, high = _RANGES.get(field.name, (None, None))
+        low, high = field.metadata.get("limits", (None, None))
         allowed = "" if low is None or high is None or abs(low) >= 1e5 else f"{number(low)} to {number(high)}"
         value = "required" if field.default is dataclasses.MISSING else literal(field.default)
         rows.append((f"`{field.name}`", unit(field.name), allowed, value, texts[field.name]))
@@ -426,9 +429,7 @@ def unit_definition() -> str:
     }
     parts = []
     for heading, model in headings.items():
-        texts: dict[str, str] = {}
-        for kind in reversed(model.__mro__[: model.__mro__.index(BaseModel)]):
-            texts |= attribute_docstrings(kind)
+        texts = attribute_docstrings(model)
         schema = model.model_json_schema()
         properties = schema.get("properties") or schema["$defs"][model.__name__]["properties"]
         rows: list[Row] = [

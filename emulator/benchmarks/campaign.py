@@ -16,19 +16,24 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, TypeVar
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, HARD_SENSOR, hard_sky
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.sensor.model import SensorModel
+from starhil.emulator.sensor.renderer import Renderer
+from starid.arrays import Array
 from starid.attitude import Attitude, random_attitude
+from starid.camera import Camera
+from starid.catalog import load_catalog
+from starid.imaging.detection import detect
+from starid.interface import StarIdentifier, make_identifier
+from starid.photograph.field_sweep import FieldSweep
 from starid.result_store import Results, ResultStore
-
-if TYPE_CHECKING:
-    from starhil.emulator.sensor.renderer import Renderer
-    from starid.interface import StarIdentifier
-    from starid.solution import Solution
+from starid.solution import Solution
 
 Plan = TypeVar("Plan")
 Made = TypeVar("Made")
@@ -66,32 +71,24 @@ RECORD: Final = np.dtype(
 
 @dataclass(frozen=True, slots=True)
 class CampaignPlan:
-    """The definition of a campaign; equal plans give equal results.
-
-    Parameters
-    ----------
-    frames : number of frames. seed : seed of attitudes and sensor noise. fov_deg : full width of the field of
-    view in degrees. rate_deg_s : body rate during the exposure, degrees per second about a random axis of
-    each frame. blocked : fraction of the image (0 … 0.9) hidden by a dark body on a random side of each
-    frame. sky : "clear", or "hard": 100 false stars to about 50 true ones, planets, hot pixels, particles,
-    the Moon in the
-        field or glare of the Sun, and body rates of up to 2°/s instead of `rate_deg_s`
-        (`starhil.emulator.benchmarks.hard_sky`).
-    algorithm : star identification algorithm, as in a device profile.
-    chunk : frames per chunk; finished chunks are not repeated when a campaign is resumed.
-    unknown_field : whether the identification has to find the field of view, like
-        `starid identify --fov auto`; identification time then includes detection.
-    """
+    """The definition of a campaign; equal plans give equal results."""
 
     frames: int
     seed: int
     fov_deg: float = 42.0
+    """Full width of the field of view, degrees."""
     rate_deg_s: float = 0.0
+    """Body rate during the exposure, degrees per second about a random axis of each frame."""
     blocked: float = 0.0
+    """Fraction of the image (0 … 0.9) hidden by a dark body on a random side of each frame."""
     algorithm: str = "geometric"
     chunk: int = 50
+    """Frames per chunk; finished chunks are not repeated when a campaign is resumed."""
     sky: str = "clear"
+    """`clear`, or `hard`: bodies, false stars and body rates of `starhil.emulator.benchmarks.hard_sky`."""
     unknown_field: bool = False
+    """Whether the identification has to find the field of view, like `starid identify --fov auto`; identification time
+    then includes detection."""
 
     def __post_init__(self) -> None:
         if self.frames < 1:
@@ -133,13 +130,6 @@ class FrameMaker:
     """Renders and solves the frames of a plan, in one thread."""
 
     def __init__(self, plan: CampaignPlan) -> None:
-        from starhil.emulator.benchmarks.hard_sky import HARD_SENSOR
-        from starhil.emulator.sensor.renderer import Renderer, SensorModel
-        from starid.camera import Camera
-        from starid.catalog import load_catalog
-        from starid.interface import make_identifier
-        from starid.photograph.field_sweep import FieldSweep
-
         self.plan = plan
         sensor = SensorModel() if plan.sky == "clear" else HARD_SENSOR
         self.camera = Camera.from_fov(plan.fov_deg)
@@ -154,8 +144,6 @@ class FrameMaker:
 
     def solve(self, frame: int) -> tuple[Any, ...]:
         """Render a frame, detect, identify, and compare with the truth; return a row of RECORD."""
-        from starhil.emulator.benchmarks.hard_sky import FASTEST_DEG_S, hard_sky
-
         rng = np.random.default_rng((self.plan.seed, frame))
         truth = random_attitude(rng)
         axis = rng.normal(size=3)
@@ -191,8 +179,6 @@ class FrameMaker:
 
     def _identified(self, image: npt.NDArray[Any]) -> tuple[Solution, int, float]:
         """Return the solution of an image, the number of detections, and the time at the end of detection."""
-        from starid.imaging.detection import detect
-
         if self.sweep is not None:
             begun = time.perf_counter()
             result = self.sweep.solve(image, self.settings)
@@ -254,9 +240,7 @@ def run_chunk(plan: CampaignPlan, chunk: int) -> npt.NDArray[np.void]:
 def open_store(folder: Path, plan: Mapping[str, Any]) -> ResultStore:
     """Open the folder of a campaign, with its plan, the versions of everything that affects it, and chunks.
 
-    Raises
-    ------
-    StaridError : the folder holds another plan, or cannot be used.
+    StaridError if it holds another plan, or cannot be used.
     """
     return ResultStore(folder, {**plan, "made_by": made_by()}, "campaign")
 
@@ -266,11 +250,8 @@ def run_parts(
 ) -> Iterator[tuple[str, Results]]:
     """Yield name and results of each part as it finishes; stored parts are loaded.
 
-    Parameters
-    ----------
-    parts : name of a part → function that returns its results, and the arguments of the function.
-    store : store for finished parts, or None.
-    jobs : number of processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
+    `parts` has the function that returns the results of each name, and its arguments. `jobs` is a number of
+    processes; a joblib backend set by the caller, such as a Dask cluster, is respected.
     """
     from joblib import Parallel, delayed
 
@@ -301,15 +282,7 @@ def run_campaign(
 ) -> Iterator[npt.NDArray[np.void]]:
     """Run a campaign and yield the rows of each chunk as it finishes; finished chunks in `folder` are loaded.
 
-    Parameters
-    ----------
-    plan : definition of the campaign.
-    folder : folder for finished chunks, or None.
-    jobs : number of processes, as in `run_parts`.
-
-    Raises
-    ------
-    StaridError : `folder` holds another campaign or a file that cannot be read.
+    `jobs` is as in `run_parts`. StaridError if `folder` holds another campaign or a file that cannot be read.
     """
     store = None if folder is None else open_store(folder, asdict(plan))
     chunks = {f"chunk-{chunk:06d}": (_chunk_results, plan, chunk) for chunk in range(plan.chunks)}
@@ -339,7 +312,7 @@ def summarise(rows: npt.NDArray[np.void], fov_deg: float) -> dict[str, Any]:
     def of_valid(name: str, percent: float) -> float | None:
         return float(np.percentile(valid[name], percent)) if len(valid) else None
 
-    def median(values: npt.NDArray[np.float64]) -> float:
+    def median(values: Array) -> float:
         return float(np.median(values))
 
     figures: dict[str, Any] = {

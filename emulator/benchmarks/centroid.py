@@ -16,18 +16,15 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.sensor.renderer import Frame, Renderer, SensorModel
+from starid.arrays import Array
 from starid.attitude import random_attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
-from starid.files import write_atomically
 from starid.imaging.centroid import star_model
 from starid.imaging.detection import Detections, detect
-
-Array = npt.NDArray[np.float64]
 
 EDGES_V: Final = (-2.0, 2.0, 3.0, 4.0, 4.5, 5.0, 5.5, 6.0)
 """Limits of the magnitude bins."""
@@ -57,7 +54,6 @@ class CentroidRow:
     bound_px: float
     """Cramér–Rao bound per axis, root mean square over the same stars."""
     ratio: float
-    """`rms_px` divided by `bound_px`."""
     predicted_px: float
     """Error predicted by the detection, root mean square."""
     normalised_squared_error: float
@@ -75,20 +71,10 @@ def cramer_rao_px(
     sensor: SensorModel,
     background_e: float,
 ) -> tuple[float, float]:
-    """Return the Cramér–Rao bound of the position of a star, as standard deviations along x and y in pixels.
+    """Return the Cramér–Rao bound of the position (2,) of a star, as standard deviations along x and y in pixels.
 
-    Parameters
-    ----------
-    xy_px : array (2,)
-        Position of the star.
-    electrons : float
-        Electrons from the star in the exposure.
-    sigma_px, trail_px
-        Standard deviation of the spot, and the trail along x and y.
-    background_variance_e2, background_e : float
-        Variance of a pixel without star light (electrons²), and its mean (electrons).
-    sensor : SensorModel
-        Sensor with the spread of sensitivity and the saturation level.
+    The star has a spot of standard deviation `sigma_px` and a trail along x and y. The variance of a pixel without
+    its light is in electrons², the mean in electrons.
     """
     reach = math.ceil(6.0 * sigma_px + 0.5 * math.hypot(*trail_px)) + 2
     left, top = round(xy_px[0]) - reach, round(xy_px[1]) - reach
@@ -113,25 +99,9 @@ def measure_centroids(
     sensor: SensorModel | None = None,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> list[CentroidRow]:
-    """Measure the accuracy of centroids in frames of random attitude.
+    """Measure the accuracy of centroids in frames of random attitude, by rate and magnitude; bins without stars are omitted.
 
-    Parameters
-    ----------
-    rates_deg_s : sequence of float
-        Body rates, about an axis across the boresight with a random direction in every frame.
-    frames : int
-        Frames per rate.
-    seed : int
-        Seed of attitudes, directions and noise.
-    sensor : optional
-        Default: the product's.
-    progress : callable, optional
-        Receives a line about each step.
-
-    Returns
-    -------
-    list of CentroidRow
-        By rate and magnitude; bins without stars are omitted.
+    The body turns about an axis across the boresight, with a random direction in every frame.
     """
     if frames < 1 or not rates_deg_s:
         raise EmulatorError(
@@ -225,40 +195,22 @@ def _rms(values: Array) -> float:
 
 def plot_centroids(rows: Sequence[CentroidRow], path: Path) -> None:
     """Plot error and bound against magnitude, one panel per rate, to an image or PDF file."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
+    from starid.plots import figure, save
 
     rates = sorted({row.rate_deg_s for row in rows})
-    figure, panels = plt.subplots(
-        1, len(rates), figsize=(3.4 * len(rates) + 0.8, 4.2), sharey=True, squeeze=False, layout="constrained"
-    )
+    plot, panels = figure(1, len(rates), width=3.4 * len(rates) + 0.8, sharey=True, squeeze=False)
     for panel, rate in zip(panels[0], rates, strict=True):
         chosen = [row for row in rows if row.rate_deg_s == rate]
         middle = [0.5 * (max(row.v_low, _BRIGHTEST_COMPLETE) + row.v_high) for row in chosen]
-        panel.semilogy(middle, [row.bound_px for row in chosen], "k-", lw=1.5, label="Cramér–Rao bound")
-        panel.semilogy(
-            middle, [row.rms_px for row in chosen], "o", color="tab:blue", ms=6, label="measured error"
-        )
-        panel.semilogy(
-            middle,
-            [row.predicted_px for row in chosen],
-            "_",
-            color="tab:orange",
-            ms=14,
-            mew=2,
-            label="error stated",
-        )
+        for name, style, size, label in (
+            ("bound_px", "k-", 0, "Cramér–Rao bound"),
+            ("rms_px", "o", 6, "measured error"),
+            ("predicted_px", "_", 14, "error stated"),
+        ):
+            panel.semilogy(middle, [getattr(row, name) for row in chosen], style, ms=size, mew=2, label=label)
         panel.set_title(f"{rate:g} °/s")
         panel.set_xlabel("V magnitude")
-        panel.grid(visible=True, which="both", lw=0.3)
     panels[0, 0].set_ylabel("error per axis, px (root mean square)")
-    panels[0, 0].legend(loc="upper left", fontsize=8)
-    try:
-        form = path.suffix.removeprefix(".").lower() or "png"
-        write_atomically(path, lambda temporary: figure.savefig(temporary, dpi=150, format=form))
-    except (OSError, ValueError) as error:
-        raise EmulatorError(f"{path}: cannot write the plot: {error}") from None
-    finally:
-        plt.close(figure)
+    panels[0, 0].legend(loc="upper left")
+    with explained(f"{path}: the plot cannot be written", errors=(OSError, ValueError)):
+        save(plot, path)

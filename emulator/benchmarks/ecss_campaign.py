@@ -20,13 +20,13 @@ from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_stor
 from starhil.emulator.benchmarks.hard_sky import direction_around
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
 from starhil.emulator.device.power import FrameTiming, PowerModel
 from starhil.emulator.device.surroundings import orbit_of
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, PipelineReady, SolverSettings
+from starhil.emulator.pipeline.messages import FrameRequest, FrameResult, camera_constants
 from starhil.emulator.pipeline.pipeline import Pipeline
-from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import load_profile
 from starhil.emulator.truth.source import TruthState
 from starhil.protocol.icd import load_unit
@@ -64,11 +64,8 @@ class EcssPlan:
     """A performance campaign; equal plans give equal results."""
 
     profile: str
-    """Name or path of the device profile."""
     overrides: tuple[str, ...] = ()
-    """Overrides of the profile, `section.key=value`."""
     seed: int = 1
-    """Seed of attitudes and noise."""
     fields: int = 80
     positions: int = 4
     repeats: int = 4
@@ -146,12 +143,9 @@ class EcssDevice:
         self.pipeline = Pipeline(replace(setup, sky=sky))
         self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
         parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))
-        ready = PipelineReady(self.pipeline.camera.to_dict(), len(self.pipeline.catalog), 0.0)
-        constants = camera_constants(ready)
+        constants = camera_constants(self.pipeline.camera.to_dict())
         parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
-        names = SolverSettings.__dataclass_fields__
-        chosen: dict[str, Any] = {name: parameters[name] for name in names}
-        self.settings = SolverSettings(**chosen)
+        self.settings = solver_settings(parameters)
         self.exposure_s = float(parameters["exposure"]) / 1000.0
         self.gain = float(parameters["analog_gain"])
         self.max_rate_deg_s = float(parameters["max_rate"])
@@ -181,16 +175,13 @@ class EcssDevice:
             particles_s=shot.particles_s,
         )
         if shot.unix_s is not None:
-            request = self._dated(request, shot.unix_s)
+            truth = request.truth.completed(shot.unix_s, self.orbit)
+            assumed = observer_velocity(self.parameters, shot.unix_s)  # by the device
+            request = replace(request, truth=truth, observer_velocity=assumed)
         result = self.pipeline.handle(request)
         if not isinstance(result, FrameResult):
             raise EmulatorError(f"campaign: profile {self.plan.profile}: {getattr(result, 'text', result)}")
         return shot, result
-
-    def _dated(self, request: FrameRequest, unix_s: float) -> FrameRequest:
-        """Return the request for a frame at a date, with the orbit and the velocity assumed by the device."""
-        truth = request.truth.completed(unix_s, self.orbit)
-        return replace(request, truth=truth, observer_velocity=observer_velocity(self.parameters, unix_s))
 
     def field_attitude(self, condition: Condition, number: int) -> Attitude:
         """Return the attitude of a field, the same for all its frames."""
@@ -306,22 +297,7 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
 def run_ecss(
     plan: EcssPlan, *, folder: Path | None = None, jobs: int = 1
 ) -> Iterator[tuple[str, int, Results]]:
-    """Run a campaign; yield condition name, chunk number and results of each part as it finishes.
-
-    Parameters
-    ----------
-    plan
-        Definition of the campaign.
-    folder
-        Folder for finished parts, or None.
-    jobs
-        Number of processes.
-
-    Raises
-    ------
-    EmulatorError, StaridError
-        The profile is invalid, or the folder holds another campaign.
-    """
+    """Run a campaign, as `run_campaign`; yield condition name, chunk number and results of each part as it finishes."""
     profile = load_profile(plan.profile, plan.overrides)
     described = {**asdict(plan), "device": profile.model_dump(mode="json")}
     store = None if folder is None else open_store(folder, described)

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
+from starid.arrays import Array, Indices
 
 SIGNIFICANCE: Final = 1e-3
 """Probability of reporting an influence that is not present."""
@@ -31,8 +31,8 @@ BIAS: Final = "bias"
 THERMO_ELASTIC: Final = "thermo-elastic error"
 ABERRATION: Final = "aberration residual"
 
-Vectors = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
+Vectors = Array
+Labels = Indices
 
 
 @dataclass(frozen=True)
@@ -98,13 +98,7 @@ class _Nested:
 
     @classmethod
     def of(cls, series: ErrorSeries) -> _Nested:
-        """Analyse a series, in which the numbers of frames may differ.
-
-        Raises
-        ------
-        EmulatorError
-            There are fewer than two fields, two conditions in a field, or two frames under a condition.
-        """
+        """Analyse a series, in which the numbers of frames may differ."""
         error = series.error_arcsec
         total = len(error)
         _, field = np.unique(series.field, return_inverse=True)
@@ -168,13 +162,7 @@ def _level(above: Vectors, below: Vectors, k: float, dof: tuple[float, float]) -
 def static_errors(
     series: ErrorSeries, confidence: float
 ) -> tuple[ErrorLine, ErrorLine, ErrorLine, ErrorLine]:
-    """Separate a series into bias, field-of-view spatial error, pixel spatial error and temporal noise.
-
-    Raises
-    ------
-    EmulatorError
-        The series is too short.
-    """
+    """Separate a series into bias, field-of-view spatial error, pixel spatial error and temporal noise."""
     from scipy.stats import t as t_distribution
 
     factor = coverage_factor(confidence)
@@ -211,13 +199,8 @@ def aberration_residual(dated: ErrorSeries | None, static: ErrorSeries, confiden
 def thermo_elastic_error(series: ErrorSeries, confidence: float) -> ErrorLine:
     """Return the error that follows the temperature and is the same in all fields.
 
-    The conditions of the series are points of the orbit. The size is the quantile of the deviation from their
-    mean. Effects of temperature that differ between fields are not included.
-
-    Raises
-    ------
-    EmulatorError
-        There are fewer than two conditions, or fewer than two fields that are valid under all of them.
+    The conditions of the series are points of the orbit. The size is the quantile of the deviation from their mean.
+    Effects of temperature that differ between fields are not included.
     """
     from scipy.stats import f as f_distribution
 

@@ -42,13 +42,17 @@ class Outcomes:
 
     influence: str
     value: float
-    """The varied influence, and its value."""
     frames: int
     correct: int
     wrong: int
     """Number of frames, of correct attitudes, and of wrong ones."""
     reasons: Mapping[str, int]
     """Reason of an invalid attitude → number of frames."""
+
+    @property
+    def invalid(self) -> int:
+        """Number of frames without an attitude."""
+        return self.frames - self.correct - self.wrong
 
     @property
     def availability(self) -> float:
@@ -61,11 +65,8 @@ class EcssReport:
     """Figures of a campaign."""
 
     plan: EcssPlan
-    """The campaign."""
     confidence: float
-    """Confidence level of the errors."""
     lines: tuple[ErrorLine, ...]
-    """Errors by kind."""
     measured_arcsec: np.ndarray
     """Quantile of the errors at rest about x, y and z at the confidence level, over sky and orbit."""
     outcomes: tuple[Outcomes, ...]
@@ -87,6 +88,11 @@ class EcssReport:
         """Quantile of all errors at rest."""
         return ErrorLine("measured over sky and orbit, without aberration", self.measured_arcsec, np.zeros(3))
 
+    @property
+    def all_lines(self) -> tuple[ErrorLine, ...]:
+        """Errors by kind, their total, and the measured errors."""
+        return (*self.lines, self.total, self.measured)
+
     def figures(self) -> dict[str, Any]:
         """Return the figures as plain values."""
         lines = {
@@ -94,7 +100,7 @@ class EcssReport:
             if line.arcsec is None
             else dict(zip(("x", "y", "z"), line.arcsec.tolist(), strict=True))
             | {"across": line.across_arcsec, "about": line.about_arcsec}
-            for line in (*self.lines, self.total, self.measured)
+            for line in self.all_lines
         }
         rest = self.outcomes[0]
         return {
@@ -170,55 +176,25 @@ def interval(count: int, frames: int) -> tuple[float, float]:
 
 def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
     """Return the report as Markdown; `plots` are names of image files in its folder."""
-    plan, percent = report.plan, 100.0 * report.confidence
-    text = [
-        f"# Performance of `{plan.profile}`",
-        "",
-        (
-            f"Attitude errors per ECSS-E-ST-60-20C, at {percent:g} % confidence; single images, lost in space, at rest; seed "
-            f"{plan.seed}. x and y are across the boresight, z is about it; *across* is the RMS of x and y."
-        ),
-        "",
-        "## Accuracy",
-        "",
-        "| error | x | y | z | across the boresight | about the boresight |",
-        "|---|---|---|---|---|---|",
-        *(_error_row(line) for line in (*report.lines, report.total, report.measured)),
-        "",
-        (
-            f"From {plan.fields} fields at {plan.positions} sub-pixel positions with {plan.repeats} images each, "
-            f"{plan.thermal_fields} fields at {plan.thermal_points} points of the orbit, and {plan.dated_fields} fields on {plan.dates} "
-            "dates of a year. `<` marks an error that is not significant: it is below the smallest significant one. The total is bias plus "
-            "thermo-elastic error plus the root sum of squares of the others, without aberration; the last line is the quantile of "
-            f"{plan.rest_frames} images at random attitudes."
-        ),
-        "",
-        "## Availability at rest",
-        "",
-        "| images | stars detected, median | correct | wrong | invalid |",
-        "|---|---|---|---|---|",
-    ]
-    rest = report.outcomes[0]
-    text.append(f"| {rest.frames} | {report.stars:g} | {_shares(rest)} |")
-    text += [
-        "",
-        f"Correct: within 0.1° on every axis. Ranges in parentheses are {100 * INTERVAL:g} % confidence intervals.",
-        "",
-    ]
-    for name, (what, unit, _) in INFLUENCES.items():
-        text += [
-            f"## {what[0].upper()}{what[1:]}",
-            "",
-            f"| {what} | correct | wrong | invalid | reasons |",
-            "|---|---|---|---|---|",
-        ]
-        for outcome in report.outcomes:
-            if outcome.influence == name:
-                reasons = ", ".join(f"{reason} {count}" for reason, count in outcome.reasons.items()) or "—"
-                text.append(f"| {outcome.value:g}{unit} | {_shares(outcome)} | {reasons} |")
-        text.append("")
-    text += [f"![{PLOTS[plot]}]({plot})\n" for plot in plots]
-    return "\n".join(text).rstrip() + "\n"
+    from jinja2 import StrictUndefined, Template
+
+    text = Path(__file__).with_name("ecss_report.md.j2").read_text(encoding="utf-8")
+    template = Template(text, trim_blocks=True, lstrip_blocks=True, undefined=StrictUndefined)
+    filled: str = template.render(
+        report=report,
+        plan=report.plan,
+        interval=INTERVAL,
+        influences=INFLUENCES,
+        plots={plot: PLOTS[plot] for plot in plots},
+        error_row=_error_row,
+        shares=_shares,
+        reasons=lambda outcome: _reasons(outcome, ", ", " ") or "—",
+    )
+    return filled.rstrip() + "\n"
+
+
+def _reasons(outcome: Outcomes, between: str, is_: str) -> str:
+    return between.join(f"{reason}{is_}{count}" for reason, count in outcome.reasons.items())
 
 
 def _error_row(line: ErrorLine) -> str:
@@ -236,8 +212,7 @@ def _error_row(line: ErrorLine) -> str:
 def _shares(outcome: Outcomes) -> str:
     """Return the cells of correct, wrong and invalid: percentages with confidence intervals."""
     cells = []
-    invalid = outcome.frames - outcome.correct - outcome.wrong
-    for count in (outcome.correct, outcome.wrong, invalid):
+    for count in (outcome.correct, outcome.wrong, outcome.invalid):
         low, high = interval(count, outcome.frames)
         cells.append(f"{100 * count / outcome.frames:.4g} % ({100 * low:.3g} to {100 * high:.3g})")
     return " | ".join(cells)
@@ -264,7 +239,7 @@ def _csv(head: str, rows: Iterable[Sequence[object]]) -> str:
 
 def _errors_csv(report: EcssReport) -> str:
     rows = []
-    for line in (*report.lines, report.total, report.measured):
+    for line in report.all_lines:
         sizes = ["", "", ""] if line.arcsec is None else [f"{size:.6g}" for size in line.arcsec]
         rows.append([line.name, *sizes, *(f"{least:.6g}" for least in line.resolution_arcsec)])
     return _csv("error x_arcsec y_arcsec z_arcsec x_least y_least z_least", rows)
@@ -273,17 +248,15 @@ def _errors_csv(report: EcssReport) -> str:
 def _availability_csv(report: EcssReport) -> str:
     rows = []
     for outcome in report.outcomes:
-        invalid = outcome.frames - outcome.correct - outcome.wrong
-        reasons = " ".join(f"{reason}:{count}" for reason, count in outcome.reasons.items())
-        counts = (outcome.frames, outcome.correct, outcome.wrong, invalid)
-        rows.append([outcome.influence, outcome.value, *counts, reasons])
+        counts = (outcome.frames, outcome.correct, outcome.wrong, outcome.invalid)
+        rows.append([outcome.influence, outcome.value, *counts, _reasons(outcome, " ", ":")])
     return _csv("influence value frames correct wrong invalid reasons", rows)
 
 
 def _plot_errors(report: EcssReport, folder: Path) -> Path:
     from starid.plots import figure, save
 
-    shown = [line for line in (*report.lines, report.total, report.measured) if line.arcsec is not None]
+    shown = [line for line in report.all_lines if line.arcsec is not None]
     fig, axes = figure(height=3.6)
     heights = np.arange(len(shown))
     axes.barh(heights - 0.2, [line.across_arcsec for line in shown], 0.38, label="across the boresight")

@@ -41,7 +41,6 @@ class StageRow:
     stage: str
     """`render`, `detect`, `identify`, or `all`."""
     frames: int
-    """Number of measured frames."""
     median_ms: float
     p99_ms: float
     least_ms: float
@@ -56,18 +55,8 @@ def measure_frames(
 ) -> list[StageRow]:
     """Measure the processor time of each stage over frames of random attitude, after a warm-up.
 
-    The thread's processor time is used because other programs on the machine have little effect on it.
-
-    Parameters
-    ----------
-    frames : int
-        Number of measured frames.
-    seed : int
-        Seed of attitudes and noise.
-    rate_deg_s : float
-        Body rate during the exposures, about an axis across the boresight.
-    progress : callable, optional
-        Receives one line per step.
+    The body turns about an axis across the boresight. The thread's processor time is used because other programs on
+    the machine have little effect on it.
     """
     if frames < 1:
         raise EmulatorError(f"bench frame: frames must be at least one, not {frames}")
@@ -110,12 +99,9 @@ class BodiesRow:
     stage: str
     """`render` or, with detection and identification, `all`."""
     frames: int
-    """Number of measured frames of each kind."""
     without_ms: float
     with_ms: float
-    """Medians, milliseconds."""
     ratio: float
-    """`with_ms` divided by `without_ms`."""
 
 
 def measure_bodies(

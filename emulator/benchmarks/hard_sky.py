@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sky.objects import Moon, PointSource, SkyObjects, SunGlare
+from starid.arrays import Array
 from starid.attitude import Attitude
 
 HARD_SENSOR: Final = SensorModel(limiting_magnitude=4.8, hot_pixels=500)
@@ -28,15 +28,7 @@ _COSMIC_RAYS_S: Final = 50.0
 
 
 def hard_sky(attitude: Attitude, rng: np.random.Generator) -> SkyObjects:
-    """Make a hard sky: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun.
-
-    Parameters
-    ----------
-    attitude : Attitude
-        Attitude of the sensor.
-    rng : Generator
-        Random generator for everything that differs between frames.
-    """
+    """Make a hard sky around an attitude: 100 false stars, 3 planets, particles, and the Moon in the field or glare of the Sun."""
     planets = tuple(
         PointSource(
             *direction_around(attitude, (0.0, _WITHIN_DEG), rng), float(rng.uniform(*_PLANET_MAGNITUDES))
@@ -69,6 +61,6 @@ def direction_around(
     low, high = np.cos(np.deg2rad(away_deg))
     cosine, angle = rng.uniform(high, low), rng.uniform(0.0, 2.0 * np.pi)
     sine = np.sqrt(1.0 - cosine * cosine)
-    seen: npt.NDArray[np.float64] = np.array([sine * np.cos(angle), sine * np.sin(angle), cosine])
+    seen: Array = np.array([sine * np.cos(angle), sine * np.sin(angle), cosine])
     x, y, z = attitude.matrix.T @ seen
     return float(np.rad2deg(np.arctan2(y, x)) % 360.0), float(np.rad2deg(np.arcsin(np.clip(z, -1.0, 1.0))))

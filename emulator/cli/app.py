@@ -14,26 +14,11 @@ from starhil.protocol.errors import ProtocolError
 from starid.cli import command_line
 from starid.errors import StaridError
 
-COMMANDS: Final[dict[str, str]] = {
-    name: f"starhil.emulator.cli.{name}"
-    for name in (
-        "icd",
-        "truth",
-        "fmu",
-        "unit",
-        "run",
-        "replay",
-        "bench",
-        "render",
-        "campaign",
-        "endurance",
-        "session",
-        "conformance",
-        "hub",
-        "cache",
-        "docs",
-    )
-}
+_NAMES: Final = (
+    "icd truth fmu unit run replay bench render campaign endurance session conformance hub cache docs"
+)
+
+COMMANDS: Final = {name: f"starhil.emulator.cli.{name}" for name in _NAMES.split()}
 """Sub-command → module."""
 
 MOVED: Final[dict[tuple[str, ...], str]] = {

@@ -7,20 +7,18 @@ import json
 from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import DIALECTS, DeviceAddress, SerialDialect, Unit
+from starhil.emulator.cli.options import DeviceAddress, Seed, SerialDialect, Unit, checked_dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.cli.options import AsJson, one_of
 from starid.cli.output import Column, output_help, prepare_output, print_table, progress
 
 if TYPE_CHECKING:
     from starhil.emulator.cli.bench_bus import Target
-
-Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 
 group = typer.Typer(
     help="Measure speed, latency, bus load and centroids (for the attitude accuracy of a device, see campaign; for solvers, starid bench).",
@@ -192,9 +190,7 @@ class TargetOptions:
         from starhil.emulator.cli.bench_bus import Target
         from starhil.protocol.serial_interface import Dialect
 
-        if self.dialect is not None:
-            one_of("--dialect", self.dialect, DIALECTS)
-        dialect = Dialect(self.dialect or "b")
+        dialect = Dialect(checked_dialect(self.dialect) or "b")
         return Target(self.can, self.serial, self.canopen, self.device_address, self.baud, dialect)
 
 

@@ -135,22 +135,16 @@ def measure(
     if target.can is not None:
         jitter_s = max(min(seconds / 3.0, 20.0), 2.0)
         report(f"jitter: {jitter_s:g} s each")
-        figures.jitter += measure_jitter(icd, target.can, jitter_s, device=target.device, node=target.canopen)
+        can, node = target.can, target.canopen
+        measurements = [unsolicited_jitter(icd, can, jitter_s, UNSOLICITED_HZ, device=target.device)]
+        if node is not None:
+            measurements += [
+                heartbeat_jitter(can, jitter_s, HEARTBEAT_MS, node=node),
+                event_timer_jitter(can, jitter_s, EVENT_TIMER_MS, node=node),
+                sync_to_pdo(can, jitter_s, SYNC_S, node=node),
+            ]
+        figures.jitter = [asyncio.run(measurement) for measurement in measurements]
     return figures
-
-
-def measure_jitter(
-    icd: InterfaceDefinition, can: str, seconds: float, *, device: int, node: int | None
-) -> list[Jitter]:
-    """Measure the jitter of periodic telemetry and, with a CANopen node, of its periodic messages."""
-    measurements = [unsolicited_jitter(icd, can, seconds, UNSOLICITED_HZ, device=device)]
-    if node is not None:
-        measurements += [
-            heartbeat_jitter(can, seconds, HEARTBEAT_MS, node=node),
-            event_timer_jitter(can, seconds, EVENT_TIMER_MS, node=node),
-            sync_to_pdo(can, seconds, SYNC_S, node=node),
-        ]
-    return [asyncio.run(measurement) for measurement in measurements]
 
 
 @contextmanager

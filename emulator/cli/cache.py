@@ -5,11 +5,10 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import names_of
+from starhil.emulator.cli.options import ProfileArgument
 from starhil.emulator.cli.output import report_slow_start
 from starid.cli.options import AsJson
 
@@ -50,14 +49,7 @@ def info(as_json: AsJson = False) -> None:
 
 @group.command("warm")
 def warm(
-    profile: Annotated[
-        str | None,
-        typer.Argument(
-            help="Device profile for which to fill the cache: a name or a TOML file.",
-            show_default="cubestar",
-            autocompletion=names_of("profile"),
-        ),
-    ] = None,
+    profile: ProfileArgument = None,
 ) -> None:
     """Compile the kernels and build the star index, as the first start of a profile does.
 
@@ -65,7 +57,7 @@ def warm(
     """
     from dataclasses import replace
 
-    from starhil.emulator.pipeline.imager import ProcessImager
+    from starhil.emulator.pipeline.imager import WorkerImager
     from starhil.emulator.pipeline.worker_process import WorkerProcess
     from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
@@ -76,7 +68,7 @@ def warm(
     setup = replace(setup, previews=True, sky={"bodies": "ephemeris"})  # these have kernels of their own
 
     async def start() -> None:
-        imager = ProcessImager(setup, WorkerProcess())
+        imager = WorkerImager(setup, WorkerProcess())
         progress = asyncio.create_task(report_slow_start())
         try:
             await imager.start()

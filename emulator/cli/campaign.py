@@ -8,16 +8,22 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import names_of
+from starhil.emulator.cli.options import Jobs, Seed, Settings, names_of
 from starid.cli.options import AsJson
+from starid.cli.output import Column, print_table
 
 if TYPE_CHECKING:
     from starhil.emulator.benchmarks.campaign import CampaignPlan
+
+_COLUMNS: Final[tuple[Column, ...]] = (
+    ("figure", lambda row: row[0]),
+    ("value", lambda row: f"{row[1]:.4g}" if isinstance(row[1], float) else str(row[1])),
+)
 
 group = typer.Typer(
     help="Measure the accuracy and reliability of attitudes over many rendered images (for speed and solvers, see bench).",
@@ -25,9 +31,31 @@ group = typer.Typer(
 )
 
 
+@dataclass(frozen=True)
+class EcssOptions:
+    """The device and the images of a campaign per ECSS-E-ST-60-20C."""
+
+    profile: Annotated[
+        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
+    ] = "cubestar"
+    setting: Settings = None
+    confidence: Annotated[float, typer.Option(help="Confidence level of the errors, 0.5 to below 1.")] = 0.997
+    rest_frames: Annotated[int, typer.Option(min=10, help="Images at random attitudes, at rest.")] = 2000
+    frames: Annotated[
+        int, typer.Option(min=5, help="Images at each value of an influence (rate, Sun …).")
+    ] = 100
+    fields: Annotated[
+        int, typer.Option(min=3, help="Number of directions in the sky, to separate the kinds of error.")
+    ] = 80
+    seed: Seed = 1
+    jobs: Jobs = 1
+
+
 @group.callback()
+@with_option_groups
 def campaigns(
     context: typer.Context,
+    *,
     ecss: Annotated[
         bool,
         typer.Option(
@@ -35,25 +63,7 @@ def campaigns(
             help="Measure the performance of a device per ECSS-E-ST-60-20C and write a report to -o.",
         ),
     ] = False,
-    profile: Annotated[
-        str, typer.Option(help="Device profile: a name or a TOML file.", autocompletion=names_of("profile"))
-    ] = "cubestar",
-    setting: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the profile. Repeatable."),
-    ] = None,
-    confidence: Annotated[
-        float, typer.Option(help="Confidence level of the errors, 0.5 to below 1.")
-    ] = 0.997,
-    rest_frames: Annotated[int, typer.Option(min=10, help="Images at random attitudes, at rest.")] = 2000,
-    frames: Annotated[
-        int, typer.Option(min=5, help="Images at each value of an influence (rate, Sun …).")
-    ] = 100,
-    fields: Annotated[
-        int, typer.Option(min=3, help="Number of directions in the sky, to separate the kinds of error.")
-    ] = 80,
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    images: EcssOptions,
     output: Annotated[
         Path | None,
         typer.Option(
@@ -81,15 +91,20 @@ def campaigns(
     from starhil.emulator.benchmarks.ecss_errors import coverage_factor
     from starhil.emulator.benchmarks.ecss_report import as_markdown, make_report, write_report
 
-    coverage_factor(confidence)  # before hours of work
+    coverage_factor(images.confidence)  # before hours of work
     if output is not None:
         import_module("matplotlib")
     plan = EcssPlan(
-        profile, tuple(setting or ()), seed, fields=fields, rest_frames=rest_frames, frames=frames
+        images.profile,
+        tuple(images.setting or ()),
+        images.seed,
+        fields=images.fields,
+        rest_frames=images.rest_frames,
+        frames=images.frames,
     )
     folder = None if output is None else output / "parts"
-    finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=jobs), len(parts(plan))))
-    report = make_report(plan, finished, confidence)
+    finished = list(_with_progress(run_ecss(plan, folder=folder, jobs=images.jobs), len(parts(plan))))
+    report = make_report(plan, finished, images.confidence)
     files = () if output is None else write_report(report, output)
     if as_json:
         print(json.dumps({**report.figures(), "files": [str(file) for file in files]}))
@@ -106,7 +121,7 @@ class PlanOptions:
     """The images of a campaign."""
 
     frames: Annotated[int, typer.Option(min=1, help="Number of images.")] = 1000
-    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1
+    seed: Seed = 1
     fov: Annotated[float, typer.Option(help="Full width of the field of view, degrees.")] = 42.0
     unknown_field: Annotated[
         bool,
@@ -184,7 +199,7 @@ def lost_in_space(
     if as_json:
         print(json.dumps(figures))
     else:
-        _print_table(figures)
+        print_table(_COLUMNS, figures.items())
     if figures["wrong"] or figures["valid_pct"] < require_valid:
         raise typer.Exit(1)
 
@@ -229,13 +244,3 @@ def _with_progress(chunks: Any, total: int) -> Any:
     from rich.progress import track
 
     return track(chunks, "campaign", total=total, console=Console(stderr=True))
-
-
-def _print_table(figures: dict[str, Any]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-
-    table = Table("figure", "value", title="lost in space, full images")
-    for name, value in figures.items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
-    Console().print(table)

@@ -4,29 +4,20 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starhil.emulator.cli.options import (
-    DIALECTS,
-    CanChannel,
-    CanopenNode,
-    ConsoleAddress,
-    DeviceAddress,
-    HostAddress,
-    JunitFile,
-    SerialDialect,
-    SerialPort,
-    UnitChoice,
-    names_of,
-)
+from starhil.emulator.cli.option_groups import with_option_groups
+from starhil.emulator.cli.options import BenchOptions, Settings, checked_dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
-from starid.cli.options import AsJson, one_of
+from starid.cli.options import AsJson
 from starid.cli.output import output_help
 
 if TYPE_CHECKING:
+    from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
     from starhil.protocol.definition import InterfaceDefinition
 
 
@@ -38,28 +29,16 @@ def links_of(icd: InterfaceDefinition, node: int | None) -> tuple[str | None, st
     return serial, None if icd.link.can is None and node is None else "auto", node
 
 
-def command(
-    patterns: Annotated[
-        list[str] | None,
-        typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'. Default: all."),
-    ] = None,
-    unit: UnitChoice = None,
-    serial: SerialPort = None,
-    can: CanChannel = None,
-    canopen: CanopenNode = None,
-    eds: Annotated[
-        Path | None, typer.Option(help="EDS file of the CANopen node; default: starhil's.")
-    ] = None,
-    start: Annotated[bool, typer.Option("--start", help="Start the emulator for this run.")] = False,
-    profile: Annotated[
-        str | None, typer.Option(help="With --start: device profile.", autocompletion=names_of("profile"))
-    ] = None,
-    settings: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", help="With --start: override a key of the profile: section.key=value. Repeatable."
-        ),
-    ] = None,
+@dataclass(frozen=True)
+class CaseOptions:
+    """Which cases are run, and how."""
+
+    canopen: Annotated[
+        int | None,
+        typer.Option(min=1, max=127, help="Also test the CANopen node with this ID on the CAN channel."),
+    ] = None
+    eds: Annotated[Path | None, typer.Option(help="EDS file of the CANopen node; default: starhil's.")] = None
+    settings: Settings = None
     speed: Annotated[
         float,
         typer.Option(
@@ -68,27 +47,71 @@ def command(
             help="Simulation seconds per second, below 1 for a slow or busy machine. An emulator that is already "
             "running must use the same speed (run --clock scaled:…).",
         ),
-    ] = 1.0,
+    ] = 1.0
     safe_only: Annotated[
         bool, typer.Option("--safe-only", help="Run only cases that change nothing; for a unit in use.")
-    ] = False,
-    list_only: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
-    junit: JunitFile = None,
-    view: ConsoleAddress = None,
-    html: Annotated[
-        Path | None,
-        typer.Option(help=output_help("Write an HTML report with the sent, expected and received data.")),
-    ] = None,
-    dialect: SerialDialect = None,
+    ] = False
     baud: Annotated[
         int | None,
         typer.Option(
             help="Bit rate of the serial line. Default: 115200, without checking the pace of replies."
         ),
+    ] = None
+    time_out: Annotated[float, typer.Option(min=0.01, help="Timeout for a reply, seconds.")] = 1.0
+
+    def request(
+        self, bench: BenchOptions, patterns: tuple[str, ...], *, list_only: bool
+    ) -> ConformanceRequest:
+        """Return the request, with all links of the unit if the emulator is started and none is given."""
+        from starhil.hil_tests.conformance.conformance_run import ConformanceRequest
+        from starhil.hil_tests.conformance.link_probe import ProbeTimes
+        from starhil.hil_tests.errors import BenchError
+        from starhil.protocol.icd import load_unit
+
+        serial, can, canopen = bench.serial, bench.can, self.canopen
+        if (bench.start or list_only) and serial is None and can is None:
+            serial, can, canopen = links_of(load_unit(bench.unit or DEFAULT_UNIT), canopen)
+        if self.settings and not bench.start:
+            raise BenchError("--set needs --start: it overrides a key of the emulator's profile")
+        if canopen is not None and can is None:
+            raise BenchError("--canopen needs --can: give the channel of the node")
+        if not bench.start and not list_only and serial == "auto":
+            raise BenchError("--serial auto needs --start; otherwise name the port")
+        return ConformanceRequest(
+            unit=bench.unit,
+            serial=serial,
+            can=can,
+            canopen_node=canopen,
+            eds=self.eds,
+            start=bench.start,
+            profile=bench.profile,
+            settings=tuple(self.settings or ()),
+            dialect=checked_dialect(bench.dialect),
+            baud=self.baud,
+            host_address=bench.host_address,
+            device_address=bench.device_address,
+            patterns=patterns,
+            safe_only=self.safe_only,
+            speed=self.speed,
+            times=ProbeTimes(answer_s=self.time_out),
+            view=bench.view,
+        )
+
+
+@with_option_groups
+def command(
+    patterns: Annotated[
+        list[str] | None,
+        typer.Argument(help="Cases or areas, such as serial.framing or 'can.fields.*'. Default: all."),
     ] = None,
-    host_address: HostAddress = 1,
-    device_address: DeviceAddress = 4,
-    time_out: Annotated[float, typer.Option(min=0.01, help="Timeout for a reply, seconds.")] = 1.0,
+    *,
+    bench: BenchOptions,
+    cases: CaseOptions,
+    list_only: Annotated[bool, typer.Option("--list", help="List the cases and exit.")] = False,
+    html: Annotated[
+        Path | None,
+        typer.Option(help=output_help("Write an HTML report with the sent, expected and received data.")),
+    ] = None,
     verbose: Annotated[bool, typer.Option("--verbose", help="Print passed cases too.")] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -104,42 +127,11 @@ def command(
     from rich.console import Console
 
     from starhil.hil_tests.conformance import report
-    from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, all_cases, run_conformance
-    from starhil.hil_tests.conformance.link_probe import ProbeTimes
-    from starhil.hil_tests.errors import BenchError
+    from starhil.hil_tests.conformance.conformance_run import all_cases, run_conformance
     from starhil.hil_tests.interruption import interruptible
     from starhil.hil_tests.results import prepare_report
-    from starhil.protocol.icd import load_unit
 
-    if dialect is not None:
-        one_of("--dialect", dialect, DIALECTS)
-    if (start or list_only) and serial is None and can is None:
-        serial, can, canopen = links_of(load_unit(unit or DEFAULT_UNIT), canopen)
-    if settings and not start:
-        raise BenchError("--set needs --start: it overrides a key of the emulator's profile")
-    if canopen is not None and can is None:
-        raise BenchError("--canopen needs --can: give the channel of the node")
-    if not start and not list_only and serial == "auto":
-        raise BenchError("--serial auto needs --start; otherwise name the port")
-    request = ConformanceRequest(
-        unit=unit,
-        serial=serial,
-        can=can,
-        canopen_node=canopen,
-        eds=eds,
-        start=start,
-        profile=profile,
-        settings=tuple(settings or ()),
-        dialect=dialect,
-        baud=baud,
-        host_address=host_address,
-        device_address=device_address,
-        patterns=tuple(patterns or ()),
-        safe_only=safe_only,
-        speed=speed,
-        times=ProbeTimes(answer_s=time_out),
-        view=view,
-    )
+    request, junit = cases.request(bench, tuple(patterns or ()), list_only=list_only), bench.junit
     console = Console(highlight=False, quiet=as_json)
     if list_only:
         for item in all_cases(request):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 import json
 import logging
 import resource
@@ -10,14 +11,15 @@ import tempfile
 import time
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
 
-from starhil.emulator.cli.options import names_of
+from starhil.emulator.cli.option_groups import with_option_groups
+from starhil.emulator.cli.options import Jobs, names_of
 from starid.cli.options import AsJson
 
 IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made there)
@@ -25,31 +27,54 @@ IN_MEMORY: Final = Path("/dev/shm")  # noqa: S108 (a folder of its own is made t
 RENDERED_STEPS: Final = 40
 """Steps of a life whose images are rendered."""
 LONG_STEPS: Final = 150
-"""Steps of a long life."""
 SIGMA_ARCSEC: Final = {False: (10.0, 33.0), True: (60.0, 300.0)}
 """Largest standard deviations across and about the boresight of the error model, and of rendered images."""
 YEAR_S: Final = 365.25 * 86_400.0
 
 
-def command(
+@dataclass(frozen=True)
+class PlanOptions:
+    """The lives of a run."""
+
     unit: Annotated[
         list[str] | None,
         typer.Option(
             help="Unit: a name or a folder. Repeatable; default: all bundled units in turns.",
             autocompletion=names_of("unit"),
         ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the first life; the others follow.")] = 1,
-    lives: Annotated[int, typer.Option(min=1, help="Number of lives.")] = 60,
+    ] = None
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the first life; the others follow.")] = 1
+    lives: Annotated[int, typer.Option(min=1, help="Number of lives.")] = 60
     hours: Annotated[
         float | None, typer.Option(min=0.001, help="Start lives for this time instead of a number of them.")
-    ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of a life.")] = 400,
+    ] = None
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a life.")] = 400
     rendered: Annotated[
         int, typer.Option(min=0, help="One life in this number is rendered and solved; 0: none.")
-    ] = 97,
-    long: Annotated[int, typer.Option(min=0, help="One life in this number lasts for months; 0: none.")] = 25,
-    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = 1,
+    ] = 97
+    long: Annotated[int, typer.Option(min=0, help="One life in this number lasts for months; 0: none.")] = 25
+    jobs: Jobs = 1
+
+    def plan(self) -> Iterator[tuple[str, int, int, str]]:
+        """Generate unit, seed, steps and kind of each life; a kind has a period, in which its last life is of it."""
+        from starhil.protocol.unit_folders import bundled_units
+
+        units = self.unit or sorted(bundled_units())
+        kinds = {"rendered": (self.rendered, RENDERED_STEPS), "long": (self.long, LONG_STEPS)}
+        kinds["usual"] = (1, self.steps)
+        for number in itertools.count() if self.hours is not None else range(self.lives):
+            kind, steps = next(
+                (name, steps)
+                for name, (period, steps) in kinds.items()
+                if period and not (number + 1) % period
+            )
+            yield units[number % len(units)], self.seed + number, steps, kind
+
+
+@with_option_groups
+def command(
+    *,
+    plan: PlanOptions,
     life: Annotated[
         Path | None, typer.Option(help="Repeat one life, a file that an earlier run has written.")
     ] = None,
@@ -64,16 +89,12 @@ def command(
     a violation is shortened and written to -o as a life, a session and a recording. The exit status is 1 if
     there is one.
     """
-    from starhil.protocol.unit_folders import bundled_units
-
     if life is not None:
         found = read_life(life)
         outcomes = [{**live(found.unit, found, rendered=False, folder=output), "kind": "usual"}]
     else:
-        kinds = {"rendered": (rendered, RENDERED_STEPS), "long": (long, LONG_STEPS), "usual": (1, steps)}
-        plan = _plan(unit or sorted(bundled_units()), seed, None if hours is not None else lives, kinds)
-        outcomes = list(_run(plan, output, jobs, lives, hours))
-    figures = {"seed": seed, **summary(outcomes)}
+        outcomes = list(_run(plan, output))
+    figures = {"seed": plan.seed, **summary(outcomes)}
     if as_json:
         print(json.dumps({**figures, "violations": [item for item in outcomes if item["violation"]]}))
     else:
@@ -82,44 +103,29 @@ def command(
         raise typer.Exit(1)
 
 
-def _plan(
-    units: list[str], seed: int, lives: int | None, kinds: dict[str, tuple[int, int]]
-) -> Iterator[tuple[str, int, int, str]]:
-    """Generate unit, seed, steps and kind of each life; a kind has a period, in which its last life is of it."""
-    number = 0
-    while lives is None or number < lives:
-        kind, steps = next(
-            (name, steps) for name, (period, steps) in kinds.items() if period and not (number + 1) % period
-        )
-        yield units[number % len(units)], seed + number, steps, kind
-        number += 1
-
-
-def _run(
-    plan: Iterator[tuple[str, int, int, str]], folder: Path, jobs: int, lives: int, hours: float | None
-) -> Iterator[dict[str, Any]]:
+def _run(plan: PlanOptions, folder: Path) -> Iterator[dict[str, Any]]:
     """Run the lives of a plan in processes, until its end or that of the time."""
     from rich.console import Console
     from rich.progress import Progress
 
-    begin = time.monotonic()
-    total = lives if hours is None else hours * 3600.0
+    begin, lives = time.monotonic(), plan.plan()
+    limit_s = None if plan.hours is None else plan.hours * 3600.0
     with (
-        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+        ProcessPoolExecutor(plan.jobs, mp_context=get_context("spawn")) as pool,
         Progress(console=Console(stderr=True)) as progress,
     ):
-        task = progress.add_task("endurance", total=total)
+        task = progress.add_task("endurance", total=limit_s or plan.lives)
         running: set[Future[dict[str, Any]]] = set()
         done = 0
         while True:
-            in_time = hours is None or time.monotonic() - begin < hours * 3600.0
-            while in_time and len(running) < 2 * jobs and (item := next(plan, None)) is not None:
+            in_time = limit_s is None or time.monotonic() - begin < limit_s
+            while in_time and len(running) < 2 * plan.jobs and (item := next(lives, None)) is not None:
                 running.add(pool.submit(live_from_seed, *item, folder))
             if not running:
                 return
             ended, running = wait(running, return_when=FIRST_COMPLETED)
             done += len(ended)
-            progress.update(task, completed=done if hours is None else time.monotonic() - begin)
+            progress.update(task, completed=done if limit_s is None else time.monotonic() - begin)
             for future in ended:
                 yield future.result()
 
@@ -227,29 +233,22 @@ def read_life(path: Path) -> Any:
 
 def summary(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
     """Return device-years, counts and the ratio of device time to processor time, in all and by unit."""
-    by_unit = {unit: _of(group) for unit, group in _grouped(outcomes).items()}
+    units = sorted({item["unit"] for item in outcomes})
+    by_unit = {unit: _of([item for item in outcomes if item["unit"] == unit]) for unit in units}
     return {**_of(outcomes), "units": by_unit}
 
 
-def _grouped(outcomes: list[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    groups: dict[str, list[dict[str, Any]]] = {}
-    for item in outcomes:
-        groups.setdefault(item["unit"], []).append(item)
-    return dict(sorted(groups.items()))
-
-
 def _of(outcomes: list[dict[str, Any]]) -> dict[str, Any]:
-    device_s, cpu_s = sum(item["device_s"] for item in outcomes), sum(item["cpu_s"] for item in outcomes)
+    names = ("device_s", "exposed_s", "cpu_s", "frames", "requests", "readings", "attitudes")
+    total = {name: sum(item[name] for item in outcomes) for name in names}
+    device_s, exposed_s, cpu_s = (total.pop(name) for name in names[:3])
     return {
         "lives": len(outcomes),
         "device_years": device_s / YEAR_S,
-        "imaging_years": sum(item["exposed_s"] for item in outcomes) / YEAR_S,
+        "imaging_years": exposed_s / YEAR_S,
         "factor": device_s / max(cpu_s, 1e-9),
         "cpu_hours": cpu_s / 3600.0,
-        "frames": sum(item["frames"] for item in outcomes),
-        "requests": sum(item["requests"] for item in outcomes),
-        "readings": sum(item["readings"] for item in outcomes),
-        "attitudes": sum(item["attitudes"] for item in outcomes),
+        **total,
         "violating": sum(bool(item["violation"]) for item in outcomes),
     }
 

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-from starid.cli.output import output_help, prepare_output
+from starhil.emulator.cli.options import ProfileArgument
+from starhil.emulator.cli.output import writing
+from starid.cli.output import output_help
 
 group = typer.Typer(help="Export the star tracker as a Functional Mock-up Unit (FMU).", no_args_is_help=True)
 
@@ -19,9 +21,7 @@ def _about() -> None:
 
 @group.command()
 def export(
-    profile: Annotated[
-        str | None, typer.Argument(help="Device profile: a name or a TOML file.", show_default="cubestar")
-    ] = None,
+    profile: ProfileArgument = None,
     output: Annotated[Path, typer.Option("--output", "-o", help=output_help("The FMU."))] = Path(
         "startracker.fmu"
     ),
@@ -33,7 +33,6 @@ def export(
     """
     from typing import Literal, cast
 
-    from starhil.emulator.errors import EmulatorError
     from starhil.emulator.fmu.export import export_fmu
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
     from starhil.hil_tests.emulator_process import installed_command
@@ -42,15 +41,6 @@ def export(
     one_of("--fmi", fmi, ("2", "3"))
     name = profile or DEFAULT_PROFILE
     load_profile(name)
-    prepare_output(output, "-o")
-    try:
-        export_fmu(
-            output,
-            str(Path(name).absolute()) if name.endswith(".toml") else name,
-            installed_command(),
-            cast("Literal['2', '3']", fmi),
-        )
-    except OSError as error:
-        raise EmulatorError(
-            f"{output}: cannot be written ({error.strerror}); choose another file with -o"
-        ) from None
+    where = str(Path(name).absolute()) if name.endswith(".toml") else name
+    with writing(output):
+        export_fmu(output, where, installed_command(), cast("Literal['2', '3']", fmi))

@@ -9,10 +9,10 @@ from typing import Annotated
 import typer
 
 from starhil.emulator.cli.options import Unit
-from starhil.emulator.cli.output import print_text
+from starhil.emulator.cli.output import print_text, writing
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.cli.options import AsJson
-from starid.cli.output import output_help, prepare_output
+from starid.cli.output import output_help
 
 group = typer.Typer(help="List or export the interface definition.", no_args_is_help=True)
 
@@ -77,16 +77,10 @@ def export(
 
 def _write(path: Path, text: str) -> None:
     """Write a file atomically."""
-    from starhil.emulator.errors import EmulatorError
     from starid.files import write_atomically
 
-    prepare_output(path, "-o")
-    try:
+    with writing(path):
         write_atomically(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise EmulatorError(
-            f"{path}: cannot be written ({error.strerror}); choose another file with -o"
-        ) from None
 
 
 @group.command("list")

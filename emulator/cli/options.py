@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import typer
 
 from starhil.protocol.names import Kind, bundled
+from starid.cli.options import one_of
 from starid.cli.output import output_help
 
 
@@ -44,56 +46,71 @@ def _description(text: str) -> str:
     return " ".join(comment).partition(". ")[0].rstrip(".") or str(tomllib.loads(text)["title"])
 
 
-SerialPort: TypeAlias = Annotated[
+ProfileArgument: TypeAlias = Annotated[
     str | None,
-    typer.Option("--serial", help="Serial port: /dev/…, socket://HOST:PORT, or auto with --start."),
-]
-CanChannel: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--can", help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …, or auto with --start."
+    typer.Argument(
+        help="Device profile: a name or a TOML file.",
+        show_default="cubestar",
+        autocompletion=names_of("profile"),
     ),
+]
+Settings: TypeAlias = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
 ]
 SerialDialect: TypeAlias = Annotated[
     str | None,
     typer.Option("--dialect", help="Format of serial replies, if the unit has several: a, b (default) or c."),
 ]
-HostAddress: TypeAlias = Annotated[int, typer.Option("--host-address", help="CAN address of the OBC.")]
 DeviceAddress: TypeAlias = Annotated[int, typer.Option("--device-address", help="CAN address of the device.")]
-CanopenNode: TypeAlias = Annotated[
-    int | None,
-    typer.Option(
-        "--canopen", min=1, max=127, help="Also test the CANopen node with this ID on the CAN channel."
-    ),
-]
-Unit: TypeAlias = Annotated[
-    str,
-    typer.Option(
-        "--unit",
-        help="Interface of the device: name of a bundled unit, or a folder of TOML files.",
-        autocompletion=names_of("unit"),
-    ),
-]
+_UNIT = "Interface of the device: name of a bundled unit, or a folder of TOML files."
+Unit: TypeAlias = Annotated[str, typer.Option("--unit", help=_UNIT, autocompletion=names_of("unit"))]
 UnitChoice: TypeAlias = Annotated[
     str | None,
     typer.Option(
-        "--unit",
-        help="Interface of the device: name of a bundled unit, or a folder of TOML files. Default: the profile's (cubestar).",
-        autocompletion=names_of("unit"),
+        "--unit", help=_UNIT + " Default: the profile's (cubestar).", autocompletion=names_of("unit")
     ),
 ]
-JunitFile: TypeAlias = Annotated[
-    Path | None, typer.Option("--junit", help=output_help("Write a JUnit XML file."))
-]
-
-ConsoleAddress: TypeAlias = Annotated[
-    str | None,
-    typer.Option(
-        "--view",
-        metavar="[ADDRESS]",
-        help="Show the results on a console as they arrive. ADDRESS is on the ready line of `starhil run --view`; "
-        "default with --start: the started emulator's console.",
-    ),
-]
+Seed: TypeAlias = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
+Jobs: TypeAlias = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.")]
 
 DIALECTS = ("a", "b", "c")
+
+
+def checked_dialect(dialect: str | None) -> str | None:
+    """Return the value of `--dialect`, which must be one of `DIALECTS` if it is given."""
+    return None if dialect is None else one_of("--dialect", dialect, DIALECTS)
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """A device on its links, which the bench tests, or the emulator that it starts for this."""
+
+    unit: UnitChoice = None
+    serial: Annotated[
+        str | None, typer.Option(help="Serial port: /dev/…, socket://HOST:PORT, or auto with --start.")
+    ] = None
+    can: Annotated[
+        str | None,
+        typer.Option(help="CAN channel: vcan0, socketcand:127.0.0.1:29536/vcan0, …, or auto with --start."),
+    ] = None
+    dialect: SerialDialect = None
+    host_address: Annotated[int, typer.Option(help="CAN address of the OBC.")] = 1
+    device_address: DeviceAddress = 4
+    start: Annotated[bool, typer.Option("--start", help="Start the emulator for this run.")] = False
+    profile: Annotated[
+        str | None,
+        typer.Option(
+            help="With --start: device profile, instead of the session's or cubestar.",
+            autocompletion=names_of("profile"),
+        ),
+    ] = None
+    junit: Annotated[Path | None, typer.Option(help=output_help("Write a JUnit XML file."))] = None
+    view: Annotated[
+        str | None,
+        typer.Option(
+            metavar="[ADDRESS]",
+            help="Show the results on a console as they arrive. ADDRESS is on the ready line of `starhil run --view`; "
+            "default with --start: the started emulator's console.",
+        ),
+    ] = None

@@ -5,7 +5,13 @@ from __future__ import annotations
 import asyncio
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Final
+
+from starhil.emulator.errors import explained
+from starid.cli.output import prepare_output
 
 PROGRESS_S: Final = 5.0
 """Time after which the progress of a slow start is reported, and between reports, seconds."""
@@ -21,6 +27,14 @@ async def report_slow_start() -> None:
         compiled = kernels_written_since(begin_s)
         reason = f", {compiled} kernels compiled; later starts use them" if compiled else ""
         print(f"starting: {time.time() - begin_s:.0f} s{reason}", file=sys.stderr, flush=True)
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Write the file of an option -o, whose folder is made; a failure is one line."""
+    prepare_output(path, "-o")
+    with explained(f"{path}: cannot be written", "choose another file with -o"):
+        yield
 
 
 def print_text(text: str) -> None:

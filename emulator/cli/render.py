@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from starhil.emulator.sensor.renderer import Frame
     from starhil.emulator.sky.view import SkyView
     from starid.camera import Camera
+    from starid.catalog import StarCatalog
 
 _NUMBERED_TO_MAGNITUDE = 3.6
 _TURN_DEG = 360.0
@@ -126,7 +127,6 @@ def command(
     """Render an image of the sky; the same options give the same bytes."""
     from starhil.emulator.sensor.renderer import Renderer
     from starid.attitude import Attitude
-    from starid.catalog import load_catalog
     from starid.imaging.image_io import image_suffix, write_image
 
     pointing.check()
@@ -134,14 +134,13 @@ def command(
     prepare_output(output, "-o")
     if lens.fov is not None and not lens.fov >= _NARROWEST_DEG:
         raise EmulatorError(f"--fov {lens.fov:g}: must be at least {_NARROWEST_DEG:g} degrees")
-    scene = _scene(profile)
-    camera, sensor = lens.applied(scene.camera), light.applied(scene.sensor)
-    catalog = load_catalog(scene.catalog_path or None, scene.epoch)
-    renderer = Renderer(camera, catalog, sensor, seed, scene.sky.objects)
+    camera, sensor, sky, catalog = _scene(profile)
+    camera, sensor = lens.applied(camera), light.applied(sensor)
+    renderer = Renderer(camera, catalog, sensor, seed, sky.objects)
     frame = renderer.render(
         Attitude.from_radec_roll(pointing.ra, pointing.dec, pointing.roll),
         [math.radians(value) for value in pointing.rate],
-        observer=scene.sky.observer,
+        observer=sky.observer,
     )
     write_image(output, _marked(frame) if as_annotated else frame.image)
     if as_json:
@@ -154,27 +153,16 @@ def command(
     typer.echo(text, file=report_stream(output))
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """Camera, sensor, catalogue and sky of an image."""
-
-    camera: Camera
-    sensor: SensorModel
-    sky: SkyView
-    catalog_path: str
-    epoch: float
-
-
-def _scene(profile: str | None) -> _Scene:
-    """Return the scene for the device of a profile, or the default."""
+def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatalog]:
+    """Return with what, and what, the device of a profile sees; by default those of camera and sensor, and no sky."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sky.objects import SkyObjects
     from starhil.emulator.sky.view import Sky, SkyView
     from starid.camera import Camera
-    from starid.catalog import DEFAULT_EPOCH
+    from starid.catalog import load_catalog
 
     if profile is None:
-        return _Scene(Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), "", DEFAULT_EPOCH)
+        return Camera.from_fov(), SensorModel(), SkyView(SkyObjects()), load_catalog()
     from starhil.emulator.device.device import profile_defaults
     from starhil.emulator.device.parameters import Parameters
     from starhil.emulator.device.surroundings import orbit_of
@@ -190,14 +178,13 @@ def _scene(profile: str | None) -> _Scene:
     orbit = orbit_of(loaded)
     at_start = None if orbit is None else orbit.state(loaded.start_unix_s)
     place = (None, None) if at_start is None else (at_start.position_m, at_start.velocity_m_s)
-    return _Scene(
+    return (
         Camera.from_dict(setup.camera),
         sensor.with_(
             exposure_s=float(parameters["exposure"]) / 1000.0, gain=float(parameters["analog_gain"])
         ),
         Sky(setup.sky).view(loaded.start_unix_s, *place),
-        setup.catalog_path,
-        setup.epoch,
+        load_catalog(setup.catalog_path or None, setup.epoch),
     )
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import names_of
+from starhil.emulator.cli.options import Settings, names_of
 from starid.cli.options import AsJson
 
 
@@ -22,12 +22,7 @@ def command(
             autocompletion=names_of("profile"),
         ),
     ] = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="SECTION.KEY=VALUE", help="Override a key of that profile. Repeatable."
-        ),
-    ] = None,
+    overrides: Settings = None,
     as_json: AsJson = False,
 ) -> int:
     """Replay a recorded run on the stepped clock and compare everything that the device sends and measures.

@@ -10,10 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
-from starhil.emulator.cli.options import DIALECTS, UnitChoice, list_option, names_of
+from starhil.emulator.cli.options import (
+    ProfileArgument,
+    Settings,
+    UnitChoice,
+    checked_dialect,
+    list_option,
+    names_of,
+)
 from starhil.emulator.cli.output import report_slow_start
 from starhil.emulator.errors import EmulatorError
-from starid.cli.options import one_of
 from starid.cli.output import output_help, prepare_output
 
 if TYPE_CHECKING:
@@ -67,10 +73,7 @@ class DeviceOptions:
         ),
     ] = None
     symlink: Annotated[Path | None, typer.Option(help="Symbolic link to the pty; removed at the end.")] = None
-    settings: Annotated[
-        list[str] | None,
-        typer.Option("--set", help="Override a key of the profile: section.key=value. Repeatable."),
-    ] = None
+    settings: Settings = None
 
     def profile(self, name: str, number: int) -> Profile:
         """Load the profile of the nth head, with the options in place of its keys; folders and links differ by head."""
@@ -78,6 +81,7 @@ class DeviceOptions:
         from starhil.emulator.profile import load_profile
 
         state_dir, symlink = self.state_dir, self.symlink
+        own_folder = "" if number == 1 else f"head-{number}"  # in the folder of the first
         values = {
             "unit": None if self.unit is None else _absolute_folder(self.unit),
             "links.serial.port": self.serial,
@@ -86,7 +90,7 @@ class DeviceOptions:
             "links.canopen.node": self.canopen,
             "run.clock": self.clock,
             "run.seed": self.seed,
-            "run.state_dir": None if state_dir is None else str(_folder_of_head(state_dir.resolve(), number)),
+            "run.state_dir": None if state_dir is None else str(state_dir.resolve() / own_folder),
             "links.serial.symlink": None
             if symlink is None
             else str(path_of_head(symlink.absolute(), number)),
@@ -179,14 +183,7 @@ class AroundOptions:
 
 @with_option_groups
 def command(
-    profile: Annotated[
-        str | None,
-        typer.Argument(
-            help="Device profile: a name or a TOML file.",
-            show_default="cubestar",
-            autocompletion=names_of("profile"),
-        ),
-    ] = None,
+    profile: ProfileArgument = None,
     head: Annotated[
         list[str] | None,
         typer.Option(
@@ -221,8 +218,7 @@ def command(
     if log not in levels:
         raise EmulatorError(f"--log {log}: must be one of {', '.join(levels)}")
     logging.basicConfig(level=log.upper(), format="%(relativeCreated)7.0f %(name)s %(levelname)s %(message)s")
-    if device.dialect is not None:
-        one_of("--dialect", device.dialect, DIALECTS)
+    checked_dialect(device.dialect)
     if head and profile is not None:
         raise EmulatorError(
             f"{profile}: a profile and --head exclude each other; give it as --head {profile}"
@@ -290,11 +286,6 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
         kind = "MCAP file" if mcap else "folder"
         raise EmulatorError(f"--record {found[1]}: one {kind} per run, and {found[0]} is one already")
     return found[0] if found else None
-
-
-def _folder_of_head(folder: Path, number: int) -> Path:
-    """Return the state folder of a head; the second head uses `head-2` in the folder of the first."""
-    return folder if number == 1 else folder / f"head-{number}"
 
 
 def _as_toml(value: str | int) -> str:

@@ -9,21 +9,12 @@ from typing import Annotated
 
 import typer
 
-from starhil.emulator.cli.options import (
-    CanChannel,
-    ConsoleAddress,
-    DeviceAddress,
-    HostAddress,
-    JunitFile,
-    SerialDialect,
-    SerialPort,
-    UnitChoice,
-    list_option,
-    names_of,
-)
+from starhil.emulator.cli.option_groups import with_option_groups
+from starhil.emulator.cli.options import BenchOptions, list_option, names_of
 from starid.cli.options import AsJson
 
 
+@with_option_groups
 def command(
     script: Annotated[
         Path,
@@ -31,27 +22,13 @@ def command(
             help="Name of a bundled session, or a TOML script.", autocompletion=names_of("session")
         ),
     ],
-    unit: UnitChoice = None,
-    serial: SerialPort = None,
-    can: CanChannel = None,
-    start: Annotated[bool, typer.Option("--start", help="Start the emulator for this session.")] = False,
-    profile: Annotated[
-        str | None,
-        typer.Option(
-            help="With --start: device profile, instead of that in the script.",
-            autocompletion=names_of("profile"),
-        ),
-    ] = None,
+    *,
+    bench: BenchOptions,
     log: Annotated[
         Path | None, typer.Option(help="Folder for logs, samples and images; default out/session/NAME.")
     ] = None,
-    junit: JunitFile = None,
-    view: ConsoleAddress = None,
     truth: Annotated[Path | None, typer.Option(help="Truth log of the emulator (run --truth-log).")] = None,
-    dialect: SerialDialect = None,
     baud: Annotated[int, typer.Option(help="Bit rate of a real serial line.")] = 115200,
-    host_address: HostAddress = 1,
-    device_address: DeviceAddress = 4,
     keep_going: Annotated[bool, typer.Option("--keep-going", help="Continue after a failed step.")] = False,
     as_json: AsJson = False,
     _list: Annotated[bool, list_option("session")] = False,
@@ -67,26 +44,21 @@ def command(
     from starhil.hil_tests.interruption import interruptible
     from starhil.hil_tests.session_run import SessionRequest, run_session
 
-    options = LinkOptions(
-        serial=serial,
-        can=can,
-        dialect=dialect,
-        baud=baud,
-        host_address=host_address,
-        device_address=device_address,
+    links = LinkOptions(
+        bench.serial, bench.can, bench.dialect, baud, bench.host_address, bench.device_address
     )
     request = SessionRequest(
-        script=script,
-        unit=unit,
-        options=options,
-        start=start,
-        profile=profile,
-        folder=log,
-        junit=junit,
-        truth=truth,
-        keep_going=keep_going,
+        script,
+        links,
+        bench.unit,
+        bench.start,
+        bench.profile,
+        log,
+        bench.junit,
+        truth,
+        keep_going,
         quiet=as_json,
-        view=view,
+        view=bench.view,
     )
     try:
         with interruptible():

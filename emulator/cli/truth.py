@@ -7,7 +7,8 @@ from typing import Annotated
 
 import typer
 
-from starid.cli.output import output_help, prepare_output
+from starhil.emulator.cli.output import writing
+from starid.cli.output import output_help
 
 group = typer.Typer(help="Convert true and measured attitudes to standard files.", no_args_is_help=True)
 
@@ -69,14 +70,9 @@ def convert(
             truth = replace(truth, start_unix_s=unix_time(date))
         except ValueError as error:
             raise EmulatorError(f"--date {date}: {error}") from None
-    prepare_output(output, "-o")
-    try:
+    with writing(output):
         if output.suffix == ".tm":
             write_kernels(truth, output, structure)
         else:
             text = write_aem(truth, sensor)
             write_atomically(output, lambda temporary: temporary.write_text(text, encoding="ascii"))
-    except OSError as error:
-        raise EmulatorError(
-            f"{output}: cannot be written ({error.strerror}); choose another file with -o"
-        ) from None

@@ -64,7 +64,7 @@ def new(
     ],
 ) -> None:
     """Create a unit: a commented definition that already runs, as a starting point."""
-    from starhil.emulator.errors import EmulatorError
+    from starhil.emulator.errors import EmulatorError, explained
     from starhil.protocol.unit_folders import SKELETON
     from starid.files import write_atomically
 
@@ -73,11 +73,9 @@ def new(
     name = folder.resolve().name
     text = SKELETON.read_text(encoding="utf-8").replace("MY_UNIT", name.replace('"', "").replace("\\", ""))
     file = folder / "unit.toml"
-    try:
+    with explained(f"{file}: cannot be written", "choose another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(file, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-    except OSError as error:
-        raise EmulatorError(f"{file}: cannot be written ({error.strerror}); choose another folder") from None
     print(f"wrote {file}; try: starhil unit check {folder}; starhil run --unit {folder} --serial auto")
 
 

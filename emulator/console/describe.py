@@ -10,10 +10,11 @@ from typing import Any, Final
 import numpy as np
 
 from starhil.emulator.console.history import COLUMNS, MODES
-from starhil.emulator.faults import NO_ERROR, DeviceFault, WireFault
+from starhil.emulator.faults import NO_ERROR, DeviceFault
 from starhil.emulator.head import Head
+from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.run import Run
-from starhil.emulator.sky.objects import SkyObjects, range_of
+from starhil.emulator.sky.objects import SkyObjects
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.names import bundled
@@ -154,7 +155,7 @@ def _class_controls(kind: type[Any]) -> list[dict[str, Any]]:
         default = None if field.default is dataclasses.MISSING else field.default
         inner = [each for each in typing.get_args(hint) if dataclasses.is_dataclass(each)]
         control: dict[str, Any] = {"name": field.name, "default": default}
-        bounds = range_of(field.name)
+        bounds = field.metadata.get("limits")
         if bounds is not None:
             control |= {"min": bounds[0], "max": bounds[1]}
         if typing.get_origin(hint) is types.UnionType and inner:

@@ -39,27 +39,27 @@ import logging
 from collections import deque
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.control.socket import ControlSocket, automatic_path
 from starhil.emulator.device.measurement import Measurement
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import until_cancelled
 from starhil.emulator.head import Head
 from starhil.emulator.json_lines import RepeatedKeyError, parse_json, read_lines
 from starhil.emulator.pipeline.messages import as_quaternion
 from starhil.emulator.run import Run
-from starhil.emulator.truth.config import FixedConfig, TruthConfig
+from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.errors import ProtocolError, reason
+from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
 from starid.errors import StaridError
 
@@ -72,16 +72,12 @@ BUSY: Final = b'{"ok": false, "error": "too many connections to the control chan
 LATE: Final = json.dumps({"ok": False, "error": f"no complete line within {REQUEST_S:g} s"}).encode() + b"\n"
 
 Answer = dict[str, Any]
+Action = Callable[[Head, dict[str, Any]], Awaitable[Answer]]
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ControlServer:
-    """Serves the control channel of a run.
-
-    Parameters
-    ----------
-    token
-        Token that each request must carry; empty for none.
-    """
+    """Serves the control channel of a run; each request must carry the token, unless it is empty."""
 
     def __init__(self, run: Run, quit_run: Callable[[], None], token: str = "") -> None:
         self._run = run
@@ -94,17 +90,18 @@ class ControlServer:
         self._server: asyncio.Server | None = None
         self._writers: set[asyncio.StreamWriter] = set()
         self._limit = ConnectionLimit("control channel", BUSY)
-        self._actions: dict[str, Callable[[Head, dict[str, Any]], Awaitable[Answer]]] = {
-            "status": self._status,
-            "truth": self._truth,
-            "frames": self._last_frames,
-            "set_truth": self._set_truth,
-            "step": self._step,
-            "fault": self._fault,
-            "clear_faults": self._clear_faults,
-            "scenario": self._run_scenario,
-            "quit": self._quit_run,
+        self._actions: dict[str, tuple[Action, tuple[str, ...] | None]] = {
+            "status": (self._status, ()),
+            "truth": (self._truth, ("run_time_s", "unix_s")),
+            "frames": (self._last_frames, ("count",)),
+            "set_truth": (self._set_truth, ("truth",)),
+            "step": (self._step, ("seconds",)),
+            "fault": (self._fault, None),
+            "clear_faults": (self._clear_faults, ()),
+            "scenario": (self._run_scenario, ("name",)),
+            "quit": (self._quit_run, ()),
         }
+        """What a request may `do`: function, and keys unless a model checks them."""
         for head in run.heads:
             head.device.signals.frame_published.connect(self._frames[head.number].append)
 
@@ -123,15 +120,12 @@ class ControlServer:
         host, _, port = where.rpartition(":")
         if not host or not port.isdecimal() or int(port) > 65535:
             raise EmulatorError(f"--control {where}: must be off, auto, unix:/PATH or HOST:PORT")
-        try:
+        what = f"control channel {where}: cannot listen"
+        with explained(what, "choose another port, or auto", errors=(OSError, ValueError)):
             serve = until_cancelled(self._serve_connection)
             self._server = await asyncio.start_server(
                 serve, host, int(port), limit=MAX_LINE - 1, backlog=self._limit.size
             )
-        except (OSError, ValueError) as error:  # an invalid host name is a ValueError
-            raise EmulatorError(
-                f"control channel {where}: cannot listen ({reason(error)}); choose another port, or auto"
-            ) from None
         address = self._server.sockets[0].getsockname()
         return f"{address[0]}:{address[1]}"
 
@@ -185,11 +179,13 @@ class ControlServer:
     async def execute(self, request: dict[str, Any]) -> Answer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
         wanted = str(request.pop("do", ""))
-        action = self._actions.get(wanted)
-        if action is None:
+        if wanted not in self._actions:
             return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+        action, known = self._actions[wanted]
         try:
             head = self._head(request)
+            if known is not None:
+                _check_keys(request, known)
             if self._run.recorder is not None:
                 self._run.recorder.latch()
             return {"ok": True, **await action(head, request)}
@@ -212,8 +208,7 @@ class ControlServer:
             raise EmulatorError(f"head: must be 1 to {len(heads)}, not {number!r}")
         return heads[number - 1]
 
-    async def _status(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request)
+    async def _status(self, head: Head, _request: dict[str, Any]) -> Answer:
         profile, device = head.profile, head.device
         truth = device.surroundings.truth.state(device.clock.now_ns() / NANOSECONDS)
         source = self._run.truth.source
@@ -249,7 +244,6 @@ class ControlServer:
         return answer
 
     async def _truth(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "run_time_s", "unix_s")
         device = head.device
         run_ns = device.clock.now_ns()
         if "run_time_s" in request:
@@ -269,25 +263,22 @@ class ControlServer:
         }
 
     async def _last_frames(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "count")
         count = int(_number(request, "count", 1.0))
         if not 1 <= count <= KEPT_FRAMES:
             raise EmulatorError(f"count: {count} is outside 1 … {KEPT_FRAMES}")
         return {"frames": [compare(measurement) for measurement in list(self._frames[head.number])[-count:]]}
 
     async def _set_truth(self, _head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "truth")
         config = self._run.truth.configured
         if "truth" in request:
             if not isinstance(request["truth"], dict):
                 raise EmulatorError("truth: must be an object with the keys of [truth] in a profile")
-            config = _parse(_TRUTH, _Truth, request["truth"], "truth")
+            config = _parse(_Truth, request).truth
         async with self._opening:  # reading a file takes time, so the last request wins
             await self._run.truth.set(config)
         return {"kind": config.kind, "address": self._run.truth.address}
 
     async def _step(self, _head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "seconds")
         clock, stepper = self._run.clock, self._run.stepper
         if stepper is None:
             raise EmulatorError(f"step: the clock is {clock.name}; run with --clock stepped")
@@ -295,51 +286,44 @@ class ControlServer:
         return {"run_time_s": clock.now_ns() / NANOSECONDS}
 
     async def _fault(self, head: Head, request: dict[str, Any]) -> Answer:
-        wanted = _parse(_FAULT, FaultRequest, request)
+        wanted = _parse(FaultRequest, request)
         head.faults.check(wanted)
         self._run.record("fault", request=request)
         head.faults.inject(wanted)
         return {"faults": head.faults.describe()}
 
-    async def _clear_faults(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request)
+    async def _clear_faults(self, head: Head, _request: dict[str, Any]) -> Answer:
         self._run.record("clear_faults")
         head.faults.clear()
         return {"faults": head.faults.describe()}
 
     async def _run_scenario(self, head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request, "name")
         if self._run.recorder is not None:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
         scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
         scenario.enter(head, self._run.truth, start_s=self._run.clock.now_ns() / NANOSECONDS)
         return {"events": len(scenario.at)}
 
-    async def _quit_run(self, _head: Head, request: dict[str, Any]) -> Answer:
-        _check_keys(request)
+    async def _quit_run(self, _head: Head, _request: dict[str, Any]) -> Answer:
         asyncio.get_running_loop().call_soon(self._quit)
         return {}
 
 
 class _Truth(BaseModel):
-    """Model that supplies the keys for validation messages."""
+    """Arguments of `set_truth`."""
 
-    truth: TruthConfig = FixedConfig(kind="fixed")
-
-
-_TRUTH: Final[TypeAdapter[TruthConfig]] = TypeAdapter(TruthConfig)
-_FAULT: Final[TypeAdapter[FaultRequest]] = TypeAdapter(FaultRequest)
+    truth: TruthConfig
 
 
-def _parse(adapter: TypeAdapter[Any], model: type[BaseModel], value: object, *under: str) -> Any:
-    """Validate an argument of a request; the error message is one line."""
+def _parse(model: type[Model], value: object) -> Model:
+    """Validate the arguments of a request; the error message is one line."""
     try:
-        return adapter.validate_json(json.dumps(value))
+        return model.model_validate_json(json.dumps(value))
     except ValidationError as error:
-        raise EmulatorError(explain(error, model, under=under)) from None
+        raise EmulatorError(explain(error, model)) from None
 
 
-def _check_keys(request: dict[str, Any], *known: str) -> None:
+def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:
     for key in request:
         if key not in known:
             raise EmulatorError(f"unknown key {key!r}; known: {', '.join(known) or 'none'}")

@@ -29,12 +29,10 @@ from starhil.emulator.device.scheduler import Action
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
-from starhil.emulator.toml_file import read_toml
+from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
 from starhil.emulator.validation_messages import explain
-from starhil.protocol.errors import reason
-from starhil.protocol.names import find, not_found
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
@@ -88,16 +86,9 @@ class Scenario(Strict):
     """Events, in any order."""
 
     def enter(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> None:
-        """Schedule all events; their files are read and checked now.
+        """Schedule all events, relative to a simulation time in seconds; their files are read and checked now.
 
-        Parameters
-        ----------
-        head
-            The head that the faults affect; its links are open.
-        truth
-            The truth of the run; None if another head sets it.
-        start_s
-            Simulation time to which the times of the events are added, seconds.
+        The faults affect a head whose links are open. The truth is that of the run; None if another head sets it.
         """
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             at_s = start_s + event.run_time_s
@@ -110,15 +101,7 @@ class Scenario(Strict):
 
 def load_scenario(name_or_path: str) -> Scenario:
     """Read a scenario from a path, or by the name of one in `configs/scenarios`."""
-    try:
-        path = find("scenario", name_or_path)
-        found = path.exists()
-    except (OSError, RuntimeError) as error:  # RuntimeError: the home folder of an unknown user
-        raise EmulatorError(
-            f"scenario {name_or_path!r}: cannot be read ({reason(error)}); give another path"
-        ) from None
-    if not found:
-        raise EmulatorError(not_found("scenario", name_or_path))
+    path = find_toml("scenario", name_or_path)
     values = read_toml(path, "scenario")
     try:
         return Scenario.model_validate(values)

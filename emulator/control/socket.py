@@ -10,9 +10,8 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.symlink_lock import LockError, lock_name
-from starhil.protocol.errors import reason
 
 PRIVATE_FOLDER: Final = 0o700
 PRIVATE_SOCKET: Final = 0o600
@@ -31,17 +30,14 @@ class ControlSocket:
             raise EmulatorError(f"control channel unix:{path}: {error}; choose another path") from None
         self.socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._file: os.stat_result | None = None
+        what = f"control channel unix:{path}: cannot listen"
         try:
-            self._remove_stale()
-            self.socket.bind(str(path))
-            path.chmod(PRIVATE_SOCKET)  # no client can connect before it listens
-            self._file = path.lstat()
-            self.socket.listen()
-        except (OSError, ValueError) as error:  # a path with a zero byte is a ValueError
-            self.close()
-            raise EmulatorError(
-                f"control channel unix:{path}: cannot listen ({reason(error)}); choose another path"
-            ) from None
+            with explained(what, "choose another path", errors=(OSError, ValueError)):
+                self._remove_stale()
+                self.socket.bind(str(path))
+                path.chmod(PRIVATE_SOCKET)  # no client can connect before it listens
+                self._file = path.lstat()
+                self.socket.listen()
         except EmulatorError:
             self.close()
             raise
@@ -85,17 +81,13 @@ def automatic_path() -> Path:
         folder = base / "starhil"
     else:
         folder = Path(tempfile.gettempdir()) / f"starhil-{os.geteuid()}"
-    try:
+    with explained(f"control channel: {folder} cannot be used", "give --control unix:/PATH"):
         folder.mkdir(mode=PRIVATE_FOLDER, exist_ok=True)
         if not _is_own_folder(folder):
             raise EmulatorError(
                 f"control channel: {folder} belongs to another user; give --control unix:/PATH"
             )
         folder.chmod(PRIVATE_FOLDER)
-    except OSError as error:
-        raise EmulatorError(
-            f"control channel: {folder} cannot be used ({reason(error)}); give --control unix:/PATH"
-        ) from None
     return folder / f"control-{os.getpid()}"
 
 

@@ -8,6 +8,7 @@ background returns a `PendingAnswer`.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, Final, TypeAlias
 
@@ -217,32 +218,6 @@ def set_hole_map(device: Device, arguments: Arguments) -> None:
 
 
 ACTIONS: Final[dict[str, Action]] = {
-    action.__name__: action
-    for action in (
-        nothing,
-        reset,
-        set_clock,
-        set_mode,
-        set_parameters,
-        set_parameter,
-        select_parameter,
-        save_parameters,
-        restore_parameters,
-        default_parameters,
-        clear_counters,
-        subscribe,
-        select_unsolicited,
-        save_image,
-        open_image,
-        load_image_chunk,
-        rewind_file_list,
-        advance_file_list,
-        erase_file,
-        format_card,
-        load_file_block,
-        start_burst,
-        next_packet,
-        set_hole_map,
-    )
+    name: item for name, item in vars().items() if inspect.isfunction(item) and item.__module__ == __name__
 }
-"""Name → function."""
+"""Name → function: every function of this module is an action."""

@@ -14,16 +14,15 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.clock import NANOSECONDS, DeviceTime
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Mode, Modes
 from starhil.emulator.device.navigation import observer_velocity
-from starhil.emulator.device.parameters import Parameters, exposure_period_s
+from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
 from starhil.emulator.device.power import FrameTiming
 from starhil.emulator.device.rate import RateEstimator
 from starhil.emulator.device.scheduler import Event, Scheduler
@@ -36,11 +35,11 @@ from starhil.emulator.pipeline.messages import (
     Failure,
     FrameRequest,
     FrameResult,
-    SolverSettings,
     Triple,
 )
 from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import TruthState
+from starid.arrays import Array
 from starid.attitude import Attitude, propagate
 
 log = logging.getLogger("starhil.device")
@@ -230,7 +229,7 @@ class FrameCycle:
         self._scheduler.at(ready_ns, self._until_stopped(partial(self._schedule_publication, frame)))
         self._signals.exposed.emit(frame.index)
 
-    def _assumed_velocity(self, mid_ns: int) -> NDArray[np.float64] | None:
+    def _assumed_velocity(self, mid_ns: int) -> Array | None:
         """Return the velocity with which the device corrects aberration; None if the sky has none."""
         velocity = observer_velocity(self._parameters, self._time.unix_ns(mid_ns) / NANOSECONDS)
         if velocity is None or self._surroundings.has_aberration:
@@ -251,7 +250,7 @@ class FrameCycle:
         truth: TruthState,
         exposure_s: float,
         predicted: Attitude | None,
-        velocity: NDArray[np.float64] | None,
+        velocity: Array | None,
         *,
         solve: bool = True,
     ) -> FrameRequest:
@@ -259,8 +258,6 @@ class FrameCycle:
         index = self.index
         self.index += 1
         parameters = self._parameters
-        chosen: dict[str, Any] = {name: parameters[name] for name in _SETTINGS}
-        settings = SolverSettings(**chosen)
         conditions = self._surroundings.conditions(truth)
         return FrameRequest(
             index=index,
@@ -269,7 +266,7 @@ class FrameCycle:
             gain=float(parameters["analog_gain"]),
             solve=solve,
             predicted=predicted,
-            settings=settings,
+            settings=solver_settings(parameters),
             faults=self._surroundings.faults,
             temperature_c=conditions.temperature_c,
             particles_s=conditions.particles_s,
@@ -364,6 +361,3 @@ class FrameCycle:
         if rate is not None and np.linalg.norm(rate) > np.radians(float(self._parameters["max_rate"])):
             return False, "rate_too_high", rate
         return True, "ok", rate
-
-
-_SETTINGS: Final = tuple(SolverSettings.__dataclass_fields__)

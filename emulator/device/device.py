@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from typing import Final, TypeAlias
+from functools import reduce
+from typing import Any, Final, TypeAlias
 
 from starhil.emulator.clock import NANOSECONDS, Clock, DeviceTime
 from starhil.emulator.device.counters import Acknowledge, Counters
@@ -324,21 +325,17 @@ def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
     """Return the parameter defaults of a profile: its `[parameters]`, and settings in its `[links]`."""
-    links = profile.links
-    serial, unit_serial = links.serial, icd.link.serial
-    baud = serial.baud if unit_serial is None or "baud" in serial.model_fields_set else unit_serial.baud
-    of_links: dict[str, Value] = {
-        "serial_dialect": links.serial.dialect,
-        "serial_baud": baud,
-        "can_address": links.can.address,
-        "host_address": links.can.host_address,
+    of_links: dict[str, Any] = {
+        name: reduce(getattr, key.split("."), profile) for name, key in LINK_PARAMETERS.items()
     }
-    if links.canopen.node:
-        of_links["canopen_node"] = links.canopen.node
-    known = {name: value for name, value in of_links.items() if name in LINK_PARAMETERS}
+    unit_serial = icd.link.serial
+    if unit_serial is not None and "baud" not in profile.links.serial.model_fields_set:
+        of_links["serial_baud"] = unit_serial.baud
+    if not profile.links.canopen.node:
+        del of_links["canopen_node"]
     try:
         for name in profile.parameters:
             icd.device_parameters[name]
     except ProtocolError as error:
         raise EmulatorError(f"parameters: {error}") from None
-    return {**profile.parameters, **known}
+    return {**profile.parameters, **of_links}

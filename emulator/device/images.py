@@ -41,7 +41,6 @@ class StoredImage:
     pixels: bytes
     """Edge in pixels, and the pixels row by row from the top."""
     frame: int
-    """Index of its exposure."""
     number: int
     """Number of the image since start-up, from 1 to 255 and again from 1; the counter of its file."""
     unix_ns: int = 0
@@ -205,29 +204,15 @@ class ImageStore:
     def _fetch_image(self, edge: int, take: Callable[[ImageResult | None], None]) -> None:
         """Fetch an image from the pipeline; call `take` after `STORE_S` with it, or with None on failure."""
         generation = self._generation
+        answered = PendingAnswer[PipelineReply]()
+
+        def finish(answer: PipelineReply) -> None:
+            if generation == self._generation:
+                take(answer if isinstance(answer, ImageResult) and answer.frame >= 0 else None)
+
+        self._imager.submit(ImageRequest(edge), answered.end)
         due_ns = self._now_ns() + round(STORE_S * NANOSECONDS)
-        answers: list[PipelineReply] = []
-        waiting: list[bool] = []
-
-        def finish() -> None:
-            answer = answers[0]
-            take(answer if isinstance(answer, ImageResult) and answer.frame >= 0 else None)
-
-        def arrived(answer: PipelineReply) -> None:
-            answers.append(answer)
-            if waiting and generation == self._generation:
-                finish()
-
-        def due(_due_ns: int) -> None:
-            if generation != self._generation:
-                return
-            if answers:
-                finish()
-            else:
-                waiting.append(True)
-
-        self._imager.submit(ImageRequest(edge), arrived)
-        self._scheduler.at(due_ns, due)
+        self._scheduler.at(due_ns, lambda _due_ns: answered.when_done(finish))
 
     @property
     def frames(self) -> int:

@@ -23,11 +23,8 @@ class Measurement:
     published_ns: int
     """Simulation time of publication, nanoseconds."""
     mode: Mode
-    """Mode of the device at the exposure."""
     truth: TruthState
-    """True attitude and rate at mid-exposure."""
     result: FrameResult
-    """Result of the pipeline."""
     valid: bool
     reason: str
     """Validity after the checks of the device, and the reason if not valid."""

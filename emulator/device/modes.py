@@ -77,19 +77,9 @@ class Modes:
         """Name in `device_error` of the error; empty in any other mode."""
         self._on_change = on_change
 
-    def allows(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Return whether a mode can be commanded.
-
-        Parameters
-        ----------
-        has_attitude
-            Whether there is an attitude from which tracking can start.
-        """
-        return wanted in COMMANDED[self.mode] and (wanted is not Mode.TRACKING or has_attitude)
-
     def command(self, wanted: Mode, *, has_attitude: bool) -> bool:
-        """Change the mode by telecommand; return False if this is not allowed."""
-        if not self.allows(wanted, has_attitude=has_attitude):
+        """Change the mode by telecommand; return False if this is not allowed. Tracking needs an attitude to start from."""
+        if wanted not in COMMANDED[self.mode] or (wanted is Mode.TRACKING and not has_attitude):
             return False
         self._enter(wanted, Cause.COMMAND)
         return True
@@ -110,14 +100,7 @@ class Modes:
     def solved(self, *, valid: bool, tracked: bool, tracking_enabled: bool) -> None:
         """Change the mode according to the result of an exposure.
 
-        Parameters
-        ----------
-        valid
-            Whether the attitude is valid.
-        tracked
-            Whether it was solved from a prediction, not lost in space.
-        tracking_enabled
-            Whether the configuration enables tracking.
+        An attitude was `tracked` if it was solved from a prediction, not lost in space.
         """
         if self.mode is Mode.LOST_IN_SPACE and valid and tracking_enabled:
             self._enter(Mode.TRACKING, Cause.ATTITUDE_FOUND)

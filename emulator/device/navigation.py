@@ -5,22 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-import numpy as np
-from numpy.typing import NDArray
-
 from starhil.emulator.truth.orbit import EARTH_RADIUS_M, KeplerOrbit
+from starid.arrays import Array
 from starid.earth import earth_velocity
 
 ParameterValue = bool | int | float | str
 
 
-def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> NDArray[np.float64] | None:
+def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -> Array | None:
     """Return the velocity (3,) that the device assumes, relative to the barycentre, ICRS, m/s.
 
-    Returns
-    -------
-    ndarray (3,) or None
-        None if the device does not correct aberration.
+    It is None if the device does not correct aberration.
     """
     if not parameters.get("corrects_aberration", False):
         return None
@@ -31,29 +26,14 @@ def observer_velocity(parameters: Mapping[str, ParameterValue], unix_s: float) -
 
 def known_orbit(parameters: Mapping[str, ParameterValue]) -> KeplerOrbit | None:
     """Return the orbit in the parameters of the device; None if there is none."""
-    elements = {
-        name: float(parameters.get(f"orbit_{name}", 0.0))
-        for name in (
-            "epoch",
-            "semi_major_axis",
-            "eccentricity",
-            "inclination",
-            "node",
-            "perigee",
-            "mean_anomaly",
-        )
-    }
-    if elements["semi_major_axis"] == 0.0:
-        return None
-    return KeplerOrbit(
-        elements["epoch"],
-        1e3 * elements["semi_major_axis"],
-        elements["eccentricity"],
-        math.radians(elements["inclination"]),
-        math.radians(elements["node"]),
-        math.radians(elements["perigee"]),
-        math.radians(elements["mean_anomaly"]),
+    names = ("epoch", "semi_major_axis", "eccentricity", "inclination", "node", "perigee", "mean_anomaly")
+    epoch, semi_major_axis_km, eccentricity, *angles_deg = (
+        float(parameters.get(f"orbit_{name}", 0.0)) for name in names
     )
+    if semi_major_axis_km == 0.0:
+        return None
+    inclination, node, perigee, anomaly = (math.radians(angle) for angle in angles_deg)
+    return KeplerOrbit(epoch, 1e3 * semi_major_axis_km, eccentricity, inclination, node, perigee, anomaly)
 
 
 def perigee_below_surface(semi_major_axis_km: float, eccentricity: float) -> bool:

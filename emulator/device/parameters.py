@@ -5,10 +5,11 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from typing import Any, Final
 
 from starhil.emulator.device.navigation import perigee_below_surface
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.pipeline.messages import SolverSettings
 from starhil.protocol.codec import STRUCT_CODES
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import FieldError, MessageError, Parameter, Value
@@ -31,6 +32,12 @@ def exposure_period_s(parameters: Mapping[str, ParameterValue]) -> float:
     Read-out and processing overlap with the next exposure and do not count.
     """
     return (float(parameters["exposure"]) + float(parameters["delay_time"])) / 1000.0
+
+
+def solver_settings(parameters: Mapping[str, ParameterValue]) -> SolverSettings:
+    """Return the parameters that detection and identification use."""
+    chosen: dict[str, Any] = {name: parameters[name] for name in SolverSettings.__dataclass_fields__}
+    return SolverSettings(**chosen)
 
 
 def memory_format(definition: Parameter) -> str:
@@ -75,12 +82,8 @@ def _contradiction(values: Mapping[str, ParameterValue]) -> tuple[tuple[str, ...
 class Parameters(Mapping[str, ParameterValue]):
     """All parameters, each always within its limits.
 
-    Parameters
-    ----------
-    defaults
-        Defaults of this device that differ from the definition.
-    on_change
-        Called after each change with the names of the changed parameters.
+    `defaults` are those of this device that differ from the definition. `on_change` is called after each change with
+    the names of the changed parameters.
     """
 
     def __init__(
@@ -123,13 +126,7 @@ class Parameters(Mapping[str, ParameterValue]):
         return self._defaults[name]
 
     def set(self, changes: Mapping[str, Value]) -> None:
-        """Set parameters, all or none.
-
-        Raises
-        ------
-        MessageError
-            A value is outside its limits, or two values contradict each other.
-        """
+        """Set parameters, all or none; MessageError if a value is outside its limits, or two values contradict each other."""
         self._assign(self._checked(self._values, changes))
 
     def flip_bit(self, name: str, bit: int) -> bool:

@@ -16,10 +16,7 @@ Other = TypeVar("Other")
 class PendingAnswer(Generic[Result]):
     """The result of some work, once it is done.
 
-    Parameters
-    ----------
-    accepted
-        Whether the telecommand is answered at once, as accepted; only telemetry then reports the result.
+    If it is `accepted`, the telecommand is answered at once; only telemetry then reports the result.
     """
 
     def __init__(self, *, accepted: bool = False) -> None:

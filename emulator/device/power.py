@@ -27,13 +27,11 @@ class FrameTiming:
     """Timing of the frames."""
 
     running: bool
-    """Whether frames are taken."""
     start_ns: int
     """Start of the last exposure, simulation time."""
     busy_s: float
     """Time from the start of an exposure to the end of its processing, seconds."""
     period_s: float
-    """Time from exposure to exposure, seconds."""
 
 
 class PowerModel:
@@ -46,12 +44,7 @@ class PowerModel:
 
     def __init__(self, config: PowerConfig) -> None:
         self._config = config
-        self._current_ma: dict[Phase, float] = {
-            Phase.IDLE: config.idle_ma,
-            Phase.IMAGER_ON: config.imager_on_ma,
-            Phase.EXPOSURE: config.exposure_ma,
-            Phase.TRANSFER: config.transfer_ma,
-        }
+        self._current_ma: dict[Phase, float] = {phase: getattr(config, f"{phase}_ma") for phase in Phase}
 
     def durations_s(self, timing: FrameTiming) -> dict[Phase, float]:
         """Return the duration of each phase in a period, beginning with the exposure."""

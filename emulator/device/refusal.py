@@ -11,7 +11,6 @@ class Refused(Exception):  # noqa: N818 (an answer on the bus, not an error of t
     def __init__(self, code: ErrorCode, argument: str | None = None) -> None:
         super().__init__(code.name.lower())
         self.code = code
-        """The error."""
         self.argument = argument
         """Name of the invalid argument or parameter, if any."""
         self.index = 0

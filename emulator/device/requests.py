@@ -76,13 +76,7 @@ class Requests:
             self.device.counters.count_fault(fault)
 
     def telemetry(self, name: str) -> bytes:
-        """Return the current data of a telemetry row.
-
-        Raises
-        ------
-        Refused
-            The row cannot be read now.
-        """
+        """Return the current data of a telemetry row; raises Refused if it cannot be read now."""
         try:
             return self.telemetry_bindings[name].encode(self.device)
         except Refused:
@@ -135,8 +129,7 @@ class Requests:
     def _reply(
         self, request: Request, kind: ReplyKind, data: bytes = b"", code: ErrorCode = ErrorCode.OK
     ) -> Reply:
-        uptime_ns, time_ns = self._times()
-        return Reply(
+        reply = Reply(
             kind,
             request.id,
             data,
@@ -145,17 +138,17 @@ class Requests:
             klass=request.klass,
             sequence=request.sequence,
             flags=request.flags,
-            uptime_ns=uptime_ns,
-            time_ns=time_ns,
         )
+        return self._with_times(reply)
 
-    def _times(self) -> tuple[int, int]:
-        """Return uptime and device time since the unit's epoch, ns; 0 if replies do not carry it."""
+    def _with_times(self, reply: Reply) -> Reply:
+        """Return a reply with uptime and device time since the unit's epoch, if replies of the unit carry them."""
         if not self._stamped:
-            return 0, 0
+            return reply
         device = self.device
         uptime_ns = device.clock.now_ns() - device.started_ns
-        return uptime_ns, device.icd.conventions.reported_ns(device.time.unix_ns())
+        time_ns = device.icd.conventions.reported_ns(device.time.unix_ns())
+        return replace(reply, uptime_ns=uptime_ns, time_ns=time_ns)
 
     def _execute(
         self, request: Request, row: Row | None
@@ -193,14 +186,6 @@ class Requests:
             data = self.telemetry(row.name)
         except Refused:  # the row cannot be read now, for example while an image is being opened
             return
-        uptime_ns, time_ns = self._times()
-        reply = Reply(
-            ReplyKind.UNSOLICITED,
-            row.id,
-            data,
-            destination=int(device.parameters["host_address"]),
-            klass=row.klass,
-            uptime_ns=uptime_ns,
-            time_ns=time_ns,
-        )
-        device.signals.unsolicited.emit(reply)
+        host = int(device.parameters["host_address"])
+        reply = Reply(ReplyKind.UNSOLICITED, row.id, data, destination=host, klass=row.klass)
+        device.signals.unsolicited.emit(self._with_times(reply))

@@ -12,9 +12,9 @@ import hashlib
 import json
 import os
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final, TypeAlias
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.protocol.durable_file import replace_durably
 from starhil.protocol.user_file import UnsuitableFileError, read_user_file
 
@@ -24,27 +24,12 @@ LOCK_FILE: Final = "lock"
 MAX_BYTES: Final = 1_000_000
 
 
-class StateStore(Protocol):
-    """Stores the state that survives a restart."""
-
-    corrupt: bool
-    """Whether the stored state could not be read and was renamed."""
-
-    def load(self) -> dict[str, Any]:
-        """Return the last saved state, empty if there is none or it is corrupt."""
-
-    def save(self, content: dict[str, Any]) -> None:
-        """Save the complete content, or none of it."""
-
-    def close(self) -> None:
-        """Release the store for another process."""
-
-
 class MemoryStore:
     """State that survives a reset of the device, but not the end of the process."""
 
     def __init__(self) -> None:
         self.corrupt = False
+        """Whether the stored state could not be read and was renamed."""
         self._text = "{}"
 
     def load(self) -> dict[str, Any]:
@@ -66,13 +51,9 @@ class FileStore:
     def __init__(self, folder: Path) -> None:
         self.corrupt = False
         self.path = folder / STATE_FILE
-        try:
+        with explained(f"state folder {folder}: cannot be used", "choose another with --state-dir"):
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = os.open(folder / LOCK_FILE, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o644)
-        except OSError as error:
-            raise EmulatorError(
-                f"state folder {folder}: cannot be used ({error.strerror}); choose another with --state-dir"
-            ) from None
         try:
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -83,17 +64,14 @@ class FileStore:
 
     def load(self) -> dict[str, Any]:
         """Return the last saved state; a corrupt file is renamed `device.json.corrupt`."""
-        try:
-            content = _decode(read_user_file(self.path, MAX_BYTES))
-        except FileNotFoundError:
-            return {}
-        except UnsuitableFileError:
-            content = None
-        except OSError as error:
-            raise EmulatorError(
-                f"state file {self.path}: cannot be read ({error.strerror}); "
-                "make it readable, or choose another folder with --state-dir"
-            ) from None
+        remedy = "make it readable, or choose another folder with --state-dir"
+        with explained(f"state file {self.path}: cannot be read", remedy):
+            try:
+                content = _decode(read_user_file(self.path, MAX_BYTES))
+            except FileNotFoundError:
+                return {}
+            except UnsuitableFileError:
+                content = None
         if content is None:
             self.corrupt = True
             self.path.replace(self.path.with_name(STATE_FILE + ".corrupt"))
@@ -102,16 +80,15 @@ class FileStore:
 
     def save(self, content: dict[str, Any]) -> None:
         """Save the whole content, or none of it."""
-        try:
+        with explained(f"state file {self.path}: cannot be written", "the previous state is kept"):
             replace_durably(self.path, _encode(content))
-        except OSError as error:
-            raise EmulatorError(
-                f"state file {self.path}: cannot be written ({error.strerror}); the previous state is kept"
-            ) from None
 
     def close(self) -> None:
         """Release the folder."""
         os.close(self._lock)
+
+
+StateStore: TypeAlias = MemoryStore | FileStore
 
 
 def _encode(content: dict[str, Any]) -> bytes:

@@ -28,20 +28,13 @@ class Conditions:
 
 
 class Surroundings:
-    """The surroundings of a sensor.
-
-    Parameters
-    ----------
-    truth
-        Truth of the sensor; what it describes may change during a run.
-    """
+    """The surroundings of a sensor; what its truth describes may change during a run."""
 
     def __init__(
         self, profile: Profile, truth: TruthSource, thermal: ThermalModel, now_ns: Callable[[], int]
     ) -> None:
         self.truth = truth
         self.has_aberration = profile.images.used or bool(has_aberration(profile.sky))
-        """Whether the sky has aberration."""
         self.faults: dict[str, Any] = {}
         """Optical faults: fields of the sky objects that differ from the profile's."""
         self._radiation = profile.radiation
@@ -68,10 +61,6 @@ class Surroundings:
             self._radiation.quiet_s, self._radiation.anomaly_s, position_m, truth.unix_s
         )
         return Conditions(self._thermal.temperature_c(self._now_ns()), particles_s)
-
-    def set_faults(self, faults: dict[str, Any]) -> None:
-        """Replace the optical faults."""
-        self.faults = faults
 
 
 def orbit_of(profile: Profile) -> Orbit | None:

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import os
 import resource
 import shutil
-import signal
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,15 +19,15 @@ from starhil.emulator.endurance.simulated_loop import WORKER_WAIT_S
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.head import Head
+from starhil.emulator.launch import Emulator, RunOptions
 from starhil.emulator.pipeline.error_model import ErrorModelImager
-from starhil.emulator.pipeline.imager import ProcessImager
+from starhil.emulator.pipeline.imager import WorkerImager
+from starhil.emulator.pipeline.worker_process import WorkerProcess
 from starhil.emulator.profile import Profile
-from starhil.emulator.pump import MAX_STEP_S, StepPump
-from starhil.emulator.replay import prepare_recording
+from starhil.emulator.pump import MAX_STEP_S
 from starhil.emulator.run import Run
-from starhil.emulator.tape import TRUTH_FILE, Recorder, Wiring
+from starhil.emulator.tape import Wiring
 from starhil.emulator.truth.config import TruthConfig
-from starhil.emulator.truth_log import TruthLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.transports.base import Transport
@@ -119,26 +117,11 @@ class _InternalErrors(logging.Handler):
 
 
 class UnitUnderTest:
-    """An emulated unit in memory.
+    """An emulated unit in memory, with the open links and the keys of a profile.
 
-    Parameters
-    ----------
-    icd
-        Definition of the unit.
-    unit
-        Its name or folder.
-    links
-        The links to open.
-    profile
-        Keys of the profile.
-    seed
-        Seed of the noise.
-    folder
-        Folder of the state, best in memory (tmpfs).
-    rendered
-        Whether images are rendered and solved, in a process; otherwise the pipeline is an error model.
-    record
-        Folder of a recording, which holds the time since power was last switched on.
+    The folder of its state is best in memory too (tmpfs). Images are `rendered` and solved in a process; otherwise
+    the pipeline is an error model. `record` is the folder of a recording of the time since power was last switched
+    on.
     """
 
     def __init__(
@@ -164,14 +147,14 @@ class UnitUnderTest:
         channels: dict[str, Any] = {
             "serial": {"port": "auto" if "serial" in links else "off"},
             "can": {"channel": "auto" if "can" in links or icd.canopen_only else "off"},
-            "canopen": {"node": node_of(icd) if "canopen" in links else 0},
+            "canopen": {
+                "node": int(icd.device_parameters["canopen_node"].default) if "canopen" in links else 0
+            },
         }
         self.profile = Profile.model_validate({**profile, "unit": unit, "run": run, "links": channels})
         self._folder = folder
         self._record = record
-        self._recorder: Recorder | None = None
-        self._truth_log: TruthLog | None = None
-        self._run: Run | None = None
+        self._emulator: Emulator | None = None
         self.frames = 0
         self.exposed_s = 0.0
         """Number of images solved in all, and the sum of their periods, seconds."""
@@ -183,9 +166,9 @@ class UnitUnderTest:
     @property
     def run(self) -> Run:
         """The run; power must be on."""
-        if self._run is None:
+        if self._emulator is None:
             raise EmulatorError("endurance: power is off")
-        return self._run
+        return self._emulator.run
 
     @property
     def head(self) -> Head:
@@ -197,7 +180,7 @@ class UnitUnderTest:
     async def power_on(self) -> None:
         """Switch the unit on and wait until the emulator is ready; simulation time begins at zero."""
         reads = {name: transport.reads for name, transport in self._transports.items()}
-        self._run = None
+        self._emulator = None
         port = MemorySerial("serial", self._time_s)
         buses: dict[str, MemoryTransport[CanFrame]] = {
             name: MemoryTransport(name, self._time_s) for name in ("can", "canopen")
@@ -205,31 +188,18 @@ class UnitUnderTest:
         self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():
             transport.reads = reads.get(name, True)
-        wiring = MemoryWiring(port, buses)
         if self._record is not None:
             shutil.rmtree(self._record, ignore_errors=True)
-            prepare_recording(self._record, self.profile, "")
-            self._recorder = Recorder(self._record, wiring)
-            self._recorder.open()
-        self._run = Run([self.profile], self._recorder or wiring)
-        await self._run.open()
+        options = RunOptions(record=self._record)
+        self._emulator = Emulator([self.profile], options, wiring=MemoryWiring(port, buses))
+        await self._emulator.start()
         self.head.device.signals.frame_published.connect(self._count_frame)
-        if self._recorder is not None:
-            path = self._recorder.folder / TRUTH_FILE
-            self._truth_log = TruthLog(path, wall_times=False, output=self._recorder.output)
-            self.head.device.signals.frame_published.connect(self._truth_log.write)
-        self._run.begin()
-        await self._run.ready()
+        await self._emulator.ready()
 
     async def power_off(self, *, factory: bool = False) -> None:
         """Switch the unit off; `factory` deletes its stored state."""
-        if self._recorder is not None:
-            self._recorder.end()
-        await self.run.close()
-        files = (getattr(self._recorder, "file", None), getattr(self._truth_log, "file", None))
-        for file in files:
-            if file is not None:
-                file.close()
+        if self._emulator is not None:
+            await self._emulator.close()
         if factory:
             shutil.rmtree(self._folder / STATE_FOLDER, ignore_errors=True)
 
@@ -242,23 +212,17 @@ class UnitUnderTest:
 
     def _time_s(self) -> float:
         """Return the simulation time; it is zero while the run is being opened."""
-        return 0.0 if self._run is None else self.now_s
+        return 0.0 if self._emulator is None else self.now_s
 
     def _count_frame(self, measurement: Measurement) -> None:
         self.frames += 1
         self.exposed_s += measurement.period_s
 
     async def step(self, seconds: float, *, most: int | None = None) -> None:
-        """Let simulation time pass, and the same time of the event loop.
-
-        Parameters
-        ----------
-        seconds
-            Time.
-        most
-            End early after about this many events in the unit.
-        """
-        stepper = self._stepper
+        """Let simulation time pass, and the same time of the event loop; end early after about `most` events in the unit."""
+        stepper = self.run.stepper
+        if stepper is None:
+            raise EmulatorError("endurance: the clock is not stepped")
         left, chunk, done = seconds, seconds if most is None else 1.0, 0
         while left > 0.0:
             chunk = min(left, chunk, MAX_STEP_S)
@@ -268,13 +232,6 @@ class UnitUnderTest:
             if most is not None and done >= most:
                 break
             chunk *= 2.0 if most is None or done < most // 4 else 1.0
-
-    @property
-    def _stepper(self) -> StepPump:
-        stepper = self.run.stepper
-        if stepper is None:
-            raise EmulatorError("endurance: the clock is not stepped")
-        return stepper
 
     def deliver(self, link: str, item: bytes | CanFrame) -> None:
         """Pass bytes or a frame to the device."""
@@ -310,9 +267,9 @@ class UnitUnderTest:
         if isinstance(imager, ErrorModelImager):
             imager.end("pipeline: ended by an endurance run")
             return
-        if not isinstance(imager, ProcessImager):
+        if not isinstance(imager, WorkerImager) or not isinstance(imager.worker, WorkerProcess):
             raise EmulatorError("endurance: the pipeline is in a thread, which cannot be ended")
-        os.kill(imager.pid, signal.SIGKILL)
+        imager.worker.process.kill()
         for ready in (False, True):
             until_s = time.monotonic() + LONGEST_START_S
             while device.warm is not ready:
@@ -361,8 +318,3 @@ def links_of(icd: InterfaceDefinition) -> tuple[str, ...]:
     there = {"serial": icd.link.serial is not None, "can": icd.link.can is not None}
     there["canopen"] = icd.canopen is not None
     return tuple(name for name, present in there.items() if present)
-
-
-def node_of(icd: InterfaceDefinition) -> int:
-    """Return the CANopen node ID of a unit."""
-    return int(icd.device_parameters["canopen_node"].default)

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, ClassVar, Final, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Final, Generic, TypeAlias, TypeVar
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.device.pending import PendingAnswer
@@ -44,54 +44,68 @@ class Heard:
         self.last_s = self._loop.time()
 
 
-class Link(Protocol):
-    """An open link of any kind."""
+class BusLink(ABC, Generic[Item]):
+    """Connects a device to a transport."""
 
     bus: ClassVar[str]
     """Name of the bus, `serial` or `can`; a link fault affects every link on its bus."""
 
-    @property
-    def transport(self) -> Transport[Any]:
-        """Transport of the link."""
-
-    @property
-    def heard(self) -> Heard:
+    def __init__(
+        self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int
+    ) -> None:
+        device = self._device = requests.device
+        self._requests = requests
+        self.transport: Final = transport
+        self.heard: Final = Heard()
         """Requests of the OBC."""
-
-    @property
-    def wire(self) -> WireFaults[Any]:
+        self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
         """Outgoing side of the link, with its faults."""
+        self._timer: Event | None = None
 
     async def start(self) -> str:
-        """Open the transport; return its port or bus."""
+        """Open the transport; return its description: a port or bus."""
+        await self.transport.start(self._receive, self._log_transport_error)
+        return self.transport.description
 
     async def close(self) -> None:
         """Close the transport."""
+        if self._timer is not None:
+            self._timer.cancel()
+        await self.transport.close()
+
+    @abstractmethod
+    def _receive(self, item: Item) -> None:
+        """Process an item that has arrived."""
+
+    def _now(self) -> float:
+        """Return the simulation time, seconds, which also applies to time-outs of messages."""
+        return self._device.clock.now_ns() / NANOSECONDS
+
+    def _log_transport_error(self, error: ProtocolError) -> None:
+        log.warning("%s", error)
 
 
-class DeviceLink(ABC, Generic[Item, Style]):
-    """Connects a device to a transport."""
+Link: TypeAlias = BusLink[Any]
+"""An open link of any kind."""
+
+
+class DeviceLink(BusLink[Item], Generic[Item, Style]):
+    """Passes requests from a transport to the device, and replies back, in order."""
 
     def __init__(
         self, requests: Requests, transport: Transport[Item], damage: Damage[Item], seed: int
     ) -> None:
-        device = requests.device
-        self._requests = requests
-        self._device = device
+        super().__init__(requests, transport, damage, seed)
         self._loop = asyncio.get_running_loop()
-        self.transport: Final = transport
-        self.heard: Final = Heard()
         self._receiver = self._new_receiver()
-        self._timer: Event | None = None
         self._held_input: deque[Request | LinkFault] = deque()
         """Input that arrived while a reply is pending, because replies are sent in the order of requests."""
         self._pending: PendingAnswer[list[Reply]] | None = None
         self._executing = False
         self._caused: list[Reply] = []
         """Unsolicited messages that the request being executed has caused; they follow its replies."""
-        self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
-        device.signals.unsolicited.connect(self._send_unsolicited)
-        device.signals.restarted.connect(self._reset_receiver)
+        self._device.signals.unsolicited.connect(self._send_unsolicited)
+        self._device.signals.restarted.connect(self._reset_receiver)
 
     @abstractmethod
     def _new_receiver(self) -> Receiver[Item, Request]:
@@ -115,21 +129,6 @@ class DeviceLink(ABC, Generic[Item, Style]):
             self._caused.append(reply)
         else:
             self._send(reply, self._reply_style())
-
-    async def start(self) -> str:
-        """Open the transport; return its description."""
-        await self.transport.start(self._receive, self._log_transport_error)
-        return self.transport.description
-
-    async def close(self) -> None:
-        """Close the transport."""
-        if self._timer is not None:
-            self._timer.cancel()
-        await self.transport.close()
-
-    def _now(self) -> float:
-        """Return the simulation time, seconds, which also applies to time-outs of messages."""
-        return self._device.clock.now_ns() / NANOSECONDS
 
     def _receive(self, item: Item) -> None:
         self._held_input.extend(self._receiver.feed(item, self._now()))
@@ -195,6 +194,3 @@ class DeviceLink(ABC, Generic[Item, Style]):
         self._receiver = self._new_receiver()
         self._held_input.clear()
         self._pending = None
-
-    def _log_transport_error(self, error: ProtocolError) -> None:
-        log.warning("%s", error)

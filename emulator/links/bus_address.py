@@ -20,12 +20,7 @@ HIGHEST: Final = 126
 class BusAddress:
     """Warns when another emulator on this machine, or any node on the bus, uses the same address.
 
-    Parameters
-    ----------
-    what
-        Name of the address in warnings: `address` or `node`.
-    setting
-        Profile key that sets it.
+    `what` is its name in warnings, `address` or `node`; `setting` is the key of the profile that sets it.
     """
 
     def __init__(self, what: str, setting: str) -> None:

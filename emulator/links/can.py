@@ -29,10 +29,7 @@ from starhil.protocol.transports.base import Transport
 class CanDamage:
     """Corrupts CAN frames; the result is a valid frame, because the CRC of the bus rejects any other.
 
-    Parameters
-    ----------
-    extended
-        Whether frames have 29-bit CAN IDs (CAN 2.0B) or 11-bit ones.
+    Frames have 29-bit CAN IDs (`extended`, CAN 2.0B) or 11-bit ones.
     """
 
     def __init__(self, *, extended: bool) -> None:
@@ -60,10 +57,7 @@ class CanDamage:
 class CanLink(DeviceLink[CanFrame, int]):
     """Connects a device to a CAN transport, with the address in its parameter `can_address`.
 
-    Parameters
-    ----------
-    frame_gap_s
-        Minimum time between two sent frames, seconds.
+    Two sent frames are at least `frame_gap_s` seconds apart.
     """
 
     bus: ClassVar[str] = "can"

@@ -15,12 +15,10 @@ from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.refusal import Refused
 from starhil.emulator.device.requests import Requests
-from starhil.emulator.device.scheduler import Event
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.links.base import Heard
+from starhil.emulator.links.base import BusLink
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanDamage
-from starhil.emulator.links.wire_faults import WireFaults
 from starhil.emulator.pipeline.messages import ImageResult
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
@@ -31,10 +29,9 @@ from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
-from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
+from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Reply
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.values import MessageError, Value
@@ -51,7 +48,8 @@ one of them."""
 STATUS_QUANTITY: Final = "mode"
 """TPDOs that map a row with this quantity are triggered when it or the validity of the attitude changes."""
 
-Action: TypeAlias = Callable[[float], list[CanFrame]]
+Action: TypeAlias = Callable[..., list[CanFrame]]
+"""An action of the slave at a time, its argument `now`, seconds."""
 
 
 def rows_reporting(icd: InterfaceDefinition, prefixes: tuple[str, ...]) -> tuple[str, ...]:
@@ -165,7 +163,7 @@ def _storage_refusal(error: EmulatorError | None) -> SdoAbortError | None:
     return None if error is None else SdoAbortError(AbortCode.HARDWARE, str(error))
 
 
-class CanopenLink:
+class CanopenLink(BusLink[CanFrame]):
     """Connects a device to a CAN bus as a CANopen slave.
 
     The node ID is the parameter `canopen_node` of the device, unless LSS has stored another one.
@@ -180,9 +178,8 @@ class CanopenLink:
         storage: ParameterStorage | None = None,
         seed: int = 0,
     ) -> None:
-        device = self._device = requests.device
-        self.transport: Final = transport
-        self.heard: Final = Heard()
+        super().__init__(requests, transport, CanDamage(extended=False), seed)
+        device = self._device
         self.application = DeviceApplication(requests, self._finish_write)
         dictionary = build_dictionary(device.icd, self.application)
         self.slave = CanopenSlave(
@@ -203,12 +200,8 @@ class CanopenLink:
             name for name in rows_reporting(device.icd, FRAME_QUANTITIES) if name not in self._status_rows
         )
         self._attitude_valid = False
-        self._timer: Event | None = None
         self._reconnects = 0
         self._node = BusAddress("node", "links.canopen.node")
-        self.wire: WireFaults[CanFrame] = WireFaults(
-            transport.send, CanDamage(extended=False), device.clock, device.scheduler, seed
-        )
         device.signals.frame_published.connect(self._frame_published)
         device.signals.mode_changed.connect(self._mode_changed)
         device.signals.restarted.connect(self._device_reset)
@@ -216,31 +209,25 @@ class CanopenLink:
 
     async def start(self) -> str:
         """Join the bus and send the boot-up message; return the description of the bus."""
-        await self.transport.start(self._receive, self._log_transport_error)
-        node = self.slave.node_id
-        self._node.acquire(self.transport.description, 0 if node == UNCONFIGURED else node)
+        bus, node = await super().start(), self.slave.node_id
+        self._node.acquire(bus, 0 if node == UNCONFIGURED else node)
         self._run_action(self.slave.start)
-        return self.transport.description
+        return bus
 
     async def close(self) -> None:
         """Leave the bus."""
         self._node.release()
-        if self._timer is not None:
-            self._timer.cancel()
-        await self.transport.close()
+        await super().close()
 
     @property
     def _wanted_node(self) -> int:
         return int(self._device.parameters["canopen_node"])
 
-    def _now(self) -> float:
-        return self._device.clock.now_ns() / NANOSECONDS
-
-    def _receive(self, frame: CanFrame) -> None:
-        if not frame.extended and not self._device.unresponsive:
-            if frame.id == SDO_RECEIVE + self.slave.node_id:
+    def _receive(self, item: CanFrame) -> None:
+        if not item.extended and not self._device.unresponsive:
+            if item.id == SDO_RECEIVE + self.slave.node_id:
                 self.heard.count()
-            self._run_action(lambda now: self.slave.receive(frame, now))
+            self._run_action(partial(self.slave.receive, item))
 
     def _run_action(self, action: Action) -> None:
         """Run an action of the slave, send its frames and handle its events; nested actions run after it."""
@@ -250,7 +237,7 @@ class CanopenLink:
         self._busy = True
         try:
             while self._actions:
-                frames = self._actions.popleft()(self._now())
+                frames = self._actions.popleft()(now=self._now())
                 if not self._device.unresponsive:
                     for frame in frames:
                         self.wire.send(frame)
@@ -277,17 +264,10 @@ class CanopenLink:
         reconnects = self.transport.statistics.reconnects
         if reconnects != self._reconnects:
             self._reconnects = reconnects
-            self._run_action(
-                partial(self._raise_emergency, EmergencyCode.BUS_OFF_RECOVERED, ErrorRegister.COMMUNICATION)
-            )
-            self._run_action(partial(self._clear_emergency, EmergencyCode.BUS_OFF_RECOVERED))
+            code = EmergencyCode.BUS_OFF_RECOVERED
+            self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.COMMUNICATION))
+            self._run_action(partial(self.slave.clear_emergency, code))
         self._run_action(self.slave.tick)
-
-    def _raise_emergency(self, code: int, bits: int, now: float) -> list[CanFrame]:
-        return self.slave.raise_emergency(code, bits, now=now)
-
-    def _clear_emergency(self, code: int, now: float) -> list[CanFrame]:
-        return self.slave.clear_emergency(code, now=now)
 
     def _handle_event(self, event: SlaveEvent) -> None:
         """Handle an event reported by the slave."""
@@ -311,11 +291,11 @@ class CanopenLink:
         return self._wanted_node
 
     def _finish_write(self, deferred: Deferred, refusal: SdoAbortError | None) -> None:
-        self._run_action(lambda now: self.slave.finish_write(deferred, now, refusal))
+        self._run_action(partial(self.slave.finish_write, deferred, refusal=refusal))
 
     def _notify_rows(self, rows: Sequence[str]) -> None:
         keys = frozenset(key for row in rows for key in self._dictionary.sources.get(row, ()))
-        self._run_action(lambda now: self.slave.notify(keys, now))
+        self._run_action(partial(self.slave.notify, keys))
 
     def _frame_published(self, measurement: Measurement) -> None:
         rows = self._frame_rows
@@ -331,14 +311,14 @@ class CanopenLink:
             return
         if transition.before is Mode.ERROR:
             for number in self._device.icd.enum("device_error").names:
-                self._run_action(partial(self._clear_emergency, DEVICE_ERROR + number))
+                self._run_action(partial(self.slave.clear_emergency, DEVICE_ERROR + number))
         self._notify_rows(self._status_rows)
 
     def _device_failed(self, _due_ns: int) -> None:
         numbers = self._device.icd.enum("device_error").values
         code = DEVICE_ERROR + numbers.get(self._device.modes.error, 0)
         if self._device.modes.mode is Mode.ERROR:
-            self._run_action(partial(self._raise_emergency, code, ErrorRegister.MANUFACTURER))
+            self._run_action(partial(self.slave.raise_emergency, code, ErrorRegister.MANUFACTURER))
             self._notify_rows(self._status_rows)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
@@ -349,22 +329,19 @@ class CanopenLink:
                 self._device.stored.fail(str(error))
         placed = self._dictionary.parameters
         keys = frozenset(placed[name] for name in names if name in placed)
-        self._run_action(lambda now: self.slave.notify(keys, now))
+        self._run_action(partial(self.slave.notify, keys))
 
     def _device_reset(self, _cause: str) -> None:
         """Restart the node with the device, unless an NMT reset of the node caused the restart."""
         self._attitude_valid = False
         self.application.clear()
         if not self._resetting:
-            self._run_action(lambda now: self.slave.reset_node(now, self._wanted_node))
-
-    def _log_transport_error(self, error: ProtocolError) -> None:
-        log.warning("%s", error)
+            self._run_action(partial(self.slave.reset_node, node_id=self._wanted_node))
 
 
 def open_canopen(
     requests: Requests, transport: Transport[CanFrame], state_dir: Path | None, seed: int
 ) -> CanopenLink:
     """Return a link that stores its parameters in `state_dir`, or in memory if this is None."""
-    storage = MemoryStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
+    storage = ParameterStorage() if state_dir is None else FileStorage(state_dir / STORAGE_FILE)
     return CanopenLink(requests, transport, storage, seed)

@@ -20,7 +20,6 @@ from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
 from starhil.protocol.values import Value
 
 SHOWN_VALUES: Final = 8
-"""Maximum number of values in a line."""
 
 CONSOLE_ADDRESS: Final = 253
 """CAN address of the OBC of console and recording, by which its own requests are recognised."""
@@ -51,9 +50,7 @@ class WireItem:
     bus: str
     """`serial` or `can`."""
     outgoing: bool
-    """True if the device sent it."""
     item: bytes | CanFrame
-    """Bytes, or a CAN frame."""
 
 
 class Traffic:
@@ -92,7 +89,8 @@ class Decoder:
     def line(self, entry: WireItem) -> dict[str, Any]:
         """Decode one item to a line of the trace, as JSON data."""
         events, item, own = self.events(entry), entry.item, False
-        kind, text = self._text_of(events) if events else ("part", self._part(item))
+        found = [self._text(event) for event in events] or [("part", self._part(item))]
+        kind, text = found[-1][0], "; ".join(text for _, text in found)
         if isinstance(item, CanFrame):
             raw = cansend(item)
             if item.extended and self._icd.link.can is not None:
@@ -161,10 +159,6 @@ class Decoder:
         number = CanId.unpack(item.id).id
         row = self._icd.row_by_id(number)
         return f"segment of {row.name if row is not None else number}"
-
-    def _text_of(self, events: Sequence[Request | Reply | LinkFault]) -> tuple[str, str]:
-        found = [self._text(event) for event in events]
-        return found[-1][0], "; ".join(text for _, text in found)
 
     def row_of(self, message: Request | Reply) -> Row | None:
         """Return the row of a message by class and ID, or else by ID alone."""

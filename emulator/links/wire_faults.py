@@ -5,30 +5,36 @@ from __future__ import annotations
 import random
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Generic, Protocol, TypeVar
+from typing import Annotated, Generic, Protocol, TypeVar
+
+from pydantic import Field
 
 from starhil.emulator.clock import NANOSECONDS, Clock
 from starhil.emulator.device.scheduler import Scheduler
+from starhil.emulator.truth.config import Strict
 
 Item = TypeVar("Item")
 
 
-@dataclass(frozen=True)
-class WireFaultSettings:
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Seconds = Annotated[float, Field(ge=0.0, le=60.0)]
+
+
+class WireFault(Strict):
     """Faults of a link."""
 
-    drop: float = 0.0
-    corrupt: float = 0.0
-    """Probability that an outgoing item (a serial reply or a CAN frame) is lost, or has one bit flipped."""
-    delay_s: float = 0.0
-    """Delay of every outgoing item, seconds."""
-    split: int = 0
-    """Size of the chunks in which a serial reply is sent, bytes; 0: not split."""
-    gap_s: float = 0.02
-    """Pause between the chunks of a split reply, seconds."""
-    junk: float = 0.0
-    """Probability that random bytes (serial) or a random frame (CAN) are sent before an item."""
+    drop: Probability = 0.0
+    """Probability that an outgoing serial reply or CAN frame is lost."""
+    corrupt: Probability = 0.0
+    """Probability that one of its bits is flipped."""
+    junk: Probability = 0.0
+    """Probability that random bytes, or a CAN frame with a random CAN ID, are sent before it."""
+    delay_s: Seconds = 0.0
+    """Delay of everything that is sent."""
+    split: Annotated[int, Field(ge=0, le=4096)] = 0
+    """Size of the chunks in which serial replies are sent; 0: not split."""
+    gap_s: Seconds = 0.02
+    """Pause between the chunks."""
 
     @property
     def none(self) -> bool:
@@ -50,13 +56,7 @@ class Damage(Protocol[Item]):
 
 
 class WireFaults(Generic[Item]):
-    """The outgoing side of a link, with its faults; items stay in order.
-
-    Parameters
-    ----------
-    clock, scheduler
-        Clock and scheduler of the device; delays are in simulation time.
-    """
+    """The outgoing side of a link, with its faults; items stay in order. Delays are in simulation time."""
 
     def __init__(
         self,
@@ -66,7 +66,7 @@ class WireFaults(Generic[Item]):
         scheduler: Scheduler,
         seed: int,
     ) -> None:
-        self.settings = WireFaultSettings()
+        self.settings = WireFault()
         self.dropped = self.corrupted = 0
         self.listener: Callable[[Item], None] | None = None
         """Called with each item that is sent."""
@@ -105,7 +105,7 @@ class WireFaults(Generic[Item]):
             self.listener(item)
         self._transmit(item)
 
-    def _send_or_hold(self, pieces: Sequence[Item], settings: WireFaultSettings) -> None:
+    def _send_or_hold(self, pieces: Sequence[Item], settings: WireFault) -> None:
         """Send the chunks of an item, after all earlier ones, now or with a delay."""
         now_ns = self._clock.now_ns()
         at_ns = max(now_ns + round(settings.delay_s * NANOSECONDS), self._free_ns)

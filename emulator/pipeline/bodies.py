@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.pipeline.messages import FrameResult
-from starhil.emulator.sky.field import disc_in_field
-from starhil.emulator.sky.light import through_baffle
+from starhil.emulator.sky.light import disc_in_field, through_baffle
 from starhil.emulator.sky.objects import SkyObjects
 from starid.arrays import Array
 from starid.attitude import Attitude

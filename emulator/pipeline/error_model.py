@@ -66,6 +66,7 @@ class ErrorModelImager:
         self._setup = setup
         self._camera = Camera.from_dict(setup.camera)
         self._constants: dict[str, Any] = self._camera.to_dict()
+        self._focal_px = math.sqrt(math.prod(self._camera.focal_px))
         self._running = True
         self._last_image = -1
         self.ended = Signal[str]("end of the image pipeline")
@@ -121,8 +122,7 @@ class ErrorModelImager:
         reason = self._failure(request, matched)
         if reason:
             return FrameResult(request.index, reason=reason, tracked=tracked, detected=detected)
-        focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
-        cross_rad = CENTROID_PX / focal_px / math.sqrt(matched)
+        cross_rad = CENTROID_PX / self._focal_px / math.sqrt(matched)
         roll_rad = CENTROID_PX / (ROLL_ARM * self._camera.width) / math.sqrt(matched)
         error = [
             sigma * min(max(random_of_frame.gauss(0.0, 1.0), -LARGEST_SIGMA), LARGEST_SIGMA)
@@ -145,7 +145,6 @@ class ErrorModelImager:
 
     def _stars(self, request: FrameRequest, random_of_frame: random.Random) -> tuple[MatchedStar, ...]:
         """Return stars somewhere in the field, each measured with the error of a centroid."""
-        focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
         centre_x, centre_y = self._constants["centre_px"]
         attitude, stars = as_quaternion(request.truth.attitude), []
         for _ in range(REPORTED_STARS):
@@ -155,7 +154,7 @@ class ErrorModelImager:
                 true + CENTROID_PX * min(max(random_of_frame.gauss(0.0, 1.0), -LARGEST_SIGMA), LARGEST_SIGMA)
                 for true in (true_x, true_y)
             )
-            true = unit_vector(true_x - centre_x, true_y - centre_y, focal_px)
+            true = unit_vector(true_x - centre_x, true_y - centre_y, self._focal_px)
             stars.append(
                 MatchedStar(
                     hip=random_of_frame.randint(1, STARS_IN_CATALOGUE),
@@ -163,7 +162,7 @@ class ErrorModelImager:
                     y=y,
                     magnitude=random_of_frame.uniform(2.0, LIMIT_V),
                     snr=50.0,
-                    vector=unit_vector(x - centre_x, y - centre_y, focal_px),
+                    vector=unit_vector(x - centre_x, y - centre_y, self._focal_px),
                     icrs=in_icrs(true, attitude),
                 )
             )
@@ -173,12 +172,13 @@ class ErrorModelImager:
         """Return the mean number of detected stars in the field."""
         settings = request.settings
         x, y, z = request.truth.rate_rad_s.tolist()
-        focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
-        trail_px = (focal_px * math.hypot(x, y) + ROLL_ARM * self._camera.width * abs(z)) * request.exposure_s
+        trail_px = (
+            self._focal_px * math.hypot(x, y) + ROLL_ARM * self._camera.width * abs(z)
+        ) * request.exposure_s
         light = request.exposure_s / 0.1 * request.gain * 5.0 / settings.detection_threshold
         reach = LIMIT_V + 2.5 * math.log10(light / (1.0 + trail_px / SMEAR_PX))
         faintest = min(reach, settings.limiting_magnitude)
-        share = self._camera.width * self._camera.height / focal_px**2 / (4.0 * math.pi)
+        share = self._camera.width * self._camera.height / self._focal_px**2 / (4.0 * math.pi)
         seen = 1.0 - float(request.faults.get("blocked_share", 0.0))
         density = STARS_TO_V6 * math.pow(10.0, 0.5 * (faintest - 6.0))
         return density * min(share, 1.0) * seen
@@ -191,8 +191,7 @@ class ErrorModelImager:
         if self._calibration_error_px(request) > settings.validation_margin:
             return "no_match"
         if request.predicted is not None:
-            focal_px = math.sqrt(math.prod(self._constants["focal_px"]))
-            off_px = focal_px * angle_between(
+            off_px = self._focal_px * angle_between(
                 as_quaternion(request.predicted), as_quaternion(request.truth.attitude)
             )
             if off_px > settings.tracking_margin + settings.search_width:
@@ -203,14 +202,13 @@ class ErrorModelImager:
         """Return the error of the unit's calibration at the edge of the field, pixels."""
         settings, constants = request.settings, self._constants
         k1, k2, p1, p2, _ = constants["distortion"]
-        true_focal = math.sqrt(math.prod(constants["focal_px"]))
-        edge = 0.5 * self._camera.width / true_focal
+        edge = 0.5 * self._camera.width / self._focal_px
         turn = math.hypot(
             settings.centroid_x - constants["centre_px"][0], settings.centroid_y - constants["centre_px"][1]
         )
         radial = settings.focal_length * (1.0 + settings.k1 * edge**2 + settings.k2 * edge**4)
-        true_radial = true_focal * (1.0 + k1 * edge**2 + k2 * edge**4)
-        tangential = true_focal * math.hypot(settings.p1 - p1, settings.p2 - p2) * edge**2
+        true_radial = self._focal_px * (1.0 + k1 * edge**2 + k2 * edge**4)
+        tangential = self._focal_px * math.hypot(settings.p1 - p1, settings.p2 - p2) * edge**2
         # a shift of the centre is nearly a rotation; what remains is its projection
         error_px: float = abs(radial - true_radial) * edge + 3.0 * tangential + turn * edge**2
         return error_px

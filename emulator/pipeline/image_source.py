@@ -35,7 +35,9 @@ class FolderImages:
             raise EmulatorError(
                 f"images.folder: {folder} is not a folder; name one with PNG, TIFF, JPEG or BMP images"
             )
-        self._files = sorted(file for file in folder.iterdir() if file.is_file() and _is_image(file))
+        self._files = sorted(
+            file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in SUFFIXES
+        )
         self._folder = folder
         self._repeat = repeat
         if not self._files:
@@ -108,7 +110,3 @@ def open_images(settings: Mapping[str, Any], camera: Camera) -> ImageSource | No
 def used_bits(image: Counts) -> int:
     """Return the number of bits that an image uses, at least 8."""
     return max(int(image.max(initial=0)).bit_length(), _MIN_BITS)
-
-
-def _is_image(file: Path) -> bool:
-    return file.suffix.lower() in SUFFIXES

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final, TypeAlias
 
-import numpy as np
-from numpy.typing import NDArray
-
 from starhil.emulator.truth.source import TruthState
+from starid.arrays import Array
 from starid.attitude import Attitude
 
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -25,14 +25,21 @@ def as_quaternion(attitude: Attitude) -> Quaternion:
     return (x, y, z, w)
 
 
-def as_triple(vector: NDArray[np.float64]) -> Triple:
+def as_triple(vector: Array) -> Triple:
     """Return a vector (3,) as Python floats."""
     x, y, z = vector.tolist()
     return (x, y, z)
 
 
 LENGTH: Final = struct.Struct("<I")
-"""Length prefix of each pickled message between the emulator and its worker process."""
+"""Length prefix of each pickled message between the emulator and its worker."""
+
+
+def with_length(message: object) -> bytes:
+    """Return a message between the emulator and its worker; a text is the last one, why the worker ends."""
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    return LENGTH.pack(len(data)) + data
+
 
 IMAGE_EDGES: Final = (1024, 512, 256, 128, 64)
 """Edges of the square images for download, pixels, indexed by the published enumeration."""
@@ -51,9 +58,7 @@ class PipelineSetup:
     epoch: float
     """Catalogue file (empty: the installed one) and the Julian year of the star positions."""
     algorithm: str
-    """`geometric`, `lsi` or `rsi`."""
     seed: int
-    """Seed of all noise."""
     build_in_background: bool = False
     """Whether frames are solved with the current star index while another is being built. If false, frames wait for
     the new index, so that a run on the stepped clock is reproducible byte for byte."""
@@ -90,6 +95,14 @@ class SolverSettings:
     p2: float = 0.0
 
 
+def camera_constants(camera: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters of a unit that is calibrated to a camera: focal length, centre and distortion, in pixels."""
+    focal_x, focal_y = camera["focal_px"]
+    names = ("focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2")
+    values = ((focal_x * focal_y) ** 0.5, *camera["centre_px"], *camera["distortion"][:4])
+    return dict(zip(names, values, strict=True))
+
+
 DIRECTION_BITS: Final = 32
 """Number of bits of a component of a star's direction in the unit's memory."""
 
@@ -99,7 +112,6 @@ class CatalogUpset:
     """A bit flipped in the unit's star catalogue."""
 
     hip: int
-    """Hipparcos number of the star."""
     component: int
     """Component of the direction: 0, 1 or 2 for x, y or z."""
     bit: int
@@ -116,13 +128,11 @@ class FrameRequest:
     """Truth of the sensor at mid-exposure; without a date, only typed bodies are rendered."""
     exposure_s: float
     gain: float
-    """Exposure in seconds and analog gain."""
     solve: bool = True
     """Whether to detect and identify stars; if false, the image is only rendered and kept for download."""
     predicted: Attitude | None = None
     """Predicted attitude at mid-exposure, for tracking; None: lost in space."""
     settings: SolverSettings = field(default_factory=SolverSettings)
-    """Parameters of detection and identification."""
     faults: dict[str, Any] = field(default_factory=dict)
     """Fields of the sky objects that are overridden by the control channel."""
     temperature_c: float | None = None
@@ -131,7 +141,7 @@ class FrameRequest:
     """Particles per second that hit the detector, in addition to the sky's particles."""
     upsets: tuple[CatalogUpset, ...] = ()
     """Bits flipped by radiation in the unit's star catalogue."""
-    observer_velocity: NDArray[np.float64] | None = None
+    observer_velocity: Array | None = None
     """Velocity (3,) of the sensor relative to the barycentre assumed by the device, ICRS, m/s, to correct aberration;
     None: no correction."""
     preview: bool = False
@@ -153,13 +163,11 @@ class MatchedStar:
     """An identified star."""
 
     hip: int
-    """Hipparcos number."""
     x: float
     y: float
     """Position, pixels."""
     magnitude: float
     snr: float
-    """Measured magnitude and signal-to-noise ratio."""
     vector: Triple
     """Measured direction in the sensor frame, by the camera of the profile."""
     icrs: Triple
@@ -205,7 +213,6 @@ class FrameResult:
     identify_s: float = 0.0
     """Wall time of each step, for the log but not for telemetry."""
     preview: Preview | None = field(default=None, repr=False, compare=False)
-    """The image, if requested."""
 
 
 @dataclass(frozen=True)
@@ -232,9 +239,7 @@ class PipelineReady:
     camera: dict[str, Any]
     """Fields of the camera, with derived constants."""
     stars: int
-    """Number of stars in the catalogue."""
     seconds: float
-    """Wall time of the start."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from starhil.emulator.pipeline.messages import (
     Preview,
     SolverSettings,
     as_triple,
+    camera_constants,
 )
 from starhil.emulator.pipeline.precompile import start_helper
 from starhil.emulator.pipeline.preview import make_preview
@@ -41,6 +42,7 @@ from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.aberration import aberrated
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import load_catalog
@@ -54,17 +56,6 @@ STARS_SENT: Final = 16
 
 DOWNLOAD_BITS: Final = 8
 """Bits per pixel of an image for download."""
-
-REASONS: Final[dict[Reason, str]] = {
-    Reason.OK: "ok",
-    Reason.TOO_FEW_STARS: "too_few_stars",
-    Reason.NO_MATCH: "no_match",
-    Reason.AMBIGUOUS: "ambiguous",
-    Reason.RESIDUAL: "residual",
-    Reason.PREDICTION_LOST: "prediction_lost",
-    Reason.BAD_INPUT: "bad_input",
-}
-"""Reason of the star identifier → its name in telemetry."""
 
 _WARM_UP_BODIES: Final = SkyObjects(
     sun=SunGlare(0.0, 80.0),
@@ -138,17 +129,7 @@ class Pipeline:
         Compiling a kernel during a run would interrupt frames for seconds, so some frames here have star
         trails. A `helper` that compiles the star identifier is waited for.
         """
-        camera = self.camera
-        k1, k2, p1, p2, _ = camera.distortion
-        settings = SolverSettings(
-            focal_length=math.sqrt(camera.focal_px[0] * camera.focal_px[1]),
-            centroid_x=camera.centre_px[0],
-            centroid_y=camera.centre_px[1],
-            k1=k1,
-            k2=k2,
-            p1=p1,
-            p2=p2,
-        )
+        settings = replace(SolverSettings(), **camera_constants(self.camera.to_dict()))
         attitude = Attitude.identity()
         request = FrameRequest(
             index=0,
@@ -270,12 +251,13 @@ class Pipeline:
         if request.predicted is None:
             solution = identifier.identify(xy, flux, sigma, observer_velocity=request.observer_velocity)
         else:
+            windows_px = (settings.search_width / 2.0, settings.window_width / 2.0)
             solution = identifier.track(
                 xy,
                 flux,
                 np.array(request.predicted.quaternion_xyzw),
                 sigma,
-                window_px=tracking_window(settings),
+                window_px=float(min(settings.tracking_margin, *windows_px)),
                 observer_velocity=request.observer_velocity,
             )
         if solution.valid and _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
@@ -304,10 +286,11 @@ class Pipeline:
         sensor: SensorModel,
         found: Detections,
         solution: Solution,
-        modelled: NDArray[np.float64],
+        modelled: Array,
         times: tuple[float, float, float, float],
     ) -> FrameResult:
         begin, rendered, detected, solved = times
+        zero_e = sensor.zero_magnitude_e_s * sensor.exposure_s
         measured = self.camera.back_project(found.xy_px[solution.detection_index])
         stars = sorted(
             (
@@ -315,7 +298,7 @@ class Pipeline:
                     hip=int(hip),
                     x=float(found.xy_px[row, 0]),
                     y=float(found.xy_px[row, 1]),
-                    magnitude=measured_magnitude(float(found.flux[row]), sensor),
+                    magnitude=-2.5 * math.log10(max(float(found.flux[row]), 1.0) / zero_e),
                     snr=float(found.flux[row] / found.flux_sigma[row]),
                     vector=as_triple(direction),
                     icrs=as_triple(icrs),
@@ -328,7 +311,7 @@ class Pipeline:
         )
         valid = solution.valid
         x, y, z, w = solution.quaternion_xyzw.tolist() if valid else (0.0, 0.0, 0.0, 0.0)
-        reason = REASONS[solution.reason] if found.searchable else "detection_failed"
+        reason = solution.reason.value if found.searchable else "detection_failed"
         rate = solution.rate_rad_s
         return FrameResult(
             index=request.index,
@@ -362,9 +345,7 @@ class Pipeline:
         return ImageResult(request.edge, request.edge, frame, square_image(image, bits, request.edge))
 
 
-def _within_margin(
-    identifier: StarIdentifier, solution: Solution, xy: NDArray[np.float64], request: FrameRequest
-) -> int:
+def _within_margin(identifier: StarIdentifier, solution: Solution, xy: Array, request: FrameRequest) -> int:
     """Count the matched stars within the validation margin of their expected position."""
     icrs = identifier.catalog.vectors[solution.catalog_index]
     if request.observer_velocity is not None:
@@ -395,16 +376,6 @@ def calibrated_camera(optics: Camera, settings: SolverSettings) -> Camera:
         optics.model,
         (settings.k1, settings.k2, settings.p1, settings.p2, optics.distortion[4]),
     )
-
-
-def tracking_window(settings: SolverSettings) -> float:
-    """Return the largest distance of a star from its prediction, pixels, limited by the windows."""
-    return float(min(settings.tracking_margin, settings.search_width / 2.0, settings.window_width / 2.0))
-
-
-def measured_magnitude(electrons: float, sensor: SensorModel) -> float:
-    """Return the magnitude of a star from its electrons in one exposure."""
-    return -2.5 * math.log10(max(electrons, 1.0) / (sensor.zero_magnitude_e_s * sensor.exposure_s))
 
 
 def eight_bits(image: NDArray[Any], bits: int) -> NDArray[np.uint8]:

@@ -1,22 +1,35 @@
-"""Previews: frames compressed for display, with an overlay of stars, bodies and covered areas."""
+"""Previews: frames compressed for display, with an overlay of stars, bodies and covered areas.
+
+The overlay is JSON; places in the image are pairs x, y, pixels:
+
+- ``width``, ``height`` of the image;
+- ``detections``: place, magnitude and signal-to-noise ratio of each, brightest first, and ``hips``: the Hipparcos number
+  of each, 0 if the solution does not have it;
+- ``unused``: Hipparcos number of the catalogue star at the place of each detection without one in ``hips``; 0 if there is
+  none. With a slightly wrong calibration, the solution leaves out bright stars, which deviate by more than their small
+  noise;
+- ``catalogue``: Hipparcos number, place and V of the catalogue stars in the field, brightest first;
+- ``false_stars``: their places;
+- ``bodies``: ``name`` (`sun`, `moon`, `earth`, or that of a planet), ``ra_deg`` and ``dec_deg`` of the centre, ICRS, angular
+  ``radius_deg`` (0 for a point), and ``outline_px`` of the disc, null where the lens maps no direction;
+- ``covered``: polygons of the areas that are covered by something near the lens.
+"""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.bodies import SEEN_PX
 from starhil.emulator.pipeline.messages import Preview
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.renderer import Frame
-from starhil.emulator.sky.directions import icrs_vector
-from starhil.emulator.sky.objects import Obstruction, SkyObjects
+from starhil.emulator.sky.objects import CelestialBody, Obstruction, SkyObjects
+from starid.arrays import Array, GreyImage, Indices32
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.imaging.detection import Detections
@@ -32,47 +45,6 @@ KNEE_SIGMA: Final = 4.0
 OUTLINE_POINTS: Final = 96
 
 
-@dataclass(frozen=True)
-class Body:
-    """A body in the sky, for display."""
-
-    name: str
-    """`sun`, `moon`, `earth`, or the name of a planet."""
-    ra_deg: float
-    dec_deg: float
-    radius_deg: float
-    """Direction of the centre, ICRS, and angular radius; 0 for a point."""
-    outline_px: list[tuple[float, float] | None]
-    """Outline of the disc as pairs of pixel coordinates; None where the lens maps no direction. A point has one
-    pair."""
-
-
-@dataclass(frozen=True)
-class Overlay:
-    """Marks that are drawn over an image."""
-
-    width: int
-    height: int
-    """Size of the image, pixels."""
-    detections: list[tuple[float, float, float, float]]
-    """Position (x, y), magnitude and signal-to-noise ratio of each detection, brightest first."""
-    hips: list[int]
-    """Hipparcos number of each detection; 0 if the solution does not have it."""
-    unused: list[int]
-    """Hipparcos number of the catalogue star at the place of each detection without one in `hips`; 0 if there is none.
-
-    With a slightly wrong calibration, the solution leaves out bright stars, which deviate by more than their small noise.
-    """
-    catalogue: list[tuple[int, float, float, float]]
-    """Hipparcos number, position (x, y) and V of the catalogue stars in the field, brightest first."""
-    false_stars: list[tuple[float, float]]
-    """Positions of the false stars in the image."""
-    bodies: list[Body]
-    """Sun, Moon, Earth and planets."""
-    covered: list[list[tuple[float, float]]]
-    """Polygons, pixels, of the areas that are covered by something near the lens."""
-
-
 def make_preview(
     frame: Frame,
     camera: Camera,
@@ -84,20 +56,6 @@ def make_preview(
     """Make the preview of a frame, without detections if it was not solved."""
     background = float(np.median(frame.image[::16, ::16])) if found is None else found.background
     noise = max(1.0, 0.0 if found is None else found.noise)
-    overlay = make_overlay(frame, camera, sensor, sky, found, solution)
-    content = json.dumps(overlay, default=vars, separators=(",", ":")).encode()
-    return Preview(compress(frame.image, background, noise, sensor.bits), content)
-
-
-def make_overlay(
-    frame: Frame,
-    camera: Camera,
-    sensor: SensorModel,
-    sky: SkyObjects,
-    found: Detections | None = None,
-    solution: Solution | None = None,
-) -> Overlay:
-    """Return the overlay of an image."""
     height, width = frame.image.shape
     stars, objects = frame.stars, frame.objects
     bright = stars.magnitude <= FAINTEST_V
@@ -107,23 +65,22 @@ def make_overlay(
         hip.tolist(), *xy_px.round(1).T.tolist(), stars.magnitude[bright].round(2).tolist(), strict=True
     )
     detections, hips = ([], []) if found is None else _detections(found, solution, sensor)
-    unused = [] if found is None else unused_stars(found.xy_px, hips, hip, xy_px)
-    return Overlay(
-        width=width,
-        height=height,
-        detections=detections,
-        hips=hips,
-        unused=unused,
-        catalogue=list(catalogue),
-        false_stars=[] if objects is None else [(x, y) for x, y in objects.false_xy_px.round(1).tolist()],
-        bodies=_bodies(sky, camera, frame.attitude),
-        covered=[_covered(obstruction, width, height) for obstruction in sky.obstructions],
-    )
+    overlay = {
+        "width": width,
+        "height": height,
+        "detections": detections,
+        "hips": hips,
+        "unused": [] if found is None else unused_stars(found.xy_px, hips, hip, xy_px),
+        "catalogue": list(catalogue),
+        "false_stars": [] if objects is None else objects.false_xy_px.round(1).tolist(),
+        "bodies": _bodies(sky, camera, frame.attitude),
+        "covered": [_covered(obstruction, width, height) for obstruction in sky.obstructions],
+    }
+    content = json.dumps(overlay, separators=(",", ":")).encode()
+    return Preview(compress(frame.image, background, noise, sensor.bits), content)
 
 
-def compress(
-    image: NDArray[np.uint8] | NDArray[np.uint16], background: float, noise: float, bits: int
-) -> bytes:
+def compress(image: GreyImage, background: float, noise: float, bits: int) -> bytes:
     """Compress an image (h, w) as JPEG, on a scale linear for faint and logarithmic for bright pixels."""
     import cv2
 
@@ -153,9 +110,7 @@ def _detections(
     return list(rows), hips.tolist()
 
 
-def unused_stars(
-    detections_xy: NDArray[np.float64], hips: list[int], hip: NDArray[np.int32], xy_px: NDArray[np.float64]
-) -> list[int]:
+def unused_stars(detections_xy: Array, hips: list[int], hip: Indices32, xy_px: Array) -> list[int]:
     """Return for each detection (n, 2) without a Hipparcos number that of the star (m, 2), brightest first, at its place."""
     unused = [0] * len(hips)
     left = ~np.isin(hip, hips)
@@ -167,32 +122,18 @@ def unused_stars(
     return unused
 
 
-def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[Body]:
+def _bodies(sky: SkyObjects, camera: Camera, attitude: Attitude) -> list[dict[str, Any]]:
     """Return the bodies in a sky, inside or outside the image."""
-    found = []
-    if sky.sun is not None:
-        radius_deg = math.degrees(sky.sun.radius_rad)
-        found.append(_body("sun", sky.sun.ra_deg, sky.sun.dec_deg, radius_deg, camera, attitude))
-    if sky.moon is not None:
-        radius_deg = sky.moon.diameter_deg / 2.0
-        found.append(_body("moon", sky.moon.ra_deg, sky.moon.dec_deg, radius_deg, camera, attitude))
-    if sky.earth is not None:
-        earth = sky.earth
-        found.append(_body("earth", earth.ra_deg, earth.dec_deg, earth.radius_deg, camera, attitude))
-    for number, planet in enumerate(sky.planets, 1):
-        name = planet.name or f"planet {number}"
-        found.append(_body(name, planet.ra_deg, planet.dec_deg, 0.0, camera, attitude))
-    return found
+    planets = ((planet.name or f"planet {number}", planet) for number, planet in enumerate(sky.planets, 1))
+    bodies = (("sun", sky.sun), ("moon", sky.moon), ("earth", sky.earth), *planets)
+    return [_body(name, body, camera, attitude) for name, body in bodies if body is not None]
 
 
-def _body(
-    name: str, ra_deg: float, dec_deg: float, radius_deg: float, camera: Camera, attitude: Attitude
-) -> Body:
+def _body(name: str, body: CelestialBody, camera: Camera, attitude: Attitude) -> dict[str, Any]:
     """Return a body with the outline of its disc in the image."""
-    centre = icrs_vector(ra_deg, dec_deg)
+    centre, radius = body.direction, body.radius_rad
     across = np.cross(centre, (0.0, 0.0, 1.0) if abs(centre[2]) < 0.9 else (1.0, 0.0, 0.0))
     across /= np.linalg.norm(across)
-    radius = math.radians(radius_deg)
     angle = np.linspace(0.0, 2.0 * math.pi, OUTLINE_POINTS + 1 if radius > 0.0 else 1)[:, None]
     ring = np.cos(angle) * across + np.sin(angle) * np.cross(centre, across)
     seen = attitude.to_sensor(math.cos(radius) * centre + math.sin(radius) * ring)
@@ -202,7 +143,8 @@ def _body(
     outline = [
         (x, y) if there else None for (x, y), there in zip(xy.round(1).tolist(), mapped.tolist(), strict=True)
     ]
-    return Body(name, ra_deg, dec_deg, radius_deg, outline)
+    place = {"ra_deg": body.ra_deg, "dec_deg": body.dec_deg, "radius_deg": math.degrees(radius)}
+    return {"name": name, **place, "outline_px": outline}
 
 
 def _covered(obstruction: Obstruction, width: int, height: int) -> list[tuple[float, float]]:

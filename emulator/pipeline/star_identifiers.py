@@ -40,7 +40,6 @@ class StarIdentifierSetup:
     """Everything a star identifier depends on."""
 
     algorithm: str
-    """`geometric`, `lsi` or `rsi`."""
     camera: Camera
     """Camera as calibrated in the device's parameters."""
     margin: float
@@ -106,23 +105,10 @@ def _known_options(algorithm: type) -> dict[str, str]:
     return {name: kind for name, kind in types.items() if any(word in kind for word in _KINDS)}
 
 
-@dataclass(frozen=True)
-class _Build:
-    """A star identifier being built in the background."""
-
-    setup: StarIdentifierSetup
-    future: Future[StarIdentifier]
-
-
 class StarIdentifiers:
     """Provides the star identifier for a setup, or the previous one while it is being built.
 
-    Parameters
-    ----------
-    make
-        Makes a star identifier.
-    in_background
-        Whether to build in a thread; otherwise `get` blocks until the build is done.
+    It is built in a thread if `in_background`; otherwise `get` blocks until that is done.
     """
 
     def __init__(self, make: Callable[[StarIdentifierSetup], StarIdentifier], *, in_background: bool) -> None:
@@ -130,7 +116,7 @@ class StarIdentifiers:
         self._in_background = in_background
         self._current: tuple[StarIdentifierSetup, StarIdentifier] | None = None
         self._failed: tuple[StarIdentifierSetup, EmulatorError | StaridError] | None = None
-        self._build: _Build | None = None
+        self._build: tuple[StarIdentifierSetup, Future[StarIdentifier]] | None = None
 
     def get(self, setup: StarIdentifierSetup) -> tuple[StarIdentifier, bool]:
         """Return the current star identifier, and whether it is the one for this setup."""
@@ -146,20 +132,20 @@ class StarIdentifiers:
             error = self._failed[1]
             raise type(error)(str(error))
         if self._build is None:
-            self._build = self._start_build(setup)
+            self._build = (setup, self._start_build(setup))
         return identifier, False
 
     def _adopt_finished_build(self) -> None:
         """Switch to a finished build, even if the setup has changed since; the next one will replace it."""
-        if self._build is None or not self._build.future.done():
+        if self._build is None or not self._build[1].done():
             return
-        build, self._build = self._build, None
+        (setup, future), self._build = self._build, None
         try:
-            self._current = (build.setup, build.future.result())
+            self._current = (setup, future.result())
         except (EmulatorError, StaridError) as error:
-            self._failed = (build.setup, error)
+            self._failed = (setup, error)
 
-    def _start_build(self, setup: StarIdentifierSetup) -> _Build:
+    def _start_build(self, setup: StarIdentifierSetup) -> Future[StarIdentifier]:
         future: Future[StarIdentifier] = Future()
 
         def build() -> None:
@@ -169,4 +155,4 @@ class StarIdentifiers:
                 future.set_exception(error)
 
         threading.Thread(target=build, name="star-identifier", daemon=True).start()
-        return _Build(setup, future)
+        return future

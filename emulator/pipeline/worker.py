@@ -1,4 +1,4 @@
-"""The pipeline worker process: renders and solves frames for the emulator over an inherited socket."""
+"""The pipeline worker: renders and solves frames for the emulator over a socket, in a process or a thread."""
 
 from __future__ import annotations
 
@@ -9,20 +9,34 @@ import socket
 import sys
 from typing import Any, Final
 
+from starhil.emulator.guard import one_line
 from starhil.emulator.parent_death_signal import end_with_parent
-from starhil.emulator.pipeline.messages import LENGTH, Failure
+from starhil.emulator.pipeline.messages import LENGTH, Failure, with_length
 
 NICE: Final = 5
 """Niceness of the worker, so that the links have priority on a busy machine."""
 
 
 def main() -> None:
-    """Receive the setup, then requests, until the emulator closes the socket."""
+    """Serve the emulator over an inherited socket."""
     end_with_parent()  # a closed socket is not noticed during a long compilation
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)  # the emulator ends this process by closing the socket
     os.nice(NICE)
-    link = socket.socket(fileno=int(sys.argv[1]))
+    serve(socket.socket(fileno=int(sys.argv[1])))
+
+
+def serve_in_thread(link: socket.socket) -> None:
+    """Serve the emulator, and report an unexpected end."""
+    with link:
+        try:
+            serve(link)
+        except BaseException as error:  # noqa: BLE001 (its pending requests must fail)
+            _send(link, f"pipeline thread: ended: {one_line(error)}")
+
+
+def serve(link: socket.socket) -> None:
+    """Receive the setup, then requests, until the emulator closes the socket."""
     from starhil.emulator.pipeline.pipeline import make_pipeline  # imported while the emulator starts
 
     setup = _receive(link)
@@ -62,9 +76,8 @@ def _read(link: socket.socket, size: int) -> bytes | None:
 
 
 def _send(link: socket.socket, message: object) -> None:
-    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
     try:
-        link.sendall(LENGTH.pack(len(data)) + data)
+        link.sendall(with_length(message))
     except ConnectionError:
         raise SystemExit(0) from None
 

@@ -1,4 +1,4 @@
-"""Start and end of the pipeline worker process.
+"""Start and end of the pipeline worker.
 
 `starhil run` starts the worker before its own imports, so that both processes start up in parallel.
 """
@@ -8,10 +8,32 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import threading
 import time
-from typing import Final
+from typing import Final, TypeAlias
 
 EXIT_GRACE_S: Final = 2.0
+
+
+class WorkerThread:
+    """A worker in a thread: takes less memory, but shares the interpreter lock with the links."""
+
+    def __init__(self) -> None:
+        from starhil.emulator.pipeline.worker import serve_in_thread
+
+        self.socket, link = socket.socketpair()
+        self._thread = threading.Thread(target=serve_in_thread, args=[link], name="pipeline", daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        """Whether the thread is still running."""
+        return self._thread.is_alive()
+
+    def end(self) -> None:
+        """Close the socket, which ends the thread, and wait."""
+        self.socket.close()
+        self._thread.join(EXIT_GRACE_S)
 
 
 class WorkerProcess:
@@ -42,6 +64,8 @@ class WorkerProcess:
             self.process.kill()
             self.process.wait()
 
+
+Worker: TypeAlias = WorkerProcess | WorkerThread
 
 _ahead: Final[list[WorkerProcess]] = []
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from starhil.emulator.sensor.fixed_pattern import make_fixed_pattern
 from starhil.emulator.sensor.model import SensorModel
 from starhil.emulator.sensor.noise import digitize
+from starid.arrays import Array32
 from starid.imaging.dark_frame import dark_excess, without_dark
 
 _HEADROOM: Final = 0.5
@@ -22,8 +23,7 @@ class DarkMap:
     """The dark signal of each pixel above the typical dark signal."""
 
     sensor: SensorModel
-    """The sensor."""
-    rate_dn_s: npt.NDArray[np.float32]
+    rate_dn_s: Array32
     """Counts/s at gain 1 and the sensor's `reference_c`, (h, w), float32."""
 
     def subtracted(
@@ -35,20 +35,9 @@ class DarkMap:
 
 
 def measure_dark_map(sensor: SensorModel, height: int, width: int, frames: int, seed: int) -> DarkMap:
-    """Average exposures with the lens covered, at gain 1 and `reference_c`.
+    """Average exposures with the lens covered, at gain 1 and `reference_c`; the seed is that of their noise.
 
     The exposure, at most 1 s, is chosen so that the mean dark signal fills half of the converter's range.
-
-    Parameters
-    ----------
-    sensor : SensorModel
-        The sensor.
-    height, width : int
-        Size of the pixel array.
-    frames : int
-        Number of exposures.
-    seed : int
-        Seed of their noise.
     """
     unit = sensor.with_(gain=1.0, temperature_c=sensor.reference_c)
     exposure_s = min(_LONGEST_S, _HEADROOM * unit.adc_range_e / max(unit.dark_e_s, 1.0))

@@ -7,9 +7,9 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.sensor.model import SensorModel
+from starid.arrays import Array32, Indices
 
 _HOT_LOG_SPREAD: Final = 1.0
 
@@ -18,12 +18,12 @@ _HOT_LOG_SPREAD: Final = 1.0
 class FixedPattern:
     """Differences between pixels that are the same in every frame."""
 
-    sensitivity: npt.NDArray[np.float32]
+    sensitivity: Array32
     """Signal relative to the mean pixel, (h, w), float32; 0 for a dead pixel."""
-    dark_e_s: npt.NDArray[np.float32]
+    dark_e_s: Array32
     """Dark current, electrons/s, (h, w), float32."""
-    hot: npt.NDArray[np.int64]
-    dead: npt.NDArray[np.int64]
+    hot: Indices
+    dead: Indices
     """Rows and columns of the hot and of the dead pixels, (n, 2), int."""
 
 

@@ -6,8 +6,13 @@ import math
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Final, Self
 
+import numpy as np
+
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.noise import Digitizer
+from starid.arrays import Array
+from starid.attitude import ARCSEC_PER_RAD
+from starid.camera import Camera
 from starid.imaging.detection import DetectionSettings
 
 ARCSEC2_PER_SR: Final = (180.0 * 3600.0 / math.pi) ** 2
@@ -135,6 +140,24 @@ class SensorModel:
     def dark_factor(self, temperature_c: float) -> float:
         """Return the dark current at a temperature relative to that at `reference_c`."""
         return math.pow(2.0, (temperature_c - self.reference_c) / self.dark_doubling_c)
+
+    def camera_at(self, camera: Camera, temperature_c: float) -> Camera:
+        """Return the camera at a temperature; unchanged at `reference_c` or without drift."""
+        above = temperature_c - self.reference_c
+        if above == 0.0 or (self.focal_drift == 0.0 and self.k1_drift == 0.0):
+            return camera
+        scale = 1.0 + self.focal_drift * above
+        k1, k2, p1, p2, k3 = camera.distortion
+        return replace(
+            camera,
+            focal_px=(camera.focal_px[0] * scale, camera.focal_px[1] * scale),
+            distortion=(k1 + self.k1_drift * above, k2, p1, p2, k3),
+        )
+
+    def boresight_drift_rad(self, temperature_c: float) -> Array:
+        """Return the rotation vector (3,) of the optics relative to the mounting, radians, sensor frame."""
+        drift = np.array([self.boresight_drift_x, self.boresight_drift_y, self.boresight_drift_z])
+        return np.asarray(drift * ((temperature_c - self.reference_c) / ARCSEC_PER_RAD))
 
     @property
     def max_dn(self) -> int:

@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array32, GreyImage
 from starid.jit import compiled_ieee, inner
 
 LANES: Final = 512
@@ -37,28 +38,16 @@ class Digitizer:
     """Parameters of a sensor's noise and converter, from electrons to counts."""
 
     read_noise_e: float
-    """Standard deviation of the read noise, electrons."""
     full_well_e: float
-    """Full-well capacity, electrons."""
     gain_e_per_dn: float
-    """Electrons per count."""
     offset_dn: float
-    """Black level, counts."""
     max_dn: int
-    """Largest count of the converter."""
 
 
 def lane_states(seed: int, frame_index: int) -> npt.NDArray[np.uint32]:
-    """Return the initial states of the generators of one frame.
+    """Return the initial states (4, LANES), uint32, of the generators of one frame.
 
-    Parameters
-    ----------
-    seed, frame_index : int
-        Non-negative; every pair gives streams independent of all others (`numpy.random.SeedSequence`).
-
-    Returns
-    -------
-    ndarray, shape (4, LANES), uint32
+    Every pair of seed and index, not negative, gives streams independent of all others (`numpy.random.SeedSequence`).
     """
     bits = np.random.Philox(np.random.SeedSequence((seed, frame_index))).random_raw(2 * LANES)
     return np.frombuffer(bits.tobytes(), dtype=np.uint32).reshape(4, LANES).copy()
@@ -92,8 +81,8 @@ def fill_normal(
     state: npt.NDArray[np.uint32],
     bits_a: npt.NDArray[np.uint32],
     bits_b: npt.NDArray[np.uint32],
-    uniform: npt.NDArray[np.float32],
-    normal: npt.NDArray[np.float32],
+    uniform: Array32,
+    normal: Array32,
 ) -> None:
     """Fill `normal` (2·LANES,) with standard normal deviates.
 
@@ -158,11 +147,11 @@ def fill_normal(
 
 @compiled_ieee
 def _digitize_kernel(
-    expected: npt.NDArray[np.float32],
+    expected: Array32,
     state: npt.NDArray[np.uint32],
     generator: np.random.Generator,
     levels: tuple[float, float, float, float, float, float, float],
-    counts: npt.NDArray[np.uint8] | npt.NDArray[np.uint16],
+    counts: GreyImage,
 ) -> None:
     """Convert mean electrons (n,) to counts (n,); `levels` as in `digitize`."""
     read_noise, full_well, gain_e_per_dn, offset_dn, max_dn, few, near_full = levels
@@ -208,24 +197,11 @@ def _digitize_kernel(
             out[i] = np.int32(min(max(value, zero), top))
 
 
-def digitize(
-    expected_e: npt.NDArray[np.float32], digitizer: Digitizer, seed: int, frame_index: int
-) -> npt.NDArray[np.uint8] | npt.NDArray[np.uint16]:
-    """Convert mean electrons to the counts of an image, with noise.
+def digitize(expected_e: Array32, digitizer: Digitizer, seed: int, frame_index: int) -> GreyImage:
+    """Convert mean electrons (h, w), float32, not negative, to the counts (h, w) of an image, with noise.
 
-    Parameters
-    ----------
-    expected_e : ndarray (h, w), float32
-        Mean electrons of every pixel: star light, sky, dark current; not negative.
-    digitizer : Digitizer
-        Noise of the pixels, and converter.
-    seed, frame_index : int
-        Determine the noise; the same pair and input give the same bytes.
-
-    Returns
-    -------
-    ndarray (h, w)
-        uint8 for converters of up to 8 bits, else uint16.
+    The counts are uint8 for converters of up to 8 bits, else uint16. Seed and index determine the noise; the same
+    pair and input give the same bytes.
     """
     rounding_e = digitizer.gain_e_per_dn / math.sqrt(12.0)
     few = FEW_ELECTRONS if math.hypot(digitizer.read_noise_e, rounding_e) < QUIET_NOISE_E else -1.0

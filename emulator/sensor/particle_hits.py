@@ -6,7 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
+
+from starid.arrays import Array, Array32
 
 _STREAK_STEP_PX: Final = 0.2
 _STREAK_MEAN_PX: Final = 8.0
@@ -14,18 +15,11 @@ _STREAK_E_PER_PX: Final = 900.0
 _STREAK_SPREAD: Final = 0.6
 
 
-def add_cosmic_rays(
-    mean_e: npt.NDArray[np.float32], count: int, rng: np.random.Generator
-) -> npt.NDArray[np.float64]:
-    """Add the charge of particles to an image, in place.
+def add_cosmic_rays(mean_e: Array32, count: int, rng: np.random.Generator) -> Array:
+    """Add the charge of particles to an image, in place; return x, y of both ends of each streak (count, 4), pixels.
 
-    Each particle leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with
-    about 900 electrons per pixel, log-normally distributed along the streak.
-
-    Returns
-    -------
-    ndarray (count, 4)
-        x, y of both ends of each streak, pixels.
+    Each particle leaves a streak of exponentially distributed length (mean 8 px) in a random direction, with about
+    900 electrons per pixel, log-normally distributed along the streak.
     """
     height, width = mean_e.shape
     ends = np.empty((count, 4))

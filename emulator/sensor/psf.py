@@ -7,8 +7,8 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array, Array32
 from starid.jit import compiled_ieee, inner
 
 MAX_GAUSS_NODES: Final = 200
@@ -22,7 +22,7 @@ _SQRT_HALF: Final = math.sqrt(0.5)
 
 
 @lru_cache(maxsize=64)
-def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+def _rule(count: int) -> tuple[Array, Array]:
     """Return nodes on (−1, 1) and weights that sum to 1: Gauss–Legendre, or midpoints for very many nodes."""
     if count > MAX_GAUSS_NODES:
         nodes = np.linspace(-1.0, 1.0, count, endpoint=False, dtype=np.float64) + 1.0 / count
@@ -31,22 +31,12 @@ def _rule(count: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]
     return nodes, np.asarray(0.5 * weights, dtype=np.float64)
 
 
-def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Return the quadrature rule that sums a moving spot to a smooth trail.
+def path_rule(longest_px: float, sigma_px: float) -> tuple[Array, Array]:
+    """Return the quadrature rule that sums a spot, moving along a path of up to `longest_px` pixels, to a smooth trail.
 
-    Parameters
-    ----------
-    longest_px : float
-        Longest path of any star during the exposure, pixels.
-    sigma_px : float
-        Standard deviation of the spot.
-
-    Returns
-    -------
-    nodes, weights : ndarray (n,)
-        Times from −1 (start of the exposure) to 1 (its end), and weights that sum to 1. A path below a
-        thousandth of the spot width gets one node. Otherwise nodes are closer than the sigma of the spot;
-        Gauss–Legendre quadrature of a Gaussian is then accurate to about 1e-5 of its peak.
+    It has nodes (n,), times from −1 (start of the exposure) to 1 (its end), and weights (n,) that sum to 1. A path
+    below a thousandth of the spot width gets one node. Otherwise nodes are closer than the sigma of the spot;
+    Gauss–Legendre quadrature of a Gaussian is then accurate to about 1e-5 of its peak.
     """
     lengths = longest_px / sigma_px
     if lengths < _STILL_SIGMA:
@@ -57,7 +47,7 @@ def path_rule(longest_px: float, sigma_px: float) -> tuple[npt.NDArray[np.float6
 
 
 @inner
-def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -> None:
+def _bell(edge: float, sigma: float, out: Array, count: int) -> None:
     """Compute the fractions of a Gaussian around 0 in `count` unit cells; the first cell starts at `edge`."""
     scale = _SQRT_HALF / sigma
     before = math.erf(edge * scale)
@@ -69,29 +59,20 @@ def _bell(edge: float, sigma: float, out: npt.NDArray[np.float64], count: int) -
 
 @compiled_ieee
 def add_spots(
-    image: npt.NDArray[np.float32],
-    sensitivity: npt.NDArray[np.float32],
-    path: npt.NDArray[np.float64],
-    electrons: npt.NDArray[np.float64],
-    sigma: npt.NDArray[np.float64],
-    nodes: npt.NDArray[np.float64],
-    weights: npt.NDArray[np.float64],
+    image: Array32,
+    sensitivity: Array32,
+    path: Array,
+    electrons: Array,
+    sigma: Array,
+    nodes: Array,
+    weights: Array,
 ) -> None:
-    """Add the light of stars to an image of mean electrons, in place.
+    """Add the light of stars to an image (h, w) of mean electrons, in place.
 
-    Parameters
-    ----------
-    image, sensitivity : ndarray (h, w), float32
-        Mean electrons, to which the light is added, and relative signal of each pixel.
-    path : ndarray (n, 6)
-        x0, y0, x1, y1, x2, y2, pixels: at time t, −1…1 over the exposure, x = x0 + x1·t + x2·t², and the same
-        for y.
-    electrons : ndarray (n,)
-        Mean electrons of each star in the whole exposure.
-    sigma : ndarray (n, 2)
-        Standard deviation of each star's spot along x and y, pixels.
-    nodes, weights : ndarray (m,)
-        From `path_rule`.
+    A path (n, 6) is x0, y0, x1, y1, x2, y2, pixels: at time t, −1…1 over the exposure, x = x0 + x1·t + x2·t², and the
+    same for y. `electrons` (n,) is the mean of each star in the whole exposure, `sigma` (n, 2) the standard deviation
+    of its spot along x and y, pixels. Sensitivity (h, w) is the relative signal of each pixel; nodes and weights are
+    from `path_rule`.
     """
     height, width = image.shape
     across = np.empty(width)

@@ -17,11 +17,11 @@ from starhil.emulator.sensor.noise import digitize
 from starhil.emulator.sensor.particle_hits import add_cosmic_rays
 from starhil.emulator.sensor.psf import MAX_RADIUS_SIGMA, add_spots, path_rule
 from starhil.emulator.sensor.rolling_shutter import at_row_times
-from starhil.emulator.sensor.thermal_drift import boresight_drift_rad, drifted_camera
 from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import AreaLight, AreaPainter
 from starhil.emulator.sky.light_grid import Backdrop
 from starhil.emulator.sky.objects import PointSource, SkyObjects
+from starid.arrays import Array, Array32, GreyImage, Indices, Indices32, Mask
 from starid.attitude import Attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog, companions
@@ -50,17 +50,17 @@ _CONE_MARGIN_RAD: Final = math.radians(1.0)
 class StarTruth:
     """Catalogue stars in an image, including companions beyond the limiting magnitude, brightest first."""
 
-    hip: npt.NDArray[np.int32]
+    hip: Indices32
     """Hipparcos numbers, (n,), int32."""
-    catalog_index: npt.NDArray[np.int64]
+    catalog_index: Indices
     """Rows of the renderer's catalogue, (n,), int64."""
-    xy_px: npt.NDArray[np.float64]
+    xy_px: Array
     """Position at mid-exposure, pixels, (n, 2)."""
-    electrons: npt.NDArray[np.float64]
+    electrons: Array
     """Mean electrons of the star in the exposure, (n,)."""
-    magnitude: npt.NDArray[np.float64]
+    magnitude: Array
     """V magnitude, (n,)."""
-    visible: npt.NDArray[np.bool_]
+    visible: Mask
     """False for hidden or omitted stars, (n,) of bool."""
 
 
@@ -68,11 +68,11 @@ class StarTruth:
 class ObjectTruth:
     """Other objects in an image."""
 
-    false_xy_px: npt.NDArray[np.float64]
+    false_xy_px: Array
     """Positions of the false stars, the fixed ones first, (n, 2)."""
-    planet_xy_px: npt.NDArray[np.float64]
+    planet_xy_px: Array
     """Positions of the planets in the order of `SkyObjects.planets`, (m, 2); NaN outside the image."""
-    cosmic_rays_px: npt.NDArray[np.float64]
+    cosmic_rays_px: Array
     """x, y of both ends of each streak, (k, 4)."""
     covered_share: float
     """Fraction of the image that receives less than half of the sky's light."""
@@ -82,24 +82,20 @@ class ObjectTruth:
 class Frame:
     """One exposure and its truth."""
 
-    image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
+    image: GreyImage
     """Counts, (h, w), uint8 or uint16."""
     stars: StarTruth
-    """Catalogue stars in the image."""
     attitude: Attitude
-    """Attitude at mid-exposure."""
     rate_rad_s: tuple[float, float, float]
     """Body rate during the exposure, sensor frame."""
     exposure_s: float
-    """Length of the exposure, seconds."""
     seed: int
     frame_index: int
-    """Seeds of the noise."""
     objects: ObjectTruth | None = None
     """Other objects in the image, if the sky has any."""
 
 
-def frame_without_truth(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], frame_index: int) -> Frame:
+def frame_without_truth(image: GreyImage, frame_index: int) -> Frame:
     """Return the frame of an image (h, w) that was not rendered: it has no stars, and its attitude is the identity."""
     none = np.zeros(0)
     stars = StarTruth(
@@ -111,21 +107,9 @@ def frame_without_truth(image: npt.NDArray[np.uint8] | npt.NDArray[np.uint16], f
 class Renderer:
     """Renders exposures for one camera, catalogue and sensor, and caches what they share.
 
-    An image depends only on the arguments and on (seed, frame_index), not on earlier images.
-
-    Parameters
-    ----------
-    camera : Camera
-        Projection and image size.
-    catalog : StarCatalog
-        The stars. Those fainter than the sensor's limiting magnitude are omitted, except unresolved companions
-        of brighter stars.
-    sensor : SensorModel
-        Optics and detector.
-    seed : int
-        Seed of the run, not negative.
-    objects : SkyObjects, optional
-        Default sky objects of all exposures.
+    An image depends only on the arguments and on (seed, frame_index), not on earlier images. Stars fainter than the
+    sensor's limiting magnitude are omitted, except unresolved companions of brighter stars. `objects` are the default
+    of all exposures.
     """
 
     def __init__(
@@ -142,7 +126,8 @@ class Renderer:
         self.seed = _whole_number("seed", seed)
         self.objects = objects
         self._painter = AreaPainter(camera, self.sensor.zero_magnitude_e_s, self.sensor.psf_sigma_px)
-        brightness = self.sensor_magnitudes()
+        colour = np.nan_to_num(catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
+        brightness = np.asarray(catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
         limit = self.sensor.limiting_magnitude
         near = companions(catalog, limit, min(_COMPANION_PX * camera.pixel_scale_rad, _COMPANION_RAD))
         rows = np.concatenate([np.flatnonzero(catalog.v <= limit), near])
@@ -173,11 +158,6 @@ class Renderer:
         roots = np.sqrt(np.maximum(self._pattern.dark_e_s, 0.0)) / np.float32(step)
         return np.rint(roots).astype(np.uint16), step**2
 
-    def sensor_magnitudes(self) -> npt.NDArray[np.float64]:
-        """Magnitudes (n,) of all catalogue stars in the sensor's band."""
-        colour = np.nan_to_num(self.catalog.b_v - SOLAR_COLOUR_B_V, nan=0.0)
-        return np.asarray(self.catalog.v - self.sensor.colour_term * colour, dtype=np.float64)
-
     def with_sensor(self, sensor: SensorModel) -> Renderer:
         """Return a renderer with another sensor; this one if the sensor is equal."""
         if sensor == self.sensor:
@@ -195,24 +175,11 @@ class Renderer:
         objects: SkyObjects | None = None,
         observer: Observer | None = None,
     ) -> Frame:
-        """Render one exposure.
+        """Render one exposure at the attitude of its middle and a constant body rate (3,), sensor frame, rad/s.
 
-        Parameters
-        ----------
-        attitude : Attitude
-            Attitude at mid-exposure.
-        rate_rad_s : array (3,)
-            Body rate, sensor frame, rad/s; constant over the exposure.
-        frame_index : int
-            Number of the frame in the run; determines the noise together with the seed.
-        exposure_s : float, optional
-            Exposure instead of the sensor's, seconds.
-        temperature_c : float, optional
-            Temperature of detector and lens instead of the sensor's, °C.
-        objects : SkyObjects, optional
-            Sky objects instead of the renderer's default.
-        observer : Observer, optional
-            Whose place and motion give the stars parallax and aberration; by default they have neither.
+        The number of the frame determines the noise, together with the seed. Exposure, seconds, temperature of
+        detector and lens, °C, and sky objects are by default those of the sensor and the renderer. The place and
+        motion of an observer give the stars parallax and aberration.
         """
         given = {"exposure_s": exposure_s, "temperature_c": temperature_c}
         sensor = self.sensor.with_(**{name: value for name, value in given.items() if value is not None})
@@ -220,8 +187,9 @@ class Renderer:
         rate = _rate(rate_rad_s)
         index = _whole_number("frame_index", frame_index)
         others = self.objects if objects is None else objects
-        self._optics = drifted_camera(self.camera, sensor, temperature)
-        optical_axis = self._pointing(attitude, temperature)
+        self._optics = sensor.camera_at(self.camera, temperature)
+        drift = sensor.boresight_drift_rad(temperature)  # of the optics against the mounting
+        optical_axis = attitude.rotated(drift) if np.any(drift) else attitude
         area = None
         if others is not None and others.has_extended_objects:
             area = self._painter.paint(others, optical_axis)
@@ -242,7 +210,10 @@ class Renderer:
             planet_xy = np.full((len(planets), 2), np.nan)
             shown = count + np.flatnonzero(inside[count:])
             planet_xy[chosen[shown] - len(self._rows)] = path[shown, :2]
-            object_truth = self._add_objects(mean, others, planet_xy, exposure, index, area)
+            rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
+            false_xy = self._add_false_stars(mean, others, rng, exposure)
+            streaks = add_cosmic_rays(mean, int(rng.poisson(others.cosmic_rays_s * exposure)), rng)
+            object_truth = ObjectTruth(false_xy, planet_xy, streaks, area.covered_share if area else 0.0)
         self._add_light(mean, path, drawn)
         image = digitize(mean, self.sensor.digitizer, self.seed, index)
         rows = self._rows[chosen[centred]]
@@ -257,28 +228,13 @@ class Renderer:
         rates = (float(rate[0]), float(rate[1]), float(rate[2]))
         return Frame(image, stars, attitude, rates, exposure, self.seed, index, object_truth)
 
-    def _add_objects(
-        self,
-        mean: npt.NDArray[np.float32],
-        objects: SkyObjects,
-        planet_xy: npt.NDArray[np.float64],
-        exposure_s: float,
-        index: int,
-        area: AreaLight | None,
-    ) -> ObjectTruth:
-        """Add false stars and particles to `mean`, in place."""
-        rng = np.random.default_rng((self.seed, index, _OBJECT_STREAM))
-        false_xy = self._add_false_stars(mean, objects, rng, exposure_s)
-        streaks = add_cosmic_rays(mean, int(rng.poisson(objects.cosmic_rays_s * exposure_s)), rng)
-        return ObjectTruth(false_xy, planet_xy, streaks, 0.0 if area is None else area.covered_share)
-
     def _add_false_stars(
         self,
-        mean: npt.NDArray[np.float32],
+        mean: Array32,
         objects: SkyObjects,
         rng: np.random.Generator,
         exposure_s: float,
-    ) -> npt.NDArray[np.float64]:
+    ) -> Array:
         """Add false stars at random positions; return the positions (n, 2)."""
         if not objects.false_stars + objects.fixed_false_stars:
             return np.zeros((0, 2))
@@ -293,7 +249,7 @@ class Renderer:
         self._add_light(mean, path, self.sensor.electrons(0.0, exposure_s) * 10.0 ** (-0.4 * magnitudes))
         return xy
 
-    def trails(self, frame: Frame) -> npt.NDArray[np.float64]:
+    def trails(self, frame: Frame) -> Array:
         """Return the displacements (n, 2) of a frame's stars during its exposure, pixels."""
         icrs = self.catalog.vectors[frame.stars.catalog_index]
         half = 0.5 * frame.exposure_s * np.array(frame.rate_rad_s)
@@ -301,14 +257,7 @@ class Renderer:
         end, _ = self.camera.project(frame.attitude.rotated(half).to_sensor(icrs))
         return end - start
 
-    def _pointing(self, attitude: Attitude, temperature_c: float) -> Attitude:
-        """Return the attitude of the optics, which drift against the mounting with the temperature."""
-        drift = boresight_drift_rad(self.sensor, temperature_c)
-        return attitude.rotated(drift) if np.any(drift) else attitude
-
-    def _mean_without_stars(
-        self, exposure_s: float, temperature_c: float, area: AreaLight | None
-    ) -> npt.NDArray[np.float32]:
+    def _mean_without_stars(self, exposure_s: float, temperature_c: float, area: AreaLight | None) -> Array32:
         """Return the mean electrons (h, w) of sky, dark current and extended objects, in a buffer that is reused."""
         if self._still_conditions != (exposure_s, temperature_c):
             factor = np.float32(self.sensor.dark_factor(temperature_c))
@@ -337,17 +286,20 @@ class Renderer:
     def _paths(
         self,
         attitude: Attitude,
-        rate: npt.NDArray[np.float64],
+        rate: Array,
         exposure_s: float,
         observer: Observer | None,
         planets: tuple[PointSource, ...],
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    ) -> tuple[Array, Indices, Mask]:
         """Return paths (n, 6), numbers and centre-inside mask of the stars and planets whose light may reach the image.
 
         A path is the parabola through the projections at the start, middle and end of the exposure. The numbers of planets
         follow those of the stars.
         """
-        near = self._near(self._vectors, attitude, rate, exposure_s)
+        readout_s = self.camera.height * self.sensor.row_time_s
+        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
+        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
+        near = np.flatnonzero(self._vectors @ attitude.boresight >= cosine)
         icrs = self._vectors[near]
         if observer is not None:
             icrs = observer.apparent_stars(icrs, self._parallax_rad[near])
@@ -358,30 +310,17 @@ class Renderer:
         path, inside, touching = self._path_of(icrs, attitude, rate, exposure_s)
         return path[touching], near[touching], inside[touching]
 
-    def _near(
-        self,
-        vectors: npt.NDArray[np.float64],
-        attitude: Attitude,
-        rate: npt.NDArray[np.float64],
-        exposure_s: float,
-    ) -> npt.NDArray[np.int64]:
-        """Return the numbers of the directions (n, 3) in the cone around the field that the exposure sweeps."""
-        readout_s = self.camera.height * self.sensor.row_time_s
-        sweep = float(np.linalg.norm(rate)) * (exposure_s + readout_s)
-        cosine = math.cos(min(math.acos(self._cos_cone) + sweep, math.pi))
-        return np.flatnonzero(vectors @ attitude.boresight >= cosine)
-
     def _path_of(
         self,
-        icrs: npt.NDArray[np.float64],
+        icrs: Array,
         attitude: Attitude,
-        rate: npt.NDArray[np.float64],
+        rate: Array,
         exposure_s: float,
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    ) -> tuple[Array, Mask, Mask]:
         """Return paths (n, 6) of directions (n, 3), and masks of those centred inside and touching the image."""
         camera, row_time_s = self._optics, self.sensor.row_time_s
 
-        def positions(turn: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]:
+        def positions(turn: Array) -> tuple[Array, Mask]:
             seen = (attitude.rotated(turn) if np.any(turn) else attitude).to_sensor(icrs)
             return camera.project(at_row_times(seen, camera, rate, row_time_s))
 
@@ -403,9 +342,9 @@ class Renderer:
 
     def _add_light(
         self,
-        mean: npt.NDArray[np.float32],
-        path: npt.NDArray[np.float64],
-        electrons: npt.NDArray[np.float64],
+        mean: Array32,
+        path: Array,
+        electrons: Array,
     ) -> None:
         """Add stars to the mean electrons, each with the spot width of its position."""
         base = self.sensor.psf_sigma_px
@@ -439,7 +378,7 @@ def _whole_number(name: str, value: int) -> int:
     return int(value)
 
 
-def _rate(value: npt.ArrayLike) -> npt.NDArray[np.float64]:
+def _rate(value: npt.ArrayLike) -> Array:
     """Check a body rate."""
     rate = np.asarray(value, dtype=np.float64)
     if rate.shape != (3,) or not np.all(np.isfinite(rate)) or np.linalg.norm(rate) > _MAX_RATE_RAD_S:

@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
+from starid.arrays import Array
 from starid.camera import Camera
 
 _ROUNDS: Final = 3
@@ -15,28 +15,15 @@ _ROUNDS: Final = 3
 
 
 def at_row_times(
-    vectors: npt.NDArray[np.float64],
+    vectors: Array,
     camera: Camera,
-    rate_rad_s: npt.NDArray[np.float64],
+    rate_rad_s: Array,
     row_time_s: float,
-) -> npt.NDArray[np.float64]:
-    """Return directions at the exposure times of the rows on which they fall.
+) -> Array:
+    """Return directions (n, 3) in the sensor frame at the times of the rows on which they fall.
 
-    Parameters
-    ----------
-    vectors : ndarray (n, 3)
-        Directions in the sensor frame at the time of the middle row.
-    camera : Camera
-        The camera.
-    rate_rad_s : ndarray (3,)
-        Body rate, sensor frame.
-    row_time_s : float
-        Time from row to row, seconds.
-
-    Returns
-    -------
-    ndarray (n, 3)
-        The same directions in the sensor frame at the time of their rows.
+    They are given at the time of the middle row; the body rate (3,) is in the sensor frame, and rows are `row_time_s`
+    seconds apart.
     """
     if row_time_s == 0.0 or not np.any(rate_rad_s):
         return vectors
@@ -49,31 +36,15 @@ def at_row_times(
     return seen
 
 
-def turned(
-    vectors: npt.NDArray[np.float64], rate_rad_s: npt.NDArray[np.float64], times_s: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
-    """Return directions in the frame of a rotating sensor, each at its own time.
+def turned(vectors: Array, rate_rad_s: Array, times_s: Array) -> Array:
+    """Return directions (n, 3) in the frame of a rotating sensor, each at its own time (n,), seconds, from those at time 0.
 
-    Parameters
-    ----------
-    vectors : ndarray (n, 3)
-        Directions in the sensor frame at time 0.
-    rate_rad_s : ndarray (3,)
-        Body rate, sensor frame.
-    times_s : ndarray (n,)
-        Time of each direction, seconds; may be negative.
-
-    Returns
-    -------
-    ndarray (n, 3)
-        The directions, rotated as by ``Attitude.rotated(rate * time)``.
+    They are rotated as by ``Attitude.rotated(rate * time)``; the body rate (3,) is in the sensor frame.
     """
     speed = math.sqrt(float(rate_rad_s @ rate_rad_s))
     axis = rate_rad_s / speed
     angles = -speed * times_s[:, None]  # the sky turns in the opposite direction to the sensor
     along = (vectors @ axis)[:, None] * axis
     across = vectors - along
-    result: npt.NDArray[np.float64] = (
-        along + np.cos(angles) * across + np.sin(angles) * np.cross(axis, vectors)
-    )
+    result: Array = along + np.cos(angles) * across + np.sin(angles) * np.cross(axis, vectors)
     return result

@@ -16,13 +16,13 @@ from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, PointSource, SunGlare
 from starid.aberration import SPEED_OF_LIGHT_M_S, aberrated, checked_beta
+from starid.arrays import Array
 from starid.earth import ASTRONOMICAL_UNIT_M, DAY_S, in_metres, terrestrial_time
 
-Vector = NDArray[np.float64]
+Vector = Array
 
 SUN_RADIUS_M: Final = 6.957e8
 MOON_RADIUS_M: Final = 1.7374e6
@@ -60,7 +60,6 @@ class Observer:
     """Date, place and velocity of the sensor."""
 
     unix_s: float
-    """Unix time."""
     offset_m: Vector | None = None
     relative_velocity_m_s: Vector | None = None
     """Position and velocity relative to the Earth's centre, GCRS, (3,); None: at the centre, without an Earth."""

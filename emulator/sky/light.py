@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Final
 
 import numpy as np
-import numpy.typing as npt
 
-from starhil.emulator.sky.field import disc_in_field
 from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Line, fill
 from starhil.emulator.sky.light_kernels import (
     Box,
@@ -28,9 +26,11 @@ from starhil.emulator.sky.light_kernels import (
 )
 from starhil.emulator.sky.objects import CelestialBody, EarthLimb, Moon, Obstruction, SkyObjects, SunGlare
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS, WideEarth
+from starid.arrays import Array, Indices
 from starid.attitude import Attitude
 from starid.camera import Camera
 
+_BORDER_SAMPLES: Final = 33
 _GLARE_FROM_DEG: Final = 0.3
 _GLARE_TO_DEG: Final = 30.0
 _SUN_REFERENCE_DEG: Final = 30.0
@@ -57,7 +57,6 @@ class Patch:
     """Light and shadow in part of an image."""
 
     box: Box
-    """Its rows and columns."""
     light: Image
     """Electrons/s in a pixel of mean sensitivity, (h', w'), float32."""
     passed: Image
@@ -65,7 +64,7 @@ class Patch:
     hides_glare: bool = True
     """Whether it is in front of the light scattered in the lens too."""
 
-    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) of the pixels nearest to positions (n, 2)."""
         return transmission_at(self.passed, self.box, xy_px)
 
@@ -81,7 +80,6 @@ class AreaLight:
     """Light of extended objects, and the fraction of the sky's light that passes them."""
 
     size: tuple[int, int]
-    """Width and height of the image, pixels."""
     glare: Image | None = None
     """Smooth light in electrons/s in a pixel of mean sensitivity, at every `GLARE_STEP`-th column and row, (gh, gw)."""
     near: tuple[NearGlare, ...] = ()
@@ -94,7 +92,7 @@ class AreaLight:
     flooded: bool = False
     """Light passes the baffle and saturates the image; the rest is then empty."""
 
-    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) at positions (n, 2); outside the image that of its edge."""
         seen = np.full(len(xy_px), 0.0 if self.flooded else 1.0)
         if self._layers:
@@ -140,6 +138,23 @@ class AreaLight:
             layer.cover(mean, backdrop)
 
 
+def disc_in_field(centre: Array, radius_rad: float, camera: Camera) -> bool:
+    """Return whether any part of a disc around a direction (3,) of the sensor frame is in the field."""
+    if math.acos(max(min(float(centre[2]), 1.0), -1.0)) > camera.field_radius_rad + radius_rad:
+        return False
+    if camera.project(centre[None, :])[1][0]:
+        return True
+    nearest = float(np.max(_border_of(camera) @ centre, initial=-1.0))
+    return nearest >= math.cos(min(radius_rad, math.pi))
+
+
+@lru_cache(maxsize=4)
+def _border_of(camera: Camera) -> Array:
+    """Directions (n, 3) of the outer edge of the pixel array, where it sees any."""
+    border = camera.back_project(camera.border(_BORDER_SAMPLES))
+    return border[~np.isnan(border).any(axis=1)]
+
+
 def through_baffle(objects: SkyObjects, attitude: Attitude) -> tuple[str, ...]:
     """Return which of `sun` and `earth` is within its exclusion angle, so that its light saturates the image."""
     passing = []
@@ -155,7 +170,7 @@ def through_baffle(objects: SkyObjects, attitude: Attitude) -> tuple[str, ...]:
     return tuple(passing)
 
 
-def _is_lit(earth: EarthLimb, towards: npt.NDArray[np.float64], off_nadir_deg: float) -> bool:
+def _is_lit(earth: EarthLimb, towards: Array, off_nadir_deg: float) -> bool:
     """Whether the Sun shines on the point of the Earth seen at an angle from its centre towards a direction."""
     sun = earth.sun_direction
     if sun is None:
@@ -179,14 +194,8 @@ def _off_axis_deg(attitude: Attitude, body: CelestialBody) -> float:
 class AreaPainter:
     """Paints the extended objects of a sky for one camera; caches the directions of its pixels.
 
-    Parameters
-    ----------
-    camera : Camera
-        Directions of the pixels.
-    zero_magnitude_e_s : float
-        Electrons/s from a source of magnitude 0.
-    psf_sigma_px : float
-        Standard deviation of the spot that blurs edges, pixels.
+    A source of magnitude 0 has `zero_magnitude_e_s` electrons/s. A spot of standard deviation `psf_sigma_px` blurs
+    edges.
     """
 
     def __init__(self, camera: Camera, zero_magnitude_e_s: float, psf_sigma_px: float) -> None:
@@ -216,7 +225,7 @@ class AreaPainter:
     def _size(self) -> tuple[int, int]:
         return self._camera.width, self._camera.height
 
-    def _directions_of(self, columns: npt.NDArray[np.int64], rows: npt.NDArray[np.int64]) -> Image:
+    def _directions_of(self, columns: Indices, rows: Indices) -> Image:
         x, y = np.meshgrid(columns, rows)
         vectors = self._camera.back_project(np.column_stack([x.ravel(), y.ravel()]).astype(np.float64))
         vectors[np.isnan(vectors).any(axis=1)] = (0.0, 0.0, -1.0)
@@ -226,30 +235,30 @@ class AreaPainter:
         """Return light and transmission of all extended objects at one attitude."""
         if not objects.blank and through_baffle(objects, attitude):
             return AreaLight(self._size, flooded=True)
-        lights = [body for body in (objects.sun, self._sun_disc(objects.sun, attitude), objects.moon) if body]
+        sun, earth = objects.sun, objects.earth
+        disc = sun.disc if sun and self._in_field(sun, sun.radius_rad, attitude) else None
+        lights = [body for body in (sun, disc, objects.moon) if body]
         glare, near = self._glare(lights, attitude)
         behind = tuple(
             patch for body in lights if isinstance(body, Moon) for patch in self._disc_patch(body, attitude)
         )
-        earth: WideEarth | None = None
+        wide_earth: WideEarth | None = None
         in_front: list[Patch] = []
-        if objects.earth is not None and self._in_reach(objects.earth, attitude):
-            if objects.earth.radius_deg >= _WIDE_EARTH_DEG:
-                earth = self._wide_earth(objects.earth, attitude)
+        if earth is not None and self._in_field(earth, self._reach_rad(earth), attitude):
+            if earth.radius_deg >= _WIDE_EARTH_DEG:
+                wide_earth = self._wide_earth(earth, attitude)
             else:
-                in_front = self._small_earth(objects.earth, attitude)
+                in_front = self._small_earth(earth, attitude)
         covers = [self._obstruction_transmission(obstruction) for obstruction in objects.obstructions]
         if objects.blank:
             covers.append(np.zeros(self._size[::-1], dtype=np.float32))
         everything = (0, self._camera.height, 0, self._camera.width)
         in_front += [Patch(everything, np.zeros_like(cover), cover) for cover in covers]
-        return AreaLight(self._size, glare, near, earth, behind, tuple(in_front))
+        return AreaLight(self._size, glare, near, wide_earth, behind, tuple(in_front))
 
-    def _sun_disc(self, sun: SunGlare | None, attitude: Attitude) -> Moon | None:
-        """Return the disc of the Sun if any part of it is in the field."""
-        if sun is None or not disc_in_field(attitude.to_sensor(sun.direction), sun.radius_rad, self._camera):
-            return None
-        return sun.disc
+    def _in_field(self, body: CelestialBody, radius_rad: float, attitude: Attitude) -> bool:
+        """Whether any part of a disc around a body is in the field."""
+        return disc_in_field(attitude.to_sensor(body.direction), radius_rad, self._camera)
 
     def _glare(
         self, lights: Sequence[SunGlare | Moon], attitude: Attitude
@@ -305,7 +314,7 @@ class AreaPainter:
         draw_moon(disc, passed, self._directions, box, (axes, turn, source), shape)
         return (Patch(box, blurred(disc, self._spot_taps), passed, hides_glare=False),)
 
-    def _box_around(self, direction: npt.NDArray[np.float64], radius_rad: float) -> Box | None:
+    def _box_around(self, direction: Array, radius_rad: float) -> Box | None:
         """Return the part of the image that holds a disc in the sensor frame; None if it is outside."""
         reach_rad = radius_rad + 1.25 * GLARE_STEP * self._camera.pixel_scale_rad
         if math.acos(max(min(float(direction[2]), 1.0), -1.0)) > self._camera.field_radius_rad + reach_rad:
@@ -344,9 +353,7 @@ class AreaPainter:
         step_rad = GLARE_STEP * self._camera.pixel_scale_rad
         return WideEarth(grid, distance, behind, earth.electrons_s, step_rad)
 
-    def _earth_and_sun(
-        self, earth: EarthLimb, attitude: Attitude
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    def _earth_and_sun(self, earth: EarthLimb, attitude: Attitude) -> tuple[Array, Array]:
         """Return the directions (3,) of the Earth's centre and of its Sun, sensor frame; zeros light all of the disc."""
         sun = earth.sun_direction
         nadir = attitude.to_sensor(earth.direction)
@@ -360,10 +367,6 @@ class AreaPainter:
     def _reach_rad(self, earth: EarthLimb) -> float:
         """Return the angle from the Earth's centre to which the glow of its limb reaches."""
         return earth.radius_rad + GLOW_HEIGHTS * self._atmosphere_rad(earth)
-
-    def _in_reach(self, earth: EarthLimb, attitude: Attitude) -> bool:
-        """Whether the Earth or the glow of its limb reaches into the field."""
-        return disc_in_field(attitude.to_sensor(earth.direction), self._reach_rad(earth), self._camera)
 
     def _obstruction_transmission(self, obstruction: Obstruction) -> Image:
         """Return the transmission (h, w) of an obstruction."""

@@ -9,11 +9,12 @@ from typing import Final
 import numpy as np
 import numpy.typing as npt
 
+from starid.arrays import Array32
 from starid.jit import compiled_ieee, inner
 
-Image = npt.NDArray[np.float32]
+Image = Array32
 
-Line = npt.NDArray[np.float32]
+Line = Array32
 
 Sensitivity = npt.NDArray[np.uint16]
 """Relative signal of each pixel (h, w) in a unit of its own: two bytes are read faster than four."""
@@ -43,7 +44,6 @@ class Backdrop:
     sky_e_s: float
     """Light of the sky, electrons/s in a pixel of mean sensitivity."""
     exposure_s: float
-    """Length of the exposure."""
     min_glare_e: float = 0.0
     """Glare of fewer electrons everywhere is left out."""
     saturated_e: float = math.inf
@@ -51,7 +51,7 @@ class Backdrop:
 
 
 @inner
-def expand(row: npt.NDArray[np.float32], line: npt.NDArray[np.float32], first: int, last: int) -> None:
+def expand(row: Array32, line: Array32, first: int, last: int) -> None:
     """Interpolate the cells from `first` to before `last` of a row of the grid at every column."""
     for i in range(first, last):
         start, slope = row[i], (row[i + 1] - row[i]) * np.float32(1.0 / GLARE_STEP)

@@ -6,13 +6,13 @@ import math
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.sky.light_grid import GLARE_STEP, Image, Line, Sensitivity, expand
 from starhil.emulator.sky.wide_earth import GLOW_HEIGHTS
+from starid.arrays import Array, Array32
 from starid.jit import compiled_ieee, inner
 
-Glare: TypeAlias = tuple[npt.NDArray[np.float32], float, float, bool]
+Glare: TypeAlias = tuple[Array32, float, float, bool]
 """Direction of a source in the sensor frame, strength, square of the softness, and whether it falls with the cube."""
 
 Box: TypeAlias = tuple[int, int, int, int]
@@ -23,7 +23,7 @@ NearGlare: TypeAlias = tuple[Box, Glare, Image, Image]
 
 
 @compiled_ieee
-def transmission_at(passed: Image, box: Box, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def transmission_at(passed: Image, box: Box, xy_px: Array) -> Array:
     """Return the transmission (n,) of the pixels nearest to positions (n, 2); 1 outside the box."""
     seen = np.ones(len(xy_px))
     for i in range(seen.size):
@@ -106,9 +106,7 @@ def refine_glare(mean: Image, sensitivity: Sensitivity, near: NearGlare, exposur
 
 
 @compiled_ieee
-def points_near(
-    directions: Image, centre: npt.NDArray[np.float32], cosine: float
-) -> tuple[int, int, int, int]:
+def points_near(directions: Image, centre: Array32, cosine: float) -> tuple[int, int, int, int]:
     """First and last row and column of directions (3, h, w) within an angle of a centre; the last before the first if none."""
     a, b, c, least = centre[0], centre[1], centre[2], np.float32(cosine)
     height, width = directions.shape[1:]
@@ -134,7 +132,7 @@ def draw_moon(
     passed: Image,
     directions: Image,
     box: Box,
-    axes: tuple[npt.NDArray[np.float64], tuple[float, float], npt.NDArray[np.float64]],
+    axes: tuple[Array, tuple[float, float], Array],
     shape: tuple[float, float, float],
 ) -> None:
     """Draw the disc with the terminator, and what is visible behind it.
@@ -189,25 +187,17 @@ def add_earth(
     electrons_s: Image,
     transmission: Image,
     directions: Image,
-    nadir: npt.NDArray[np.float64],
-    sun: npt.NDArray[np.float64],
+    nadir: Array,
+    sun: Array,
     angles: tuple[float, float],
     brightness: float,
 ) -> None:
-    """Put the Earth in front of light and sky, in place.
+    """Put the Earth in front of light and sky, `light` and `passed` (h, w) of a `Patch`, in place.
 
-    Parameters
-    ----------
-    electrons_s, transmission : ndarray (h, w), float32
-        `light` and `passed` of a `Patch`.
-    directions : ndarray (3, h, w), float32
-        Of the pixels, sensor frame.
-    nadir, sun : ndarray (3,)
-        To the Earth's centre and to the Sun, sensor frame; zeros instead of the Sun light all of the disc.
-    angles : (float, float)
-        Angular radius of the disc, and height over which its limb fades, radians.
-    brightness : float
-        Electrons/s per pixel where the Sun is in the zenith.
+    `directions` (3, h, w) are those of the pixels, `nadir` and `sun` (3,) those to the Earth's centre and to the Sun,
+    all in the sensor frame; zeros instead of the Sun light all of the disc. `angles` are the angular radius of the
+    disc, and the height over which its limb fades, radians. `brightness` is electrons/s per pixel where the Sun is in
+    the zenith.
     """
     radius, atmosphere = angles
     distance = 1.0 / math.sin(radius)

@@ -14,23 +14,34 @@ from functools import cached_property
 from typing import Any, Final, Self
 
 import numpy as np
-import numpy.typing as npt
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.sky.directions import icrs_vector
+from starid.arrays import Array
 
-_ANGLE: Final = (-360.0, 360.0)
 _MAX_OBJECTS: Final = 100_000
 
 
+def limited(low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
+    """Return a field with its limits, and its default if it has one; whole numbers if the limits are."""
+    return dataclasses.field(default=default, metadata={"limits": (low, high)})
+
+
+def icrs_vector(ra_deg: float, dec_deg: float) -> Array:
+    """Unit vector (3,) of a direction."""
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    return np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
+
+
+@dataclass(frozen=True)
 class CelestialBody:
     """Something in one direction of the sky."""
 
-    ra_deg: float
-    dec_deg: float
+    ra_deg: float = limited(-360.0, 360.0)
+    dec_deg: float = limited(-90.0, 90.0)
+    """Direction of its centre, ICRS."""
 
     @cached_property
-    def direction(self) -> npt.NDArray[np.float64]:
+    def direction(self) -> Array:
         """Direction (3,) of its centre, ICRS."""
         return icrs_vector(self.ra_deg, self.dec_deg)
 
@@ -44,20 +55,17 @@ class CelestialBody:
 class Moon(CelestialBody):
     """The Moon: a saturated disc, and its light scattered in the lens."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction of its centre, ICRS."""
-    diameter_deg: float = 0.52
+    diameter_deg: float = limited(1e-3, 90.0, 0.52)
     """Apparent diameter."""
-    magnitude: float = -12.7
+    magnitude: float = limited(-30.0, 20.0, -12.7)
     """V of the whole disc; −12.7 when full."""
-    illuminated: float = 1.0
+    illuminated: float = limited(0.0, 1.0, 1.0)
     """Illuminated fraction of the disc, 0…1."""
-    bright_limb_deg: float = 90.0
+    bright_limb_deg: float = limited(-360.0, 360.0, 90.0)
     """Position angle of the midpoint of the bright limb, from north through east."""
-    glare_share: float = 1e-3
+    glare_share: float = limited(0.0, 1.0, 1e-3)
     """Fraction of its light that the lens scatters over the field; falls with the square of the angle."""
-    reach_deg: float = 180.0
+    reach_deg: float = limited(0.0, 180.0, 180.0)
     """Angle from the boresight beyond which none of its light enters the lens."""
 
     @property
@@ -70,14 +78,11 @@ class Moon(CelestialBody):
 class SunGlare(CelestialBody):
     """The Sun: stray light, and in the field of view a disc whose light, scattered in the lens, saturates the image."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction of the Sun, ICRS."""
-    electrons_s: float = 1000.0
+    electrons_s: float = limited(0.0, 1e12, 1000.0)
     """Electrons/s per pixel at 30° from the Sun; falls with the cube of the angle."""
-    exclusion_deg: float = 0.0
+    exclusion_deg: float = limited(0.0, 180.0, 0.0)
     """Angle from the boresight within which sunlight passes the baffle and saturates the image."""
-    reach_deg: float = 180.0
+    reach_deg: float = limited(0.0, 180.0, 180.0)
     """Angle from the boresight beyond which no sunlight enters the lens."""
 
     @property
@@ -95,24 +100,21 @@ class SunGlare(CelestialBody):
 class EarthLimb(CelestialBody):
     """The Earth's disc in front of part of the sky."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction of the Earth's centre, ICRS."""
-    radius_deg: float = 64.0
+    radius_deg: float = limited(0.1, 179.0, 64.0)
     """Angular radius of the Earth; 64° at an altitude of 700 km."""
-    electrons_s: float = 1e6
+    electrons_s: float = limited(0.0, 1e12, 1e6)
     """Electrons/s per pixel of the disc: 0 for the night side, millions for the day side."""
-    atmosphere_deg: float = 0.15
+    atmosphere_deg: float = limited(1e-3, 20.0, 0.15)
     """Angular height over which the limb fades."""
-    exclusion_deg: float = 0.0
+    exclusion_deg: float = limited(0.0, 180.0, 0.0)
     """Angle between the boresight and the nearest point of the disc, if that is lit, within which its light passes
     the baffle and saturates the image; 0 for no baffle."""
-    sun_ra_deg: float | None = None
-    sun_dec_deg: float | None = None
+    sun_ra_deg: float | None = limited(-360.0, 360.0, None)
+    sun_dec_deg: float | None = limited(-90.0, 90.0, None)
     """Direction of the Sun, which lights the half of the Earth that faces it; by default all of the disc is lit."""
 
     @cached_property
-    def sun_direction(self) -> npt.NDArray[np.float64] | None:
+    def sun_direction(self) -> Array | None:
         """Direction (3,) of the Sun that lights it, ICRS; None if all of the disc is lit."""
         if self.sun_ra_deg is None or self.sun_dec_deg is None:
             return None
@@ -128,10 +130,7 @@ class EarthLimb(CelestialBody):
 class PointSource(CelestialBody):
     """A planet, satellite or other point source that is not in the star catalogue."""
 
-    ra_deg: float
-    dec_deg: float
-    """Direction, ICRS."""
-    magnitude: float
+    magnitude: float = limited(-30.0, 20.0)
     """V magnitude in the sensor's band."""
     name: str = ""
     """Name in the truth."""
@@ -141,46 +140,14 @@ class PointSource(CelestialBody):
 class Obstruction:
     """A dark object near the lens that covers the image beyond a straight edge or inside a polygon."""
 
-    share: float = 0.5
+    share: float = limited(0.0, 1.0, 0.5)
     """Fraction of the image beyond the edge, 0…1; not used with a polygon."""
-    angle_deg: float = 0.0
+    angle_deg: float = limited(-360.0, 360.0, 0.0)
     """Direction from the image to the covered side, 0 to the right, 90 down."""
-    polygon_px: tuple[tuple[float, float], ...] = ()
+    polygon_px: tuple[tuple[float, float], ...] = limited(-1e5, 1e5, ())
     """Corners, pixels; empty for an edge."""
-    softness_px: float = 3.0
+    softness_px: float = limited(0.0, 1000.0, 3.0)
     """Blur of the out-of-focus outline, pixels."""
-
-
-_RANGES: Final[dict[str, tuple[float, float]]] = {
-    "ra_deg": _ANGLE,
-    "dec_deg": (-90.0, 90.0),
-    "diameter_deg": (1e-3, 90.0),
-    "magnitude": (-30.0, 20.0),
-    "illuminated": (0.0, 1.0),
-    "bright_limb_deg": _ANGLE,
-    "glare_share": (0.0, 1.0),
-    "electrons_s": (0.0, 1e12),
-    "radius_deg": (0.1, 179.0),
-    "atmosphere_deg": (1e-3, 20.0),
-    "exclusion_deg": (0.0, 180.0),
-    "reach_deg": (0.0, 180.0),
-    "sun_ra_deg": _ANGLE,
-    "sun_dec_deg": (-90.0, 90.0),
-    "share": (0.0, 1.0),
-    "angle_deg": _ANGLE,
-    "polygon_px": (-1e5, 1e5),
-    "softness_px": (0.0, 1000.0),
-    "false_stars": (0, _MAX_OBJECTS),
-    "fixed_false_stars": (0, _MAX_OBJECTS),
-    "false_star_magnitudes": (-5.0, 20.0),
-    "missing_stars": (0, _MAX_OBJECTS),
-    "cosmic_rays_s": (0.0, 1e6),
-}
-
-
-def range_of(field: str) -> tuple[float, float] | None:
-    """Return the lowest and highest value of a field of any class here; None if it has no range."""
-    return _RANGES.get(field)
 
 
 @dataclass(frozen=True)
@@ -195,15 +162,15 @@ class SkyObjects:
     """Point sources at fixed directions."""
     obstructions: tuple[Obstruction, ...] = ()
     """Objects that cover parts of the image."""
-    false_stars: int = 0
+    false_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of false stars at random positions that change with every frame."""
-    fixed_false_stars: int = 0
+    fixed_false_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of false stars at random positions that stay the same during a run."""
-    false_star_magnitudes: tuple[float, float] = (1.0, 5.5)
+    false_star_magnitudes: tuple[float, float] = limited(-5.0, 20.0, (1.0, 5.5))
     """Range of the magnitudes of false stars, brighter first; uniformly distributed."""
-    missing_stars: int = 0
+    missing_stars: int = limited(0, _MAX_OBJECTS, 0)
     """Number of catalogue stars omitted, the brightest in the field."""
-    cosmic_rays_s: float = 0.0
+    cosmic_rays_s: float = limited(0.0, 1e6, 0.0)
     """Mean number of particles per second that hit the detector, each leaving a streak."""
     blank: bool = False
     """True if no light reaches the detector."""
@@ -314,16 +281,14 @@ def _check_fields(where: str, body: Any) -> None:
                 raise EmulatorError(f"sky {where} {name}: must be {kind} {low:g}…{high:g}, not {number!r}")
 
 
-def _field_rules(kind: Any) -> tuple[tuple[str, Any, float, float, bool], ...]:
-    """Name, default and range of each field of a class, and whether it is a whole number; from above to below is no range."""
-    ranges = [_RANGES.get(field.name, (math.inf, -math.inf)) for field in dataclasses.fields(kind)]
-    return tuple(
+_NO_LIMITS: Final = (math.inf, -math.inf)
+
+_RULES: Final[dict[type, list[tuple[str, Any, float, float, bool]]]] = {
+    kind: [
         (field.name, field.default, low, high, isinstance(low, int))
-        for field, (low, high) in zip(dataclasses.fields(kind), ranges, strict=True)
-    )
-
-
-_RULES: Final = {
-    kind: _field_rules(kind) for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
+        for field in dataclasses.fields(kind)
+        for low, high in (field.metadata.get("limits", _NO_LIMITS),)
+    ]
+    for kind in (Moon, SunGlare, EarthLimb, PointSource, Obstruction, SkyObjects)
 }
-"""Rules of the fields of each class of objects."""
+"""Name, default and limits of each field of a class of objects, and whether it is a whole number."""

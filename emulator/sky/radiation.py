@@ -24,12 +24,8 @@ _DAY_S: Final = 86_400.0
 def sub_satellite_point(position_m: npt.ArrayLike, unix_s: float) -> tuple[float, float, float]:
     """Return the place below a satellite: geocentric latitude and longitude in degrees, altitude in kilometres.
 
-    Parameters
-    ----------
-    position_m : array (3,)
-        Position in GCRS, metres; precession since J2000 (0.4° by 2026) is neglected.
-    unix_s : float
-        Time, taken as UT1. The Earth rotation angle is equation 5.15 of the IERS Conventions 2010.
+    The position (3,) is in GCRS, metres; precession since J2000 (0.4° by 2026) is neglected. The time is taken as
+    UT1; the Earth rotation angle is equation 5.15 of the IERS Conventions 2010.
     """
     x, y, z = (float(value) for value in np.asarray(position_m, dtype=np.float64) / 1000.0)
     distance = math.sqrt(x * x + y * y + z * z)
@@ -58,16 +54,8 @@ def particle_rate(
 ) -> float:
     """Return the mean number of particles per second that hit the detector.
 
-    Parameters
-    ----------
-    quiet_s : float
-        Particles per second outside the anomaly.
-    anomaly_s : float
-        Particles per second in addition, in the centre of the anomaly at 500 km.
-    position_m : array (3,), optional
-        Position in GCRS, metres; without it only `quiet_s` counts.
-    unix_s : float, optional
-        Time; without it only `quiet_s` counts.
+    There are `quiet_s` outside the anomaly, and `anomaly_s` more in its centre at 500 km. Without a position (3,),
+    GCRS, metres, and a time, only `quiet_s` counts.
     """
     if position_m is None or unix_s is None or anomaly_s == 0.0:
         return quiet_s

@@ -52,20 +52,15 @@ def has_aberration(values: Mapping[str, Any]) -> Any:
 
 
 class Sky:
-    """The sky of a profile.
+    """The sky of a table `[sky]` in a profile: the fields of `SkyObjects`, and three more.
 
-    Parameters
-    ----------
-    values
-        The table `[sky]`: the fields of `SkyObjects`, and
+    - `date`: set if the stars are to be seen with aberration and parallax;
+    - `bodies`: one of `BODIES`; with `ephemeris`, a table `sun`, `moon` or `earth` with a direction replaces
+      the body of the date;
+    - `aberration`: false for stars without aberration and parallax all the same.
 
-        - `date`: set if the stars are to be seen with aberration and parallax;
-        - `bodies`: one of `BODIES`; with `ephemeris`, a table `sun`, `moon` or `earth` with a direction replaces
-          the body of the date;
-        - `aberration`: false for stars without aberration and parallax all the same.
-
-        A table `sun`, `moon` or `earth` without a direction does not place the body, but gives its look wherever the
-        date or a fault puts it.
+    A table `sun`, `moon` or `earth` without a direction does not place the body, but gives its look wherever the date
+    or a fault puts it.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -98,16 +93,10 @@ class Sky:
         velocity_m_s: Vector | None = None,
         faults: Mapping[str, Any] | None = None,
     ) -> SkyView:
-        """Return the sky at a time.
+        """Return the sky at a date, Unix time (None: only bodies that are given), and a place.
 
-        Parameters
-        ----------
-        unix_s
-            Date, Unix time; None: only bodies that are given.
-        position_m, velocity_m_s
-            Relative to the Earth's centre, GCRS (3,); None: at the centre.
-        faults
-            Fields of `SkyObjects` that replace the profile's; of a body, its fields.
+        Position and velocity (3,) are relative to the Earth's centre, GCRS; None: at the centre. Faults are fields of
+        `SkyObjects` that replace the profile's; of a body, its fields.
         """
         objects = self._with_faults(faults) if faults else self._typed
         if unix_s is None or not (self.by_date or self._moving):

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from starhil.emulator.sky.light_grid import GLARE_STEP, Backdrop, Image, Sensitivity, expand
+from starid.arrays import Array, Array32, Indices32
 from starid.jit import compiled_ieee, inner
 
 GLOW_HEIGHTS: Final = 20.0
@@ -31,7 +32,7 @@ _BRIGHT: Final = 1
 _SMOOTH: Final = 2
 _DETAILED: Final = 3
 
-Line = npt.NDArray[np.float32]
+Line = Array32
 Gain = npt.NDArray[np.uint16]
 
 
@@ -49,9 +50,8 @@ class WideEarth:
     brightness: float
     """Electrons/s per pixel where the Sun is in the zenith."""
     step_rad: float
-    """Angle between points of the grid."""
 
-    def seen_at(self, xy_px: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    def seen_at(self, xy_px: Array) -> Array:
         """Return the transmission (n,) of the atmosphere at positions (n, 2)."""
         height = self.grid[2]
         across, down = (xy_px / GLARE_STEP).T
@@ -60,7 +60,7 @@ class WideEarth:
         across, down = across - column, down - row
         upper = height[row, column] * (1.0 - across) + height[row, column + 1] * across
         lower = height[row + 1, column] * (1.0 - across) + height[row + 1, column + 1] * across
-        seen: npt.NDArray[np.float64] = np.clip(upper * (1.0 - down) + lower * down, 0.0, 1.0)
+        seen: Array = np.clip(upper * (1.0 - down) + lower * down, 0.0, 1.0)
         return seen
 
     @property
@@ -103,7 +103,7 @@ def _shades(cosine: Line, lit: Line, shade: Line, emergent: Line, far: float, be
 
 @inner
 def _sort_cells(
-    sorts: npt.NDArray[np.int32],
+    sorts: Indices32,
     heights: tuple[Line, Line],
     shades: tuple[Line, Line],
     emergents: tuple[Line, Line],

@@ -19,8 +19,8 @@ from starhil.emulator.truth.orbit import LARGEST_ECCENTRICITY, KeplerOrbit, Orbi
 from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import (
     MAX_RATE_DEG_S,
+    ZERO_RATE,
     FixedTruth,
-    HoldSegment,
     RateSegment,
     RateTruth,
     Segment,
@@ -134,32 +134,45 @@ class MountConfig(Strict):
         return rotation
 
 
-class FixedConfig(Strict):
+class SourceConfig(Strict):
+    """Keys of every truth source."""
+
+    kind: str
+    """Selects this truth source."""
+    mount: MountConfig | None = None
+    """Mount of the sensor on the body; the truth then describes the body."""
+
+
+class StartConfig(SourceConfig):
+    """Keys of a truth source that starts from an attitude."""
+
+    attitude: AttitudeConfig = DEFAULT_ATTITUDE
+    """Attitude at the start; of a feed, before the first message."""
+
+
+class SocketConfig(StartConfig):
+    """Keys of a truth source with a socket."""
+
+    stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
+    """Silence after which the attitude is held and flagged `stale`."""
+
+
+class FixedConfig(StartConfig):
     """An attitude that does not change."""
 
     kind: Literal["fixed"]
-    """Selects this truth source."""
-    attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """The attitude."""
-    mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source."""
         return FixedTruth(self.attitude.build())
 
 
-class RateConfig(Strict):
+class RateConfig(StartConfig):
     """A rotation at a constant body rate, starting from an attitude."""
 
     kind: Literal["rate"]
-    """Selects this truth source."""
-    attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """Attitude at the start."""
     rate_deg_s: Rate
     """Body rate about x, y and z of the sensor frame."""
-    mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the rotation begins now."""
@@ -176,7 +189,7 @@ class HoldConfig(Strict):
 
     def build(self) -> Segment:
         """Make the segment."""
-        return HoldSegment(self.seconds)
+        return RateSegment(self.seconds, ZERO_RATE)
 
 
 class TurnConfig(Strict):
@@ -222,19 +235,14 @@ class SlewToConfig(Strict):
 SegmentConfig: TypeAlias = Annotated[HoldConfig | TurnConfig | SlewToConfig, Field(discriminator="do")]
 
 
-class SlewConfig(Strict):
+class SlewConfig(StartConfig):
     """A sequence of holds, constant rates and slews."""
 
     kind: Literal["slew"]
-    """Selects this truth source."""
-    attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """Attitude at the start."""
     segments: Annotated[list[SegmentConfig], Field(min_length=1)]
     """Segments in order."""
     repeat: bool = False
     """Whether to start again after the last segment."""
-    mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:  # noqa: ARG002 (one signature for all)
         """Make the source; the first segment begins now."""
@@ -242,11 +250,10 @@ class SlewConfig(Strict):
         return SlewTruth(self.attitude.build(), segments, start_s=now_s, repeat=self.repeat)
 
 
-class FileConfig(Strict):
+class FileConfig(SourceConfig):
     """A file of attitudes: CSV, CCSDS AEM, STK `.a` or SPICE; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
-    """Selects this truth source."""
     path: str
     """The file; its content says which format it has, see truth-files.md."""
     start: Literal["run", "now"] = "run"
@@ -254,8 +261,6 @@ class FileConfig(Strict):
     the truth is set."""
     repeat: bool = False
     """Whether to start again after the last row."""
-    mount: MountConfig | None = None
-    """Mount of the sensor on the body; the truth then describes the body."""
 
     def build(self, now_s: float, folder: Path) -> TruthSource:
         """Read the file."""
@@ -263,11 +268,10 @@ class FileConfig(Strict):
         return replace(read_truth_file(folder / self.path), start_s=start_s, repeat=self.repeat)
 
 
-class LiveConfig(Strict):
+class LiveConfig(SocketConfig):
     """A feed of JSON lines in the format of `starhil.emulator.truth.feed_message`."""
 
     kind: Literal["live"]
-    """Selects this truth source."""
     protocol: Literal["udp", "tcp"] = "udp"
     """Transport of the feed."""
     host: str = "127.0.0.1"
@@ -279,20 +283,14 @@ class LiveConfig(Strict):
     42, Basilisk and most textbooks."""
     order: Literal["xyzw", "wxyz"] = "xyzw"
     """Position of the scalar in `q`: last or first."""
-    stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
-    """Silence after which the attitude is held and flagged `stale`."""
     timeline: Literal["anchor", "run"] = "anchor"
     """Meaning of `t` in a message: with `anchor`, the first message refers to its time of arrival; with
     `run`, `t` is simulation time in seconds."""
     lockstep: bool = False
     """Whether each message advances the stepped clock to its `t` and is then answered; TCP only."""
-    attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """Attitude before the first message."""
-    mount: MountConfig | None = None
-    """Mount of the sensor on the body; the messages are then about the body."""
 
     @model_validator(mode="after")
-    def _answers_have_a_way_back(self) -> Self:
+    def _lockstep_needs_tcp(self) -> Self:
         if self.lockstep and self.protocol != "tcp":
             raise ValueError('lockstep needs protocol = "tcp", because each message is answered')
         return self
@@ -312,11 +310,10 @@ class LiveConfig(Strict):
         )
 
 
-class Config42(Strict):
+class Config42(SocketConfig):
     """The simulator 42, over its socket (`Inp_IPC.txt`, mode TX); in lock-step on the stepped clock."""
 
     kind: Literal["42"]
-    """Selects this truth source."""
     role: Literal["client", "server"] = "client"
     """`client` connects to 42 (SERVER in `Inp_IPC.txt`); `server` listens (CLIENT in `Inp_IPC.txt`)."""
     host: str = "127.0.0.1"
@@ -327,12 +324,6 @@ class Config42(Strict):
     """Number of the spacecraft, i of `SC[i]`."""
     orbit: Annotated[int, Field(ge=0, le=999)] = 0
     """Number of the reference orbit, i of `Orb[i]`."""
-    stale_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
-    """Silence after which the attitude is held and flagged `stale`."""
-    attitude: AttitudeConfig = DEFAULT_ATTITUDE
-    """Attitude before the first message."""
-    mount: MountConfig | None = None
-    """Mount of the sensor in the body frame of 42."""
 
     @model_validator(mode="after")
     def _port_to_connect_to(self) -> Self:

@@ -25,6 +25,8 @@ from typing import Final
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.truth.feed_message import checked_attitude
+from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.table import FileTruth
@@ -43,9 +45,6 @@ LOG_COLUMNS: Final = {
     **{f"true_{name}": name for name in (*QUATERNION_COLUMNS, *RATE_COLUMNS)},
 }
 """Column of a truth log → column of a truth file."""
-
-NORM_TOLERANCE: Final = 0.01
-"""Largest error of the length of a quaternion that is attributed to rounding."""
 
 BOUNDS: Final = {
     "t": 1e9,
@@ -177,7 +176,7 @@ def _attitude(where: str, needed: tuple[str, ...], row: dict[str, float]) -> Att
     values = [row[name] for name in needed]
     if needed is ANGLE_COLUMNS:
         return Attitude.from_radec_roll(*values)
-    norm = math.sqrt(sum(v * v for v in values))
-    if abs(norm - 1.0) > NORM_TOLERANCE:
-        raise EmulatorError(f"{where}: the quaternion is not of length 1")
-    return Attitude(np.array(values))
+    try:
+        return checked_attitude("the quaternion", np.array(values), "rotation")
+    except FeedError as error:
+        raise EmulatorError(f"{where}: {error}") from None

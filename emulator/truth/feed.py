@@ -1,17 +1,18 @@
-"""The sockets of a live feed: UDP, or TCP as server or client of the simulator."""
+"""The sockets of a live feed, UDP or TCP as server or client of the simulator, and lock-step with it."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
+from dataclasses import replace
 from typing import Final, Literal
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.guard import until_cancelled
 from starhil.emulator.json_lines import read_lines
-from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth.lock_step import LockStep, Step
+from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError
+from starhil.emulator.truth.live import RESTART_S, LiveTruth
 from starhil.protocol.errors import reason
 from starhil.protocol.flow import ConnectionLimit
 
@@ -21,6 +22,54 @@ RETRY_S: Final = 0.5
 """Pause between attempts to connect to a simulator, seconds."""
 
 Socket = Literal["udp", "listen", "connect"]
+
+Step = Callable[[float], Awaitable[None]]
+"""Advances simulation time by a number of seconds; returns when all events within the step are done."""
+
+
+class LockStep:
+    """Advances the simulation clock with the messages of a live feed: each to its time, and is then answered.
+
+    The first message is the current truth. Each later message is the truth at the end of the step that it causes, so
+    that exposures within the step are between two messages. The simulator waits for the answer: both have the same
+    time, and the same messages give the same bytes.
+    """
+
+    def __init__(self, truth: LiveTruth, now_s: Callable[[], float], step: Step) -> None:
+        self._truth = truth
+        truth.timeline = "run"
+        self._now_s = now_s
+        self._step = step
+        self._last_t: float | None = None
+        self._lock = asyncio.Lock()
+
+    async def receive(self, data: bytes) -> str:
+        """Process one message; return the fault of a rejected message, otherwise an empty text."""
+        async with self._lock:
+            try:
+                return await self._apply_message(data)
+            except (FeedError, EmulatorError) as fault:
+                self._truth.reject(str(fault))
+                return str(fault)
+
+    async def _apply_message(self, data: bytes) -> str:
+        message = self._truth.format.decode(data)
+        if message.t is None:
+            raise FeedError("t is missing; lock-step needs the sender's time")
+        last, now = self._last_t, self._now_s()
+        if last is not None and last - message.t > RESTART_S:
+            self._truth.begin_timeline()
+            last = None
+        step_s = 0.0 if last is None else message.t - last
+        if last is not None and abs(step_s) < SHORTEST_S:
+            return ""  # a simulator may repeat its first message
+        if step_s < 0.0:
+            raise FeedError(f"t = {message.t} is not later than in the previous message")
+        self._last_t = message.t
+        accepted = self._truth.accept(replace(message, t=now + step_s), now)
+        if step_s > 0.0:
+            await self._step(step_s)
+        return "" if accepted else self._truth.last_fault
 
 
 class _Datagrams(asyncio.DatagramProtocol):
@@ -39,10 +88,7 @@ class _Datagrams(asyncio.DatagramProtocol):
 class LiveFeed:
     """The socket between a dynamics simulator and a `LiveTruth`.
 
-    Parameters
-    ----------
-    step
-        Advances the simulation clock, for lock-step; None if time passes by itself.
+    `step` advances the simulation clock, for lock-step; None if time passes by itself.
     """
 
     def __init__(
@@ -69,7 +115,8 @@ class LiveFeed:
             return f"tcp:{host}:{port}"
         loop = asyncio.get_running_loop()
         protocol = "udp" if socket == "udp" else "tcp"
-        try:
+        what = f"truth feed {protocol}:{host}:{port}: cannot listen"
+        with explained(what, "choose another port, or 0", errors=(OSError, ValueError)):
             if socket == "udp":
                 transport, _ = await loop.create_datagram_endpoint(
                     lambda: _Datagrams(self), local_addr=(host, port)
@@ -85,10 +132,6 @@ class LiveFeed:
                     backlog=self._limit.size,
                 )
                 address = self._server.sockets[0].getsockname()
-        except (OSError, ValueError) as error:  # ValueError: not a valid host name
-            raise EmulatorError(
-                f"truth feed {protocol}:{host}:{port}: cannot listen ({reason(error)}); choose another port, or 0"
-            ) from None
         return f"{protocol}:{address[0]}:{address[1]}"
 
     def receive(self, data: bytes) -> None:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -55,37 +55,7 @@ class FeedMessage:
     rate_rad_s: Vector | None = None
     """Body rate (3,), rad/s, body frame, or None."""
     orbit: OrbitState | None = None
-    """Position and velocity, GCRS, or None."""
     unix_s: float | None = None
-    """Date as Unix time, or None."""
-
-
-class FeedFormat(Protocol):
-    """Format of the messages of a feed, and of the answers in lock-step."""
-
-    @property
-    def end(self) -> bytes:
-        """Bytes that end a message in a stream."""
-
-    @property
-    def max_size(self) -> int:
-        """Longest accepted message, bytes."""
-
-    def decode(self, data: bytes | str) -> FeedMessage:
-        """Decode one message.
-
-        Raises
-        ------
-        FeedError
-            The message is invalid; the text names the key.
-        """
-
-    def answer(self, run_time_s: float, fault: str) -> bytes:
-        """Return the answer to a message; `fault` is empty if it was accepted."""
-
-    @property
-    def always_answers(self) -> bool:
-        """Whether the sender expects an answer even without lock-step."""
 
 
 @dataclass(frozen=True)
@@ -95,11 +65,14 @@ class JsonFormat:
     convention: Convention = "rotation"
     order: Order = "xyzw"
     end: bytes = b"\n"
+    """Bytes that end a message in a stream."""
     max_size: int = 4096
+    """Longest accepted message, bytes."""
     always_answers: bool = False
+    """Whether the sender expects an answer even without lock-step."""
 
     def decode(self, data: bytes | str) -> FeedMessage:
-        """Decode one line."""
+        """Decode one line; FeedError names the key that is invalid."""
         try:
             message: Any = parse_json(data)
         except RepeatedKeyError as error:
@@ -136,13 +109,7 @@ class JsonFormat:
 
 
 def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) -> Attitude:
-    """Return the attitude of a scalar-last quaternion (4,).
-
-    Raises
-    ------
-    FeedError
-        The quaternion is not of length 1.
-    """
+    """Return the attitude of a scalar-last quaternion (4,); FeedError if it is not of length 1."""
     if not abs(float(np.linalg.norm(quaternion_xyzw)) - 1.0) <= NORM_TOLERANCE:
         raise FeedError(f"{key} is not of length 1")
     if convention == "attitude":
@@ -151,13 +118,7 @@ def checked_attitude(key: str, quaternion_xyzw: Vector, convention: Convention) 
 
 
 def checked_rate(key: str, rate_rad_s: Vector | None) -> Vector | None:
-    """Return a body rate in rad/s.
-
-    Raises
-    ------
-    FeedError
-        The rate is above `MAX_RATE_DEG_S`.
-    """
+    """Return a body rate in rad/s; FeedError if it is above `MAX_RATE_DEG_S`."""
     if rate_rad_s is not None and not np.degrees(np.abs(rate_rad_s).max()) <= MAX_RATE_DEG_S * (1.0 + 1e-12):
         raise FeedError(f"{key} exceeds {MAX_RATE_DEG_S:g} degrees per second")
     return rate_rad_s

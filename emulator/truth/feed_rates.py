@@ -57,11 +57,8 @@ class _Message:
 class FeedRates:
     """Derives and checks the body rates of one feed, message by message.
 
-    Parameters
-    ----------
-    timed
-        Whether times are from the sender's clock; otherwise they are times of receipt, and only the
-        directions of rotations are checked.
+    Times are from the sender's clock if `timed`; otherwise they are times of receipt, and only the directions of
+    rotations are checked.
     """
 
     def __init__(self, *, timed: bool) -> None:
@@ -77,10 +74,7 @@ class FeedRates:
     def body_rate(self, at_s: float, attitude: Attitude, given_rad_s: Vector | None) -> Vector:
         """Return the body rate in the next message, rad/s on the time scale of `at_s`.
 
-        Raises
-        ------
-        FeedError
-            The given rate contradicts the attitudes, or the attitude has jumped.
+        FeedError if the given rate contradicts the attitudes, or the attitude has jumped.
         """
         before = self._seen[-1] if self._seen else None
         message = _Message(at_s, attitude, given_rad_s)

@@ -28,10 +28,11 @@ from typing import Final, Literal
 import numpy as np
 
 from starhil.emulator.clock import MAX_SCALE
-from starhil.emulator.truth.feed_message import FeedFormat, FeedMessage, JsonFormat
+from starhil.emulator.truth.feed_message import FeedMessage, JsonFormat
 from starhil.emulator.truth.feed_rates import SHORTEST_S, FeedError, FeedRates
 from starhil.emulator.truth.orbit import interpolate_orbit
 from starhil.emulator.truth.sender_clock import SenderClock, SenderSpeed
+from starhil.emulator.truth.simulator_42 import Format42
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus
 from starid.attitude import Attitude, interpolate, propagate
 
@@ -48,17 +49,11 @@ RESTART_S: Final = 1.0
 
 
 class LiveTruth:
-    """Truth from the messages of a live feed.
+    """Truth from the messages of a live feed, by default JSON lines.
 
-    Parameters
-    ----------
-    stale_s
-        Silence, in seconds of simulation time, after which the attitude is held and flagged stale.
-    timeline
-        `anchor`: the first message sets the offset of the sender's clock; `run`: the sender uses simulation
-        time.
-    message_format
-        Format of messages; default: JSON lines.
+    After `stale_s` seconds of silence in simulation time the attitude is held and flagged stale. `timeline` is as in
+    the profile: with `anchor` the first message sets the offset of the sender's clock, with `run` it uses simulation
+    time.
     """
 
     def __init__(
@@ -67,11 +62,11 @@ class LiveTruth:
         *,
         stale_s: float = 1.0,
         timeline: Literal["anchor", "run"] = "anchor",
-        message_format: FeedFormat | None = None,
+        message_format: JsonFormat | Format42 | None = None,
         kind: str = "live",
     ) -> None:
         self.kind = kind
-        self.format: FeedFormat = message_format or JsonFormat()
+        self.format = message_format or JsonFormat()
         self.stale_s = stale_s
         self.timeline = timeline
         self.accepted = 0

@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
+from starid.arrays import Array
 from starid.earth import DAY_S, UNIX_EPOCH_JD, terrestrial_time
 
-Vector: TypeAlias = NDArray[np.float64]
+Vector: TypeAlias = Array
 
 EARTH_GM_M3_S2: Final = 3.986_004_418e14
 EARTH_RADIUS_M: Final = 6_378_137.0
@@ -47,10 +47,8 @@ class KeplerOrbit:
     """An elliptic orbit about the Earth."""
 
     epoch_unix_s: float
-    """Unix time of the elements."""
     semi_major_axis_m: float
     eccentricity: float = 0.0
-    """Size and shape."""
     inclination_rad: float = 0.0
     raan_rad: float = 0.0
     argument_of_perigee_rad: float = 0.0

@@ -44,15 +44,10 @@ APART_S: Final = 0.3
 
 
 class SenderSpeed:
-    """Determines the speed of a sender relative to the clock.
+    """Determines the speed of a sender relative to the clock, which has a speed of 0 if it is stepped; a sender then has none.
 
     It must be the same in the earlier and in the later half of the last arrivals: a pause, a gap or a burst changes
     only one of them.
-
-    Parameters
-    ----------
-    clock_speed
-        Simulation time per wall time; 0 on the stepped clock, on which a sender has no speed.
     """
 
     def __init__(self, clock_speed: float) -> None:
@@ -101,13 +96,7 @@ def _ratio(begin: tuple[float, float], end: tuple[float, float]) -> float:
 
 
 class SenderClock:
-    """Converts the times of a sender to simulation time.
-
-    Parameters
-    ----------
-    clock_speed
-        Simulation time per wall time; 0 on the stepped clock.
-    """
+    """Converts the times of a sender to simulation time; `clock_speed` is simulation time per wall time, 0 if it is stepped."""
 
     def __init__(self, clock_speed: float) -> None:
         self.slope = 0.0
@@ -130,16 +119,9 @@ class SenderClock:
         self._delays.append(self._offset_s)
 
     def simulation_time(self, t: float, received_s: float, silence_s: float) -> float:
-        """Convert a sender's time to simulation time, seconds.
+        """Convert a sender's time, seconds, to simulation time; it increases from call to call.
 
-        Parameters
-        ----------
-        t
-            Seconds on the sender's clock; increasing from call to call.
-        received_s
-            Simulation time of receipt, seconds.
-        silence_s
-            Silence after which a late message means that the sender paused, seconds.
+        After a silence of `silence_s` seconds, a late message means that the sender paused.
         """
         if self._offset_s is None:
             self.set_offset(t, received_s)

@@ -43,15 +43,7 @@ _PREFIXES: Final = 'give 42 the prefixes "SC" and "Orb" in Inp_IPC.txt'
 
 
 class Format42:
-    """Message format of 42 for one spacecraft.
-
-    Parameters
-    ----------
-    spacecraft
-        Number of the spacecraft, i of ``SC[i]``.
-    orbit
-        Number of the reference orbit, i of ``Orb[i]``.
-    """
+    """Message format of 42 for spacecraft i of ``SC[i]`` and its reference orbit, i of ``Orb[i]``."""
 
     end: Final = b"[ENDMSG]"
     max_size: Final = 65536

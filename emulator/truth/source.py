@@ -14,13 +14,13 @@ from enum import StrEnum
 from typing import Final, Literal, Protocol, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import Orbit, OrbitState
+from starid.arrays import Array
 from starid.attitude import Attitude, propagate
 
-Vector: TypeAlias = NDArray[np.float64]
+Vector: TypeAlias = Array
 
 ZERO_RATE: Final[Vector] = np.zeros(3)
 ZERO_RATE.flags.writeable = False
@@ -63,7 +63,6 @@ class TruthState:
     orbit: OrbitState | None = None
     """Position and velocity relative to the Earth's centre, GCRS."""
     unix_s: float | None = None
-    """Date as Unix time (UTC), seconds."""
 
     def completed(self, unix_s: float, orbit: Orbit | None) -> TruthState:
         """Return the state with the date and orbit of the run if the source has none."""
@@ -113,13 +112,6 @@ class RateTruth:
 
 
 @dataclass(frozen=True)
-class HoldSegment:
-    """Hold the attitude for a time, seconds."""
-
-    seconds: float
-
-
-@dataclass(frozen=True)
 class RateSegment:
     """Rotate at a constant body rate (3,), rad/s, sensor frame, for a time in seconds."""
 
@@ -139,7 +131,7 @@ class SlewSegment:
     """Acceleration of the `limited` shape, rad/s²."""
 
 
-Segment: TypeAlias = HoldSegment | RateSegment | SlewSegment
+Segment: TypeAlias = RateSegment | SlewSegment
 
 
 @dataclass(frozen=True)
@@ -159,8 +151,7 @@ class _Leg:
         if isinstance(segment, SlewSegment):
             angle, rate = _slew_angle_and_rate(segment, self.angle, self.seconds, elapsed)
             return TruthState(self.attitude.rotated(self.axis * angle), self.axis * rate)
-        rate_vector = segment.rate_rad_s if isinstance(segment, RateSegment) else ZERO_RATE
-        return TruthState(propagate(self.attitude, rate_vector, elapsed), rate_vector)
+        return TruthState(propagate(self.attitude, segment.rate_rad_s, elapsed), segment.rate_rad_s)
 
 
 def _slew_seconds(segment: SlewSegment, angle: float) -> float:
@@ -194,15 +185,9 @@ def _slew_angle_and_rate(
 
 
 class SlewTruth:
-    """A sequence of holds, constant rates and slews.
+    """A sequence of holds, constant rates and slews, at rest before the simulation time `start_s`.
 
-    Parameters
-    ----------
-    start_s
-        Simulation time at which the first segment begins; at rest before this.
-    repeat
-        Whether to restart from the initial attitude after the last segment; otherwise the final attitude is
-        held.
+    After the last segment it restarts from the initial attitude (`repeat`), or the final attitude is held.
     """
 
     kind: Final = "slew"

@@ -48,13 +48,7 @@ class Row:
 
 @lru_cache
 def icrs_to(where: str, frame: str) -> Attitude:
-    """Return the rotation from ICRS to an inertial frame.
-
-    Raises
-    ------
-    EmulatorError
-        The frame is not known; the text names it.
-    """
+    """Return the rotation from ICRS to an inertial frame; EmulatorError names one that is not known."""
     import erfa
 
     if frame.upper() in ICRS_NAMES:
@@ -71,13 +65,7 @@ def is_inertial(frame: str) -> bool:
 
 
 def unix_ns(where: str, text: str, scale: str = "UTC") -> int:
-    """Return the Unix time of a date, nanoseconds: ISO 8601 with month or day of year, or as STK writes it.
-
-    Raises
-    ------
-    EmulatorError
-        The date or its time scale is not known.
-    """
+    """Return the Unix time of a date, nanoseconds: ISO 8601 with month or day of year, or as STK writes it."""
     whole_text, _, fraction = text.removesuffix("Z").partition(".")
     for form in DATES:
         with suppress(ValueError):
@@ -98,10 +86,7 @@ def unix_ns(where: str, text: str, scale: str = "UTC") -> int:
 def truth_of(path: Path, blocks: Sequence[Sequence[Row]], *, smooth: bool) -> FileTruth:
     """Return the truth of the rows of a file, in blocks of continuous motion; a block may begin where the last one ends.
 
-    Raises
-    ------
-    EmulatorError
-        There are no rows, dates do not increase, or rates contradict attitudes: the quaternion has the wrong sense.
+    EmulatorError if dates do not increase, or rates contradict attitudes: the quaternion has the wrong sense.
     """
     rows: list[Row] = []
     for number, block in enumerate(blocks, 1):

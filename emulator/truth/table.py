@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.orbit import OrbitState, interpolate_orbit
 from starhil.emulator.truth.source import ZERO_RATE, TruthState, TruthStatus, Vector
+from starid.arrays import Array
 from starid.attitude import Attitude, interpolate, rate_between
 
 SMALL_TURN_RAD: Final = 1e-4
@@ -28,10 +28,10 @@ SMALL_TURN_RAD: Final = 1e-4
 class FileTruth:
     """Attitudes interpolated in time; at rest before the first row and after the last."""
 
-    times_s: NDArray[np.float64]
+    times_s: Array
     """Times (n,) of the rows, seconds, increasing."""
     attitudes: Sequence[Attitude]
-    rates_rad_s: NDArray[np.float64] | None = None
+    rates_rad_s: Array | None = None
     """Body rates (n, 3), rad/s, sensor frame; None to derive them from successive rows."""
     orbit: Sequence[OrbitState] | None = None
     """Position and velocity of each row; None if the file has none."""
@@ -85,19 +85,9 @@ class FileTruth:
 
 
 class OrbitTable:
-    """Positions and velocities, interpolated between dates.
+    """Positions and velocities of a file, interpolated between the increasing Unix times (n,) of its rows."""
 
-    Parameters
-    ----------
-    source
-        File of the rows, for messages.
-    times_unix_s
-        Unix times (n,) of the rows, increasing.
-    """
-
-    def __init__(
-        self, source: object, times_unix_s: NDArray[np.float64], states: Sequence[OrbitState]
-    ) -> None:
+    def __init__(self, source: object, times_unix_s: Array, states: Sequence[OrbitState]) -> None:
         self._source = source
         self._times = times_unix_s
         self._states = states
@@ -114,7 +104,7 @@ class OrbitTable:
         return interpolate_orbit(self._states[low], self._states[low + 1], fraction, span)
 
 
-def _between(times: NDArray[np.float64], t: float) -> tuple[int, float, float]:
+def _between(times: Array, t: float) -> tuple[int, float, float]:
     """Return the row before a time within at least two rows, the fraction of the way to the next, and their distance."""
     low = min(int(np.searchsorted(times, t, side="right")), len(times) - 1) - 1
     span = float(times[low + 1] - times[low])

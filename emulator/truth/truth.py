@@ -19,9 +19,8 @@ from pathlib import Path
 from starhil.emulator.clock import NANOSECONDS, Clock, make_clock
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.config import Config42, FeedConfig, FileConfig, TruthConfig
-from starhil.emulator.truth.feed import LiveFeed
+from starhil.emulator.truth.feed import LiveFeed, Step
 from starhil.emulator.truth.live import LiveTruth
-from starhil.emulator.truth.lock_step import Step
 from starhil.emulator.truth.source import FixedTruth, TruthSource, TruthState
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
@@ -32,7 +31,6 @@ class TruthHost:
     """The run, as its truth sees it."""
 
     clock: Clock
-    """Clock of the run."""
     clock_name: str
     """Configured clock: that of a replay differs."""
     time_passes: asyncio.Event
@@ -50,25 +48,18 @@ class TruthHost:
 
 
 class Truth:
-    """The truth of the body on which the heads of a run are mounted.
+    """The truth of the body on which the heads of a run are mounted, which `open` builds from its configuration.
 
-    Parameters
-    ----------
-    config
-        The configured truth; `open` builds it.
-    folder
-        Folder to which relative paths of truth files refer.
+    Relative paths of truth files refer to `folder`.
     """
 
     def __init__(self, config: TruthConfig, folder: Path, host: TruthHost) -> None:
         self.configured = config
-        """The configured truth."""
         self.source: TruthSource = FixedTruth(Attitude.identity())
         """Truth of the body: attitude ICRS→body, rate in the body frame."""
         self.mount: Attitude | None = None
         """Mount in the configuration that has replaced the first one; None: each head has that of its profile."""
         self.feed: LiveFeed | None = None
-        """The live feed, or None."""
         self.address = ""
         """Address of the live feed; empty if there is none."""
         self._wanted_address = ""
@@ -81,13 +72,7 @@ class Truth:
         self.put(*await self._load(self.configured, None))
 
     async def set(self, config: TruthConfig, at_s: float | None = None) -> None:
-        """Replace the truth.
-
-        Parameters
-        ----------
-        at_s
-            Simulation time at which its motion begins, as in a recorded run; by default now.
-        """
+        """Replace the truth; its motion begins now, or at a simulation time, as in a recorded run."""
         loaded = await self._load(config, at_s)
         start_s = getattr(loaded[0], "start_s", self._host.now_s())
         self._host.record("truth", config=config.model_dump(mode="json"), start_s=start_s)
@@ -160,10 +145,7 @@ class Truth:
 class SensorTruth:
     """The truth of a sensor that is mounted on the body.
 
-    Parameters
-    ----------
-    mount
-        Rotation body→sensor, unless the truth's configuration has one; None: the frames are the same.
+    `mount` is the rotation body→sensor, unless the truth's configuration has one; None: the frames are the same.
     """
 
     def __init__(self, body: Truth, mount: Attitude | None) -> None:

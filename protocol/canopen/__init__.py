@@ -15,7 +15,7 @@ from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.emergency import EmergencyCode, ErrorRegister
 from starhil.protocol.canopen.slave import CanopenSlave
-from starhil.protocol.canopen.storage import FileStorage, MemoryStorage, ParameterStorage, StorageError
+from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
 
 __all__ = [
     "UNCONFIGURED",
@@ -29,7 +29,6 @@ __all__ = [
     "EventKind",
     "FileStorage",
     "GreyImage",
-    "MemoryStorage",
     "NmtState",
     "ParameterStorage",
     "SdoAbortError",

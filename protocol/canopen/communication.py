@@ -101,17 +101,7 @@ def add_record(
 def add_communication(
     od: ObjectDictionary, layout: CanopenModel, rpdos: Sequence[MappedPdo], tpdos: Sequence[MappedPdo]
 ) -> None:
-    """Add the whole communication profile.
-
-    Parameters
-    ----------
-    od
-        Object dictionary to which the objects are added.
-    layout
-        Identity of the node, and its bit rates.
-    rpdos, tpdos
-        The PDOs, numbered from 1.
-    """
+    """Add the whole communication profile to an object dictionary. PDOs are numbered from 1 in order."""
     information = od.device_information
     information.vendor_name = layout.vendor_name
     information.vendor_number = layout.vendor_id

@@ -45,23 +45,13 @@ class EventKind(StrEnum):
 
 @dataclass(frozen=True)
 class SlaveEvent:
-    """An event of a node.
-
-    Attributes
-    ----------
-    kind
-        What happened.
-    now
-        Time of the event, s, on the caller's clock.
-    value
-        A number: NMT state, node ID, error code, bit/s, Unix time in s.
-    detail
-        One line of text.
-    """
+    """An event of a node."""
 
     kind: EventKind
     now: float
+    """Time of the event, s, on the caller's clock."""
     value: float = 0
+    """NMT state, node ID, error code, bit/s, or Unix time in s."""
     detail: str = ""
 
 

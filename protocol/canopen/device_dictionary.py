@@ -23,7 +23,7 @@ from starhil.protocol.canopen.communication import (
     set_limits,
     variable,
 )
-from starhil.protocol.canopen.dictionary import Deferred, Dictionary, decode, encode, type_size
+from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Value, encode, type_size
 from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
@@ -240,25 +240,9 @@ def _slot_of(icd: InterfaceDefinition, reference: str) -> tuple[Row, Slot, list[
 
 
 class DeviceDictionary(Dictionary):
-    """Object dictionary of a device, built from its interface definition.
+    """Object dictionary of a device, built from its interface definition and the indices of its layout.
 
-    Parameters
-    ----------
-    icd
-        The interface definition.
-    layout
-        Indices of its rows, fields and parameters.
-    application
-        Device behind the dictionary; none for one that is only described, so that nothing reads it.
-
-    Attributes
-    ----------
-    readings
-        Key of an entry → the part of a telemetry row that it reads.
-    sources
-        Telemetry row → keys of the entries that contain it.
-    parameters
-        Parameter → key of its entry.
+    Without an application it is only described: nothing may read or write the entries of a device.
     """
 
     def __init__(
@@ -269,6 +253,7 @@ class DeviceDictionary(Dictionary):
         self.application = cast("Application", application)
         self.readings: dict[Key, Reading] = {}
         self.sources: dict[str, set[Key]] = {}
+        """Telemetry row → keys of the entries that contain it."""
         self.parameters: dict[str, Key] = {}
         self._names: dict[str, Key] = {}
         self._placed: dict[tuple[str, str, int | None], Key] = {}
@@ -379,7 +364,7 @@ class DeviceDictionary(Dictionary):
         if reading.slot is None:
             return data
         if reading.packed is not None:
-            return _pack(reading, reading.packed, reading.slot, data)
+            return encode(item.variable, _narrowed(reading, reading.packed, reading.slot, data))
         value = in_order(reading.slot, data[span_of(reading.slot)])
         return value.rstrip(b"\0") if item.variable.data_type == datatypes.VISIBLE_STRING else value
 
@@ -405,20 +390,20 @@ class DeviceDictionary(Dictionary):
 
     def _read_parameter(self, item: Placement, parameter: Parameter) -> bytes:
         value = parameter.to_number(self.application.parameter(parameter.name))
-        return encode(item.variable.data_type or 0, value)
+        return encode(item.variable, value)
 
     def _write_parameter(self, item: Placement, parameter: Parameter, data: bytes) -> None:
         try:
-            value = parameter.check(decode(item.variable.data_type or 0, data))
+            value = parameter.check(cast("Value", item.variable.decode_raw(data)))
         except MessageError as error:
             raise abort_of(error) from None
         self.application.set_parameter(parameter.name, value)
 
     def _read_image(self, item: Placement, name: str, attribute: str) -> bytes:
-        return encode(item.variable.data_type or 0, getattr(self.application.image(name), attribute))
+        return encode(item.variable, getattr(self.application.image(name), attribute))
 
 
-def _pack(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> bytes:
+def _narrowed(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> int:
     """Return a field of a telemetry row as a narrower integer."""
     field = reading.fields[0]
     if field.width:
@@ -434,7 +419,7 @@ def _pack(reading: Reading, packed: PackedField, slot: Slot, data: bytes) -> byt
     if packed.wrap:
         raw &= (1 << bits) - 1
     low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if packed.type[0] == "i" else (0, (1 << bits) - 1)
-    return encode(DATA_TYPES[packed.type], min(max(raw, low), high))
+    return min(max(raw, low), high)
 
 
 def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:

@@ -7,7 +7,6 @@ current value as bytes on the wire and the functions that read and write it in t
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
@@ -36,31 +35,19 @@ later."""
 
 @dataclass(slots=True)
 class Entry:
-    """One variable of a node's object dictionary with its current value.
-
-    Attributes
-    ----------
-    variable
-        Description in the library's object dictionary.
-    value
-        Current value as on the wire; unused if there is a `reader`.
-    reader
-        Returns the current value from the device instead of `value`.
-    writer
-        Writes a value that passed the access, length and range checks, before `value` changes; raises
-        `SdoAbortError` to refuse.
-    maximum_size
-        Longest value, bytes, of a type without a fixed size.
-    persistent
-        Whether store (1010h) saves it.
-    """
+    """One variable of a node's object dictionary with its current value."""
 
     variable: ODVariable
     value: bytes = b""
+    """Current value as on the wire; unused if there is a `reader`."""
     reader: Callable[[], bytes] | None = None
+    """Returns the current value from the device."""
     writer: Writer | None = None
+    """Called before `value` changes."""
     maximum_size: int = MAXIMUM_STRING
+    """Longest value, bytes, of a type without a fixed size."""
     persistent: bool = False
+    """Whether store (1010h) saves it."""
 
     @property
     def key(self) -> tuple[int, int]:
@@ -89,49 +76,23 @@ def type_size(data_type: int | None) -> int | None:
     return None if packer is None else packer.size
 
 
-def encode(data_type: int, value: Value) -> bytes:
+def encode(variable: ODVariable, value: Value) -> bytes:
     """Pack a raw (unscaled) value; `bytes` pass unchanged.
 
     Raises SdoAbortError: VALUE_RANGE if the value does not fit the type.
     """
-    if isinstance(value, bytes):
-        return value
     if isinstance(value, str):
         return value.encode("ascii", errors="replace")
-    size = type_size(data_type)
     try:
-        if data_type in (datatypes.REAL32, datatypes.REAL64):
-            return struct.pack("<f" if data_type == datatypes.REAL32 else "<d", value)
-        if size is not None:
-            return int(value).to_bytes(size, "little", signed=data_type in datatypes.SIGNED_TYPES)
-    except (OverflowError, struct.error) as error:
+        return bytes(variable.encode_raw(value))
+    except (ValueError, OverflowError, TypeError) as error:
         raise SdoAbortError(
-            AbortCode.VALUE_RANGE, f"{value!r} does not fit type 0x{data_type:04X}: {error}"
+            AbortCode.VALUE_RANGE, f"{value!r} does not fit {variable.qualname}: {error}"
         ) from None
-    raise SdoAbortError(AbortCode.VALUE_RANGE, f"{value!r} cannot be encoded as type 0x{data_type:04X}")
-
-
-def decode(data_type: int, data: bytes) -> Value:
-    """Unpack the wire form to a number, a string (VISIBLE_STRING) or bytes."""
-    if data_type == datatypes.VISIBLE_STRING:
-        return data.decode("ascii", errors="replace")
-    if data_type == datatypes.BOOLEAN:
-        return data != b"\0"
-    if data_type in (datatypes.REAL32, datatypes.REAL64):
-        return float(struct.unpack("<f" if data_type == datatypes.REAL32 else "<d", data)[0])
-    if type_size(data_type) is None:
-        return bytes(data)
-    return int.from_bytes(data, "little", signed=data_type in datatypes.SIGNED_TYPES)
 
 
 class Dictionary:
-    """Object dictionary of one node.
-
-    Parameters
-    ----------
-    od
-        Description of the objects. Each variable gets an entry; `load_defaults` sets the default values.
-    """
+    """Object dictionary of one node, with an entry for each variable; `load_defaults` sets their default values."""
 
     def __init__(self, od: ObjectDictionary) -> None:
         self.od = od
@@ -213,7 +174,7 @@ def default_bytes(variable: ODVariable, node_id: int) -> bytes:
         return bytes(type_size(variable.data_type) or 0)
     if variable.relative:
         default += node_id
-    return encode(variable.data_type or 0, default)
+    return encode(variable, default)
 
 
 def check_length(entry: Entry, length: int) -> None:
@@ -236,7 +197,7 @@ def check_value(variable: ODVariable, data: bytes) -> None:
         return
     if data_type == datatypes.BOOLEAN and data not in {b"\0", b"\1"}:
         raise SdoAbortError(AbortCode.VALUE_HIGH, f"{variable.qualname} takes 0 or 1")
-    value = decode(data_type, data)
+    value = variable.decode_raw(data)
     if not isinstance(value, int | float):
         return
     if math.isnan(value):

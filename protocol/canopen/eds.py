@@ -122,7 +122,7 @@ def _variable(item: ODVariable) -> Section:
 
 def _default(item: ODVariable, data_type: int) -> str:
     if data_type in datatypes.FLOAT_TYPES:
-        return "0x" + encode(data_type, item.default or 0)[::-1].hex().upper()
+        return "0x" + encode(item, item.default or 0)[::-1].hex().upper()
     if not isinstance(item.default, int):
         return str(item.default)
     number = f"0x{item.default:X}" if item.default >= 0 else str(item.default)

@@ -95,23 +95,10 @@ class EmergencyProducer:
             self._history.clear()
 
     def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> bool:
-        """Report an error unless it is already active.
+        """Report an error unless it is already active; return whether it is new.
 
-        Parameters
-        ----------
-        code
-            Error code, 16 bits.
-        bits
-            Bits of the error register to set; the generic bit is always set.
-        data
-            Up to 5 manufacturer-specific bytes.
-        key
-            Distinguishes errors with the same code (a PDO number, a node ID).
-
-        Returns
-        -------
-        bool
-            Whether the error is new.
+        `bits` are set in the error register, besides the generic one; `data` are up to 5 manufacturer-specific bytes;
+        `key` distinguishes errors with the same code: a PDO number, a node ID.
         """
         if (code, key) in self._active:
             return False

@@ -31,13 +31,8 @@ class Monitor:
 class ErrorControl:
     """Produces the heartbeat of this node and supervises other nodes' heartbeats.
 
-    Parameters
-    ----------
-    context, emergency
-        Shared by the node.
-    on_failure
-        Called when a supervised node or the guarding master falls silent; applies the error behaviour of
-        1029h.
+    `on_failure` is called when a supervised node or the guarding master falls silent; it applies the error behaviour of
+    1029h.
     """
 
     def __init__(

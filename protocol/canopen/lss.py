@@ -70,20 +70,9 @@ class LssHost(Protocol):
 
 
 class LssSlave:
-    """Answers the LSS master.
+    """Answers the LSS master, which may set the allowed bit rates, bit/s.
 
-    Parameters
-    ----------
-    context
-        Shared by the node.
-    host
-        The node itself.
-    store
-        Saves node ID and bit rate; raises `ProtocolError` if that fails.
-    bit_rate
-        Current bit rate, bit/s.
-    allowed_bit_rates
-        Bit rates that LSS may set, bit/s.
+    `store` saves node ID and bit rate, and raises `ProtocolError` if that fails.
     """
 
     def __init__(

@@ -90,17 +90,7 @@ def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedO
 
 
 class PdoRecords:
-    """Communication and mapping record of one PDO with the rules for changing them.
-
-    Parameters
-    ----------
-    dictionary
-        Object dictionary with the records.
-    direction
-        RPDO or TPDO.
-    number
-        0 for the first PDO.
-    """
+    """Communication and mapping record of a PDO, 0 for the first, with the rules for changing them."""
 
     def __init__(self, dictionary: Dictionary, direction: Direction, number: int) -> None:
         self._dictionary = dictionary

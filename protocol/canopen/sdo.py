@@ -26,15 +26,7 @@ INITIATE: Final = {
 
 
 class SdoServer:
-    """Answers the SDO requests of one client (1200h).
-
-    Parameters
-    ----------
-    dictionary
-        Object dictionary to read and write.
-    timeout_s
-        Silence of the client after which a transfer is aborted.
-    """
+    """Answers the SDO requests of one client (1200h), whose transfer is aborted after a silence of the timeout."""
 
     def __init__(self, dictionary: Dictionary, timeout_s: float = 1.0) -> None:
         self._dictionary = dictionary
@@ -76,12 +68,7 @@ class SdoServer:
     def receive(self, data: bytes, now: float) -> Answers:
         """Process the data of one CAN frame and return the data of the answers.
 
-        Parameters
-        ----------
-        data
-            Data of a frame with the COB-ID of requests; a length other than 8 is ignored.
-        now
-            Current time, s.
+        A length other than 8 is ignored. `now` is the current time, s.
         """
         if len(data) != LENGTH:
             return []

@@ -22,7 +22,7 @@ from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
 from starhil.protocol.canopen.pdo import PdoService, ReceivePdo
 from starhil.protocol.canopen.sdo import SdoServer
 from starhil.protocol.canopen.sdo_transfer import Answers
-from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, MemoryStorage, ParameterStorage
+from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, ParameterStorage
 from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
 from starhil.protocol.canopen.sync import SyncService
 from starhil.protocol.canopen.timestamp import TimeConsumer
@@ -84,7 +84,7 @@ class CanopenSlave:
         self.dictionary = dictionary
         self._context = context = Context(dictionary, node_id)
         self.store = ParameterStore(
-            context, MemoryStorage() if storage is None else storage, on_save, on_restore
+            context, ParameterStorage() if storage is None else storage, on_save, on_restore
         )
         stored = self.store.load_lss()
         if stored is not None:

@@ -29,16 +29,8 @@ ApplicationStore: TypeAlias = Callable[[], Deferred | None]
 class ParameterStore:
     """Saves parameters across a restart, and restores the defaults.
 
-    Parameters
-    ----------
-    context
-        Shared by the node.
-    storage
-        Storage of the values.
-    on_save
-        Saves the parameters of the application; raises `SdoAbortError` on failure.
-    on_restore
-        Resets the parameters of the application to their defaults at its next restart.
+    `on_save` saves the parameters of the application and raises `SdoAbortError` on failure; `on_restore` resets them to
+    their defaults at its next restart.
     """
 
     def __init__(

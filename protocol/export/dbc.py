@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from starhil.protocol.can_framing import (
     MAX_FRAME_DATA,
@@ -22,6 +22,7 @@ from starhil.protocol.can_framing import (
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
+from starhil.protocol.export.templates import fill
 from starhil.protocol.messages import ErrorCode, ReplyKind, RequestKind
 from starhil.protocol.quoting import Scope, dbc_string
 from starhil.protocol.values import EnumDefinition, IcdError
@@ -29,7 +30,21 @@ from starhil.protocol.values import EnumDefinition, IcdError
 EXTENDED: Final = 0x80000000
 """Flag of a 29-bit CAN ID in DBC files."""
 
-_JOINED: Final = "Messages longer than 8 bytes describe the data after their segments are joined."
+
+class _Signal(NamedTuple):
+    """One signal of a message: a field, or one byte of a string."""
+
+    name: str
+    start: int
+    bits: int
+    order: int = 1
+    """1 for little-endian, 0 for big-endian."""
+    sign: str = "+"
+    scale: float = 1.0
+    bias: float = 0.0
+    low: float = 0
+    high: float = 255
+    unit: str = ""
 
 
 @dataclass(frozen=True)
@@ -37,11 +52,17 @@ class _Message:
     """One message of the database."""
 
     can_id: int
+    """With the flag `EXTENDED`."""
     name: str
     size: int
     sender: str
-    signals: tuple[Field, ...]
+    fields: tuple[Field, ...]
     doc: str
+
+    @property
+    def signals(self) -> list[_Signal]:
+        """The signals of the fields."""
+        return [signal for field in self.fields for signal in _signals(field)]
 
 
 def render(icd: InterfaceDefinition) -> str:
@@ -51,51 +72,17 @@ def render(icd: InterfaceDefinition) -> str:
     host = int(icd.device_parameters["host_address"].default)
     device = int(icd.device_parameters["can_address"].default)
     messages = [message for row in icd.rows for message in _messages(row, icd, host, device)]
-    return "\n".join(_lines(icd, messages)) + "\n"
-
-
-def _lines(icd: InterfaceDefinition, messages: list[_Message]) -> Iterator[str]:
-    yield from (
-        f"VERSION {dbc_string(f'{icd.name} {icd.version}')}",
-        "",
-        "NS_ :",
-        "",
-        "BS_:",
-        "",
-        "BU_: OBC SENSOR",
-    )
-    for message in messages:
-        yield ""
-        yield f"BO_ {message.can_id | EXTENDED} {message.name}: {message.size} {message.sender}"
-        for signal in message.signals:
-            yield from _signals(signal, "OBC" if message.sender == "SENSOR" else "SENSOR")
-    yield ""
-    yield f"CM_ {dbc_string(f'{icd.doc} {_JOINED}')};"
-    for message in messages:
-        yield f"CM_ BO_ {message.can_id | EXTENDED} {dbc_string(message.doc)};"
-        for signal in message.signals:
-            if signal.slot.type != "bytes":
-                yield f"CM_ SG_ {message.can_id | EXTENDED} {signal.name} {dbc_string(signal.doc)};"
-    yield 'BA_DEF_ BO_ "VFrameFormat" ENUM "StandardCAN","ExtendedCAN";'
-    yield 'BA_DEF_DEF_ "VFrameFormat" "ExtendedCAN";'
-    signals = [(message.can_id | EXTENDED, signal) for message in messages for signal in message.signals]
-    for can_id, signal in signals:
-        if signal.enum is not None:
-            values = " ".join(f"{value} {dbc_string(name)}" for name, value in signal.enum.values.items())
-            yield f"VAL_ {can_id} {signal.name} {values} ;"
-    for can_id, signal in signals:
-        if signal.kind == "float":
-            yield f"SIG_VALTYPE_ {can_id} {signal.name} : {1 if signal.type == 'f32' else 2};"
+    return fill("dbc.j2", icd=icd, messages=messages, number=number, string=dbc_string)
 
 
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:
     to_device = (row.id, host, device)
     to_host = (row.id, device, host)
-    signals = tuple(field.changed(doc=meaning(row, field)) for field in row.named_fields.values())
+    fields = tuple(field.changed(doc=meaning(row, field)) for field in row.named_fields.values())
     scope = Scope("DBC")
-    for field in signals:
-        for name in _names(field):
-            scope.claim(name, f"{row.kind} {row.name}: field {field.name}")
+    for field in fields:
+        for signal in _signals(field):
+            scope.claim(signal.name, f"{row.kind} {row.name}: field {field.name}")
     code = (
         Field(name="error", kind="enum", slot=Slot(0, "u8", 0, 1), enum=_error_codes(icd), doc="Error code."),
     )
@@ -106,9 +93,9 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     asked, answered = _id(request, *to_device), _id(reply, *to_host)
     if telemetry:
         yield _Message(asked, f"REQ_{row.name}", 0, "OBC", (), f"Request for: {row.doc}")
-        yield _Message(answered, f"TLM_{row.name}", row.size, "SENSOR", signals, row.doc)
+        yield _Message(answered, f"TLM_{row.name}", row.size, "SENSOR", fields, row.doc)
     else:
-        yield _Message(asked, f"TC_{row.name}", row.size, "OBC", signals, row.doc)
+        yield _Message(asked, f"TC_{row.name}", row.size, "OBC", fields, row.doc)
         yield _Message(answered, f"ACK_{row.name}", 0, "SENSOR", (), f"Acknowledge of {row.name}.")
     refused = _id(nack_type(row.id), *to_host)
     yield _Message(refused, f"NACK_{row.name}", 1, "SENSOR", code, f"Refusal of {row.name}.")
@@ -121,29 +108,20 @@ def _error_codes(icd: InterfaceDefinition) -> EnumDefinition:
 
 
 def _id(kind: MessageType, row_id: int, source: int, destination: int) -> int:
-    return CanId(kind, row_id, source, destination).pack()
+    return CanId(kind, row_id, source, destination).pack() | EXTENDED
 
 
-def _names(field: Field) -> list[str]:
-    """Return the names of the signals of a field: one for each byte of a string."""
-    if field.slot.type != "bytes":
-        return [field.name]
-    return [f"{field.name}_{index}" for index in range(field.size)]
-
-
-def _signals(field: Field, receiver: str) -> Iterator[str]:
+def _signals(field: Field) -> Iterator[_Signal]:
     if field.slot.type == "bytes":
-        for index, name in enumerate(_names(field)):
-            yield f' SG_ {name} : {8 * (field.offset + index)}|8@1+ (1,0) [0|255] "" {receiver}'
+        for index in range(field.size):
+            yield _Signal(f"{field.name}_{index}", 8 * (field.offset + index), 8)
         return
     big = field.slot.order == "big"
     byte, bit = field.place(field.bit_count - 1 if big else 0)
     sign = "-" if field.slot.type.startswith("i") or field.kind == "float" else "+"
-    low, high = _limits(field)
-    yield (
-        f" SG_ {field.name} : {8 * byte + bit}|{field.bit_count}@{int(not big)}{sign} "
-        f"({number(field.scale)},{number(field.bias)}) [{number(low)}|{number(high)}] {dbc_string(field.unit)} {receiver}"
-    )
+    yield _Signal(
+        field.name, 8 * byte + bit, field.bit_count, int(not big), sign, field.scale, field.bias, *_limits(field), field.unit
+    )  # fmt: skip
 
 
 def _limits(field: Field) -> tuple[float, float]:

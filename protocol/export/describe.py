@@ -7,27 +7,12 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.export.wire import texts_of
 from starhil.protocol.unit_examples import Exchange, exchanges
 from starhil.protocol.values import EnumDefinition, Parameter, Section, Value
 
 FIELD_COLUMNS: Final = ("Byte", "Field", "Type", "Unit", "Value", "Range", "Source", "Meaning", "Example")
 PARAMETER_COLUMNS: Final = ["ID", "Parameter", "Type", "Unit", "Range", "Default", "Meaning"]
-
-_BEHAVIOUR: Final = (
-    (
-        "A telecommand with a value outside its range is refused with invalid_parameter and changes nothing. In telemetry, a number "
-        "beyond its range is sent as the nearest limit (clipped) or modulo the range (wraps), as the range column states; a "
-        "floating-point number without a range is sent unchanged."
-    ),
-    (
-        "Byte 3.5 is bit 5 of byte 3; bit 0 is the least significant. A group of bits is given from its least to its most "
-        "significant bit. The examples are made up to show how the fields are packed."
-    ),
-    (
-        "Source of a row or field: confirmed (by public flight software or a manual, named with the row), proxy (public for "
-        "another unit of the same family) or ours (no public source; chosen here)."
-    ),
-)
 
 
 def introduction(icd: InterfaceDefinition) -> Iterator[str]:
@@ -39,7 +24,7 @@ def introduction(icd: InterfaceDefinition) -> Iterator[str]:
         else ""
     )
     yield f"Multi-byte fields are {icd.conventions.byte_order}-endian.{kinds}"
-    yield from _BEHAVIOUR
+    yield from texts_of("introduction")["paragraphs"]
 
 
 def examples(icd: InterfaceDefinition) -> dict[str, list[Exchange]]:

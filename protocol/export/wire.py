@@ -38,7 +38,7 @@ _PLACEHOLDERS: Final = {
 """Placeholder names for bytes of the example messages."""
 
 
-def _text(table: str) -> dict[str, Any]:
+def texts_of(table: str) -> dict[str, Any]:
     """Return a table of the texts."""
     texts: dict[str, Any] = _texts()[table]
     return texts
@@ -51,7 +51,7 @@ def _texts() -> dict[str, Any]:
 
 def _section(name: str, rows: Iterable[tuple[str, ...]], **values: object) -> Section:
     """Return a section with its texts filled in; a paragraph that is empty then is left out."""
-    texts = _text(name)
+    texts = texts_of(name)
     paragraphs = [paragraph.format(**values) for paragraph in texts.get("paragraphs", ())]
     return Section(
         heading=texts["heading"],
@@ -84,8 +84,8 @@ def _conventions(icd: InterfaceDefinition) -> Section:
     epoch = conventions.epoch
     start = "midnight of the current day" if epoch == "midnight" else EPOCHS.get(epoch, epoch)
     rows = [
-        ("quaternion", _text("quaternion")[conventions.quaternion]),
-        ("sign", _text("sign")[conventions.scalar_sign]),
+        ("quaternion", texts_of("quaternion")[conventions.quaternion]),
+        ("sign", texts_of("sign")[conventions.scalar_sign]),
         (
             "axes x, y, z of the reported frame",
             f"{', '.join(conventions.axes)} of the sensor frame (+x right in the image, +y down, +z boresight)",
@@ -187,11 +187,11 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
             bit.role or "constant",
             f"{type_}, bits {bits} to {bits + bit.width - 1}",
             _fixed_value(bit.const, bit.default),
-            _counter(bit.counts) or _text("role").get(bit.role or "", ""),
+            _counter(bit.counts) or texts_of("role").get(bit.role or "", ""),
         )
         bits += bit.width
     if not field.bits:
-        meaning = _text("role").get(field.role or "", "")
+        meaning = texts_of("role").get(field.role or "", "")
         if field.role == "length":
             offset = f" {'+' if field.offset > 0 else '−'} {abs(field.offset)}" if field.offset else ""
             meaning = f"number of bytes of {', '.join(field.includes) or 'nothing'}{offset}"
@@ -204,7 +204,7 @@ def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, 
 
 def _counter(counts: list[CountedMessage]) -> str:
     """Describe a number that counts messages."""
-    return str(_text("counted")["".join(sorted(set(counts)))]) if counts else ""
+    return str(texts_of("counted")["".join(sorted(set(counts)))]) if counts else ""
 
 
 def _fixed_value(const: int | None, default: int | None) -> str:

@@ -110,14 +110,9 @@ class _Connection(TurnProtocol):
 
 
 class HubTransport(ReconnectingTransport[CanFrame]):
-    """Frames over a socketcand server.
+    """A bus of a socketcand server.
 
-    Parameters
-    ----------
-    host, port, bus:
-        Address of the server, and name of the bus there.
-    ensure_server:
-        Awaited before each connection; starts a server if there is none (used by `auto`).
+    `ensure_server` is awaited before each connection; it starts a server if there is none (used by `auto`).
     """
 
     kind = "CAN"

@@ -13,7 +13,6 @@ from functools import partial
 from itertools import takewhile
 from typing import Final
 
-from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports.base import Statistics, Transport
 
 BACKLOG_LIMIT: Final = 64 * 1024
@@ -25,29 +24,8 @@ GRAIN_S: Final = 1e-6
 RETRY_S: Final = 0.005
 """Time until the next attempt if the port is full."""
 
-
-class PacingSchedule:
-    """Schedule of bytes on a serial line at its bit rate."""
-
-    def __init__(self, baud: int, bits_per_byte: int = 10) -> None:
-        if baud <= 0 or bits_per_byte <= 0:
-            raise ProtocolError(f"baud rate {baud} and {bits_per_byte} bits per byte must be positive")
-        self.seconds_per_byte: Final = bits_per_byte / baud
-        """Time that one byte takes on the line."""
-        self._free_at = float("-inf")
-
-    def reserve(self, now: float, size: int) -> tuple[float, float]:
-        """Reserve the line for `size` bytes.
-
-        Returns the times at which the first byte begins and the last one ends.
-        """
-        begin = max(now, self._free_at)
-        self._free_at = begin + size * self.seconds_per_byte
-        return begin, self._free_at
-
-    def release(self) -> None:
-        """Free the line: the reserved bytes are not sent."""
-        self._free_at = float("-inf")
+BITS_PER_BYTE: Final = 10
+"""Start bit, 8 data bits, stop bit."""
 
 
 class PacedWriter:
@@ -60,16 +38,16 @@ class PacedWriter:
     write:
         Writes without blocking and returns how many bytes were accepted (0 if the port is full). OSError
         means that the port is lost; the bytes are dropped, as on a line without a peer.
-    schedule:
-        Schedule of bytes on the line, or None for no pacing.
+    baud:
+        Bit rate of the line, or None for no pacing.
     """
 
-    def __init__(
-        self, write: Callable[[bytes], int], schedule: PacingSchedule | None, statistics: Statistics
-    ) -> None:
+    def __init__(self, write: Callable[[bytes], int], baud: int | None, statistics: Statistics) -> None:
         self._loop = asyncio.get_running_loop()
         self._write = write
-        self.schedule = schedule
+        self.baud = baud
+        self._free_at = float("-inf")
+        """When the last byte of the queue will have been sent."""
         self._statistics = statistics
         self._queue: deque[tuple[float, bytes]] = deque()
         """Messages, each with the time at which it is due."""
@@ -93,8 +71,8 @@ class PacedWriter:
             return False
         if data:
             due = self._loop.time()
-            if self.schedule is not None:
-                _, due = self.schedule.reserve(due, len(data))
+            if self.baud is not None:
+                due = self._free_at = max(due, self._free_at) + len(data) * BITS_PER_BYTE / self.baud
             self._queue.append((due, data))
             self._backlog += len(data)
             self._idle.clear()
@@ -122,8 +100,7 @@ class PacedWriter:
     def clear(self) -> None:
         """Drop the queue and free the line."""
         self._statistics.dropped += self._backlog
-        if self.schedule is not None:
-            self.schedule.release()
+        self._free_at = float("-inf")
         self._queue.clear()
         self._backlog = self._written = 0
         if self._timer is not None:
@@ -171,9 +148,10 @@ class SerialTransport(Transport[bytes]):
 class PacedTransport(SerialTransport):
     """Base of the ports with a paced writer."""
 
-    def __init__(self, description: str, schedule: PacingSchedule | None) -> None:
+    def __init__(self, description: str, pace: int | None) -> None:
         super().__init__(description)
-        self._schedule = schedule
+        self._pace = pace
+        """Bit rate of the pacing, None for none."""
         self._writer: PacedWriter | None = None
 
     def set_baud(self, baud: int) -> None:
@@ -185,17 +163,17 @@ class PacedTransport(SerialTransport):
 
     def _change_rate(self, baud: int) -> None:
         """Change the bit rate; the queue is empty."""
-        if self._schedule is not None:
-            self._schedule = PacingSchedule(baud)
+        if self._pace is not None:
+            self._pace = baud
             if self._writer is not None:
-                self._writer.schedule = self._schedule
+                self._writer.baud = baud
 
     @abstractmethod
     def _write(self, data: bytes) -> int:
         """Write without blocking; return how many bytes were accepted."""
 
     def _make_writer(self) -> None:
-        self._writer = PacedWriter(self._write, self._schedule, self.statistics)
+        self._writer = PacedWriter(self._write, self._pace, self.statistics)
 
     def send(self, item: bytes) -> bool:
         """Queue a complete message, or drop it; without an open port it is dropped."""

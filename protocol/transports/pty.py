@@ -21,7 +21,7 @@ from typing import Final
 
 from starhil.protocol.flow import TURN
 from starhil.protocol.transports.base import TransportError
-from starhil.protocol.transports.paced import PacedTransport, PacingSchedule, termios_as_os_error, write_fd
+from starhil.protocol.transports.paced import PacedTransport, termios_as_os_error, write_fd
 
 _LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _IN_CLOSE: Final = 0x08 | 0x10
@@ -31,14 +31,7 @@ _EVENTS_SIZE: Final = 256 * _EVENT.size
 
 
 class PtyPeers:
-    """Watches the slave side of a pseudo-terminal, which this process must not have open.
-
-    Parameters
-    ----------
-    master
-        File descriptor of the master side.
-    path
-        Path of the slave side.
+    """Watches the slave side of a pseudo-terminal, a path that this process must not have open, by its master.
 
     Without inotify (if the system has no free instance), a peer that is replaced at once goes unnoticed.
     """
@@ -131,8 +124,8 @@ class PtyTransport(PacedTransport):
     read when it leaves.
     """
 
-    def __init__(self, schedule: PacingSchedule | None, symlink: Path | None) -> None:
-        super().__init__("pty", schedule)
+    def __init__(self, pace: int | None, symlink: Path | None) -> None:
+        super().__init__("pty", pace)
         self._symlink = symlink
         self._path = ""
         self._master = -1

@@ -9,7 +9,7 @@ import os
 import select
 from abc import abstractmethod
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 from urllib.parse import urlsplit
 
 import serial
@@ -19,7 +19,6 @@ from starhil.protocol.flow import TURN, TurnProtocol, detect_lost_peer
 from starhil.protocol.transports.base import ReconnectingTransport, TransportError
 from starhil.protocol.transports.paced import (
     PacedTransport,
-    PacingSchedule,
     SerialTransport,
     termios_as_os_error,
     write_fd,
@@ -54,8 +53,9 @@ def open_serial(
 
     Raises TransportError: the specification is invalid.
     """
-    schedule = PacingSchedule(baud)
-    pace = schedule if paced is None or paced else None
+    if baud <= 0:
+        raise TransportError(f"serial {spec}: bit rate {baud} must be positive")
+    pace = baud if paced is None or paced else None
     if spec in ("auto", "pty"):
         return PtyTransport(pace, symlink)
     if symlink is not None:
@@ -109,8 +109,8 @@ class _ReconnectingSerial(PacedTransport, ReconnectingTransport[bytes]):
 class TtyTransport(_ReconnectingSerial):
     """A tty opened by its path, through pyserial."""
 
-    def __init__(self, path: str, baud: int, schedule: PacingSchedule | None) -> None:
-        super().__init__(path, schedule)
+    def __init__(self, path: str, baud: int, pace: int | None) -> None:
+        super().__init__(path, pace)
         self._path = path
         self._baud = baud
         self._port: serial.Serial | None = None
@@ -223,8 +223,10 @@ class _StreamProtocol(TurnProtocol):
 class _TcpTransport(_ReconnectingSerial):
     """Base of both TCP transports."""
 
-    def __init__(self, scheme: str, host: str, port: int, schedule: PacingSchedule | None) -> None:
-        super().__init__(f"{scheme}://{host}:{port}", schedule)
+    scheme: ClassVar[str]
+
+    def __init__(self, host: str, port: int, pace: int | None) -> None:
+        super().__init__(f"{self.scheme}://{host}:{port}", pace)
         self._host = host
         self._port = port
         self._stream: asyncio.Transport | None = None
@@ -269,8 +271,7 @@ class _TcpTransport(_ReconnectingSerial):
 class _ConnectTransport(_TcpTransport):
     """A TCP connection to a serial server."""
 
-    def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
-        super().__init__("socket", host, port, schedule)
+    scheme = "socket"
 
     async def _attach(self) -> None:
         loop = asyncio.get_running_loop()
@@ -288,9 +289,8 @@ class _ConnectTransport(_TcpTransport):
 class _ListenTransport(_TcpTransport):
     """A TCP port for one peer at a time; without a peer, bytes are lost as on an open line."""
 
-    def __init__(self, host: str, port: int, schedule: PacingSchedule | None) -> None:
-        super().__init__("listen", host, port, schedule)
-        self._server: asyncio.Server | None = None
+    scheme = "listen"
+    _server: asyncio.Server | None = None
 
     async def _attach(self) -> None:
         loop = asyncio.get_running_loop()

@@ -36,7 +36,7 @@ from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.canopen import build_dictionary, build_eds
 from starhil.protocol.icd import load_unit
 from starhil.protocol.transports.base import Transport
-from starhil.protocol.transports.paced import PacedWriter, PacingSchedule
+from starhil.protocol.transports.paced import PacedWriter
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
@@ -72,7 +72,7 @@ class MemoryTransport(Transport[Any]):
 
     async def _open(self) -> None:
         if self._paced:
-            self._writer = PacedWriter(self._write, PacingSchedule(BAUD), self.statistics)
+            self._writer = PacedWriter(self._write, BAUD, self.statistics)
 
     def _write(self, data: bytes) -> int:
         self._put(data)

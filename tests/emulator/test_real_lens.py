@@ -8,9 +8,9 @@ import pytest
 from starhil.emulator.benchmarks.ecss_campaign import REST, Condition, EcssDevice, EcssPlan
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.device.parameters import Parameters
-from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady, SolverSettings
+from starhil.emulator.pipeline.messages import FrameRequest, SolverSettings, camera_constants
 from starhil.emulator.pipeline.pipeline import Pipeline
-from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import CALIBRATION, load_profile
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
@@ -46,7 +46,7 @@ def errors_arcsec(pipeline, parameters) -> list[float]:
 def test_a_slightly_wrong_calibration_stays_within_the_data_sheet(name, noise_arcsec):
     profile, icd = load_profile(name, ["run.clock=stepped"]), load_unit()
     pipeline = Pipeline(pipeline_setup(profile))
-    constants = camera_constants(PipelineReady(pipeline.camera.to_dict(), len(pipeline.catalog), 0.0))
+    constants = camera_constants(pipeline.camera.to_dict())
     parameters = Parameters(icd, profile_defaults(profile, icd))
     assert constants.keys() == CALIBRATION <= profile.parameters.keys()
     wrong = errors_arcsec(pipeline, parameters)

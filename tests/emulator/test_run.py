@@ -11,7 +11,7 @@ from starhil.emulator.control.scenario import load_scenario
 from starhil.emulator.device.modes import Mode
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
-from starhil.emulator.pipeline.imager import ProcessImager
+from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.messages import PipelineReady
 from starhil.emulator.profile import Profile, RunConfig
 from starhil.emulator.run import Run
@@ -355,12 +355,12 @@ def test_a_pipeline_that_dies_is_reported_and_restarted():
             run.begin()
             await run.ready()
             emulation = FirstHead(run)
-            assert isinstance(emulation.imager, ProcessImager)
+            assert isinstance(emulation.imager, WorkerImager)
             await emulation.stepper.step(1.0)
             command(emulation, "set_mode", mode="lost_in_space")
             await emulation.stepper.step(2.0)
             assert emulation.device.latest.valid
-            emulation.imager._worker.process.kill()
+            emulation.imager.worker.process.kill()
             while emulation.device.modes.mode.value != "error":
                 await asyncio.sleep(0.01)
             assert emulation.device.modes.error == "processing"

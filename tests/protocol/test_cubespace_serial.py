@@ -13,7 +13,6 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.transports.paced import PacingSchedule
 from tests.protocol.composed_links import CUBESPACE, stack_of
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
@@ -285,19 +284,3 @@ def test_the_host_survives_any_bytes(dialect: Dialect, noise: list[bytes]) -> No
     receiver.expect(Request.of(230), 6)
     events = receiver.feed(CUBESPACE.encode_reply(TELEMETRY, dialect), 10.0)
     assert events[-1] == TELEMETRY
-
-
-# -- pacing ------------------------------------------------------------------------------------------------------------
-
-
-def test_bytes_take_ten_bits_each_one_after_another() -> None:
-    line = PacingSchedule(115200)
-    assert line.reserve(5.0, 1152) == pytest.approx((5.0, 5.1))
-    assert line.reserve(5.05, 1152) == pytest.approx((5.1, 5.2))
-    assert line.reserve(9.0, 1) == pytest.approx((9.0, 9.0 + 10 / 115200))
-
-
-@pytest.mark.parametrize("baud", [0, -1])
-def test_a_bit_rate_must_be_positive(baud: int) -> None:
-    with pytest.raises(ProtocolError):
-        PacingSchedule(baud)

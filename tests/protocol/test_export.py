@@ -425,19 +425,19 @@ def check_documented_bits(icd: InterfaceDefinition) -> int:
     """Set each bit field alone and compare the bytes with its documented position; return the number of fields."""
     checked = 0
     for row in icd.rows:
-        others = {**row.sample(), **{name: 0 for name, field in row.named_fields.items() if field.width}}
+        bits = {name: field for name, field in row.named_fields.items() if field.width}
+        others = row.sample() | {name: field.to_physical(0) for name, field in bits.items()}
         base = row.encode(others, check=False)
         documented = {cells[1]: cells[0] for cells in field_cells(row)}
-        for name, field in row.named_fields.items():
-            if not field.width:
-                continue
+        for name, field in bits.items():
             places = list(documented_places(documented[name]))
             assert len(places) == field.width
             for raw in (1, 2**field.width - 1, 0b0110_1001_1010_0101_1100_0011_0101 % 2**field.width):
                 value = bytearray(base)
                 for number, (byte, bit) in enumerate(places):
                     value[byte] |= (raw >> number & 1) << bit
-                assert row.encode({**others, name: raw}, check=False) == value, f"{row.name}.{name}"
+                found = row.encode({**others, name: field.to_physical(raw)}, check=False)
+                assert found == value, f"{row.name}.{name}"
             checked += 1
     return checked
 

@@ -22,7 +22,7 @@ from starhil.emulator.links.canopen import (
     rows_reporting,
 )
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import FileStorage, MemoryStorage, NmtState
+from starhil.protocol.canopen import FileStorage, NmtState, ParameterStorage
 from starhil.protocol.icd import load_unit
 from starhil.protocol.transports.base import Transport
 
@@ -235,7 +235,7 @@ def test_restart_takes_over_the_stored_node_parameter(linked):
 
 
 def test_node_id_stored_by_lss_overrides_the_parameter_until_it_changes(linked):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     storage.save("lss", {"node_id": b"\x30", "bit_rate": (1_000_000).to_bytes(4, "little")})
 
     def test(link):

@@ -10,10 +10,10 @@ from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
-from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import MemoryStorage, StorageError
+from starhil.protocol.canopen import ParameterStorage, StorageError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_stack import build_serial_stack
@@ -34,7 +34,7 @@ def test_each_corrupted_item_is_counted_once_and_shown_as_it_is_sent():
     clock = SteppedClock()
     faults = WireFaults(sent.append, SerialDamage(), clock, Scheduler(), seed=1)
     faults.listener = seen.append
-    faults.settings = WireFaultSettings(corrupt=1.0)
+    faults.settings = WireFault(corrupt=1.0)
     for _ in range(3):
         faults.send(bytes(4))
     assert faults.corrupted == 3
@@ -113,7 +113,7 @@ def test_a_restart_of_the_device_after_a_reset_of_the_node_boots_the_node(node_b
 
 
 def test_another_parameter_leaves_the_node_id_that_lss_stored(node_bench):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     storage.save("lss", {"node_id": b"\x30", "bit_rate": (1_000_000).to_bytes(4, "little")})
 
     def test(_bus):
@@ -124,7 +124,7 @@ def test_another_parameter_leaves_the_node_id_that_lss_stored(node_bench):
 
 
 def test_a_stored_node_id_that_cannot_be_deleted_is_a_fault_of_the_store(node_bench, caplog):
-    class Kept(MemoryStorage):
+    class Kept(ParameterStorage):
         def clear(self, group):
             raise StorageError(f"{group}: read-only")
 
@@ -169,7 +169,7 @@ def test_after_a_gap_without_frames_the_next_one_is_sent_at_once(bench):
 
 
 def test_stored_parameters_that_cannot_be_read_are_a_fault_of_the_store(make_bench, caplog):
-    class Unreadable(MemoryStorage):
+    class Unreadable(ParameterStorage):
         def load(self, group):
             raise StorageError(f"{group}: damaged")
 

@@ -10,7 +10,7 @@ from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialDamage, SerialLink
-from starhil.emulator.links.wire_faults import WireFaults, WireFaultSettings
+from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.protocol.can_framing import (
     CanFrame,
     CanHostReceiver,
@@ -339,11 +339,11 @@ def test_an_incomplete_message_is_abandoned_and_counted(bench, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        (WireFaultSettings(drop=1.0), 0),
-        (WireFaultSettings(split=3, gap_s=0.0), 4),
-        (WireFaultSettings(junk=1.0), 2),
-        (WireFaultSettings(corrupt=1.0), 1),
-        (WireFaultSettings(delay_s=0.01), 0),
+        (WireFault(drop=1.0), 0),
+        (WireFault(split=3, gap_s=0.0), 4),
+        (WireFault(junk=1.0), 2),
+        (WireFault(corrupt=1.0), 1),
+        (WireFault(delay_s=0.01), 0),
     ],
 )
 def test_wire_faults_damage_outgoing_bytes(bench, settings, expected):
@@ -365,7 +365,7 @@ def test_wire_faults_damage_outgoing_bytes(bench, settings, expected):
             assert linked.uart.take() == []
             bench.step(settings.delay_s / 2)
             assert linked.uart.take() == [good]
-        linked.serial.wire.settings = WireFaultSettings()
+        linked.serial.wire.settings = WireFault()
         assert linked.over_serial(128)[0].kind is ReplyKind.TELEMETRY
 
     in_loop(scenario())
@@ -376,12 +376,12 @@ def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
     wire = WireFaults(
         lambda item: sent.append((clock.now_ns() / 1e9, item)), SerialDamage(), clock, scheduler, 1
     )
-    wire.settings = WireFaultSettings(split=2, gap_s=0.5)
+    wire.settings = WireFault(split=2, gap_s=0.5)
     wire.send(b"abcd")
     wire.send(b"efg")
-    wire.settings = WireFaultSettings(delay_s=0.25)
+    wire.settings = WireFault(delay_s=0.25)
     wire.send(b"hi")
-    wire.settings = WireFaultSettings()
+    wire.settings = WireFault()
     wire.send(b"jk")
     while (event := scheduler.pop_due(10**10)) is not None:
         clock.set_ns(event.due_ns)
@@ -396,11 +396,11 @@ def test_pieces_of_one_reply_are_not_mixed_with_those_of_the_next():
 def test_can_faults_lose_frames_and_the_host_notices(bench):
     async def scenario():
         linked = await Linked(bench).start()
-        linked.can.wire.settings = WireFaultSettings(drop=0.3)
+        linked.can.wire.settings = WireFault(drop=0.3)
         answers = [linked.over_can(211) for _ in range(20)]
         whole = [a for a in answers if a and isinstance(a[-1], Reply)]
         assert len(whole) < 20
-        linked.can.wire.settings = WireFaultSettings()
+        linked.can.wire.settings = WireFault()
         assert len(linked.over_can(211)[0].data) == 54
 
     in_loop(scenario())

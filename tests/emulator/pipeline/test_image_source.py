@@ -16,11 +16,11 @@ from starhil.emulator.pipeline.messages import (
     Failure,
     FrameRequest,
     ImageRequest,
-    PipelineReady,
     SolverSettings,
+    camera_constants,
 )
 from starhil.emulator.pipeline.pipeline import Pipeline, make_pipeline
-from starhil.emulator.pipeline_setup import camera_constants, pipeline_setup
+from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
@@ -68,7 +68,7 @@ def profile(tmp_path, photographs):
 def request(pipeline: Pipeline, profile: Profile, index: int) -> FrameRequest:
     icd = load_unit()
     parameters = Parameters(icd, profile_defaults(profile, icd))
-    parameters.adopt_defaults(camera_constants(PipelineReady(pipeline.camera.to_dict(), 0, 0.0)))
+    parameters.adopt_defaults(camera_constants(pipeline.camera.to_dict()))
     settings = SolverSettings(**{name: parameters[name] for name in SolverSettings.__dataclass_fields__})
     return FrameRequest(index, NOWHERE, 0.5, 1.0, settings=settings)
 

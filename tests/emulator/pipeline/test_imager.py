@@ -6,8 +6,9 @@ import pickle
 import pytest
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.pipeline.imager import ProcessImager, ThreadImager
-from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageRequest, PipelineReady
+from starhil.emulator.pipeline.imager import WorkerImager
+from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageRequest, PipelineReady, with_length
+from starhil.emulator.pipeline.worker_process import WorkerThread
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
 from tests.emulator.workers import ANSWERING, WORKER
@@ -40,11 +41,11 @@ def make_imager(request, worker, monkeypatch):
 
     def make():
         if request.param == "process":
-            imager = ProcessImager(SETUP, worker(ANSWERING))
-            imager.kill = lambda: imager._worker.process.kill()
+            imager = WorkerImager(SETUP, worker(ANSWERING))
+            imager.kill = lambda: imager.worker.process.kill()
         else:
-            imager = ThreadImager(SETUP)
-            imager.kill = lambda: imager._requests.put(ImageRequest(0))
+            imager = WorkerImager(SETUP, WorkerThread())
+            imager.kill = lambda: imager._writer.write(with_length(ImageRequest(0)))
         return imager
 
     return make
@@ -132,7 +133,7 @@ def test_an_answer_that_cannot_be_read_loses_the_worker_and_is_logged(worker, ca
         imager.submit(REQUEST, answers.append)
         assert isinstance(answers[-1], Failure)
 
-    run(lambda: ProcessImager(SETUP, worker(program)), scenario)
+    run(lambda: WorkerImager(SETUP, worker(program)), scenario)
     assert "cannot be read" in losses[0]
     assert "\n" not in losses[0]
 
@@ -149,7 +150,7 @@ def test_a_start_that_fails_raises_once_and_is_no_loss(worker, program):
     losses = []
 
     async def scenario():
-        imager = ProcessImager(SETUP, worker(program))
+        imager = WorkerImager(SETUP, worker(program))
         imager.ended.connect(losses.append)
         try:
             with pytest.raises(EmulatorError, match=r"no catalogue|pipeline worker"):
@@ -168,7 +169,7 @@ def test_a_request_that_cannot_be_sent_is_not_left_pending(worker):
             imager.submit(lambda: None, lambda _answer: None)
         assert imager.pending == 0
 
-    run(lambda: ProcessImager(SETUP, worker(ANSWERING)), scenario)
+    run(lambda: WorkerImager(SETUP, worker(ANSWERING)), scenario)
 
 
 def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
@@ -178,7 +179,7 @@ def test_a_thread_whose_pipeline_cannot_be_made_reports_it(monkeypatch):
     monkeypatch.setattr("starhil.emulator.pipeline.pipeline.make_pipeline", fail)
 
     async def scenario():
-        imager = ThreadImager(SETUP)
+        imager = WorkerImager(SETUP, WorkerThread())
         try:
             with pytest.raises(EmulatorError, match="ValueError: odd camera"):
                 await asyncio.wait_for(imager.start(), WITHIN_S)

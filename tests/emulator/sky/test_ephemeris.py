@@ -11,10 +11,9 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
-from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.ephemeris import Observer
 from starhil.emulator.sky.light import through_baffle
-from starhil.emulator.sky.objects import SkyObjects
+from starhil.emulator.sky.objects import SkyObjects, icrs_vector
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.orbit import KeplerOrbit
 from starid.aberration import aberrated

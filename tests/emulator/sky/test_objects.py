@@ -7,10 +7,17 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.renderer import Renderer, SensorModel
-from starhil.emulator.sky.directions import icrs_vector
 from starhil.emulator.sky.light import AreaPainter
 from starhil.emulator.sky.light_grid import Backdrop
-from starhil.emulator.sky.objects import EarthLimb, Moon, Obstruction, PointSource, SkyObjects, SunGlare
+from starhil.emulator.sky.objects import (
+    EarthLimb,
+    Moon,
+    Obstruction,
+    PointSource,
+    SkyObjects,
+    SunGlare,
+    icrs_vector,
+)
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import load_catalog

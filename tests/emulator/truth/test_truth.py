@@ -13,8 +13,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth.source import (
+    ZERO_RATE,
     FixedTruth,
-    HoldSegment,
     RateSegment,
     RateTruth,
     SlewSegment,
@@ -62,7 +62,7 @@ def test_constant_rate_turns_about_its_axis():
     ],
 )
 def test_slew_goes_from_rest_to_rest_about_one_axis_within_its_rate(slew):
-    truth = SlewTruth(ORION, [HoldSegment(2.0), slew], start_s=1.0)
+    truth = SlewTruth(ORION, [RateSegment(2.0, ZERO_RATE), slew], start_s=1.0)
     end = 1.0 + truth.duration_s
     assert apart_arcsec(truth.state(3.0).attitude, ORION) < MILLIARCSECOND
     assert apart_arcsec(truth.state(end).attitude, EAST) < MILLIARCSECOND
@@ -88,7 +88,7 @@ def test_limited_slew_keeps_its_acceleration():
 def test_segments_follow_one_another_and_repeat():
     turn = RateSegment(10.0, np.radians([0.5, 0.0, 0.0]))
     back = SlewSegment(ORION, math.radians(1.0))
-    truth = SlewTruth(ORION, [turn, HoldSegment(3.0), back], repeat=True)
+    truth = SlewTruth(ORION, [turn, RateSegment(3.0, ZERO_RATE), back], repeat=True)
     assert (
         apart_arcsec(truth.state(12.0).attitude, propagate(ORION, np.radians([0.5, 0, 0]), 10.0))
         < MILLIARCSECOND
@@ -101,7 +101,10 @@ def test_segments_follow_one_another_and_repeat():
 @settings(max_examples=60, deadline=None, derandomize=True)
 @given(st.floats(0.0, 200.0), st.floats(0.0, 0.01))
 def test_slew_has_no_jump(t, dt):
-    truth = SlewTruth(ORION, [HoldSegment(5.0), SlewSegment(EAST, math.radians(0.5)), HoldSegment(5.0)])
+    truth = SlewTruth(
+        ORION,
+        [RateSegment(5.0, ZERO_RATE), SlewSegment(EAST, math.radians(0.5)), RateSegment(5.0, ZERO_RATE)],
+    )
     moved = apart_arcsec(truth.state(t).attitude, truth.state(t + dt).attitude)
     assert moved <= 0.5 * 3600.0 * dt + MILLIARCSECOND
 

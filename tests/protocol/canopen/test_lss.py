@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from starhil.protocol.canopen import MemoryStorage, NmtState, StorageError
+from starhil.protocol.canopen import NmtState, ParameterStorage, StorageError
 
 VENDOR, PRODUCT, REVISION, SERIAL = 0, 0x53544152, 0x10000, 1
 IDENTITY = (VENDOR, PRODUCT, REVISION, SERIAL)
@@ -175,7 +175,7 @@ def test_a_frame_just_after_the_silence_is_answered_though_no_timer_has_run(benc
 
 
 def test_store_survives_the_power_cycle(new_bench):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     bench = new_bench(storage=storage).power_on()
     lss(bench, "04 01")
     lss(bench, "11 30")
@@ -187,7 +187,7 @@ def test_store_survives_the_power_cycle(new_bench):
 
 
 def test_store_that_fails(new_bench):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     storage.save = Mock(side_effect=StorageError("disk full"))
     bench = new_bench(storage=storage).power_on()
     lss(bench, "04 01")

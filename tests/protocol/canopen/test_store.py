@@ -12,7 +12,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from starhil.protocol.canopen import AbortCode, FileStorage, MemoryStorage, SdoAbortError, StorageError
+from starhil.protocol.canopen import AbortCode, FileStorage, ParameterStorage, SdoAbortError, StorageError
 
 SAVE = b"save"
 LOAD = b"load"
@@ -20,7 +20,7 @@ LOAD = b"load"
 
 @pytest.fixture(params=["memory", "file"])
 def storage(request, tmp_path):
-    return MemoryStorage() if request.param == "memory" else FileStorage(tmp_path / "sub" / "node.json")
+    return ParameterStorage() if request.param == "memory" else FileStorage(tmp_path / "sub" / "node.json")
 
 
 @pytest.fixture
@@ -118,7 +118,7 @@ def test_application_parameters_are_stored_by_the_application(new_bench, storage
 
 
 def test_a_failing_storage_gives_defaults_an_event_and_hardware_aborts(new_bench):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     storage.save = Mock(side_effect=StorageError("disk full"))
     storage.clear = Mock(side_effect=StorageError("disk full"))
     storage.load = Mock(side_effect=StorageError("damaged"))
@@ -130,7 +130,7 @@ def test_a_failing_storage_gives_defaults_an_event_and_hardware_aborts(new_bench
 
 
 def test_defaults_replace_a_stored_mapping_that_no_longer_fits(new_bench):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     storage.save("communication", {"1017:00": b"\x05\x00", "1A00:01": (0x5FFF_0008).to_bytes(4, "little")})
     bench = new_bench(storage=storage).power_on()
     assert values(bench) == (1000, 254)
@@ -139,7 +139,7 @@ def test_defaults_replace_a_stored_mapping_that_no_longer_fits(new_bench):
 
 @pytest.mark.parametrize("name", ["1017:00", "1000:00", "5FFF:01", "1001:00"])
 def test_stored_values_of_wrong_size_or_of_unknown_objects_are_ignored(new_bench, name):
-    storage = MemoryStorage()
+    storage = ParameterStorage()
     storage.save("communication", {name: b"\x01\x02\x03"})
     assert values(new_bench(storage=storage).power_on()) == (1000, 254)
 

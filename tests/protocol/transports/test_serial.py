@@ -16,7 +16,7 @@ import serial
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports import TransportError, open_serial
 from starhil.protocol.transports.base import Statistics
-from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedWriter, PacingSchedule
+from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedWriter
 from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 
@@ -85,7 +85,7 @@ def test_a_paced_message_is_written_at_the_moment_its_last_byte_ends() -> None:
             written.append((loop.time(), len(data)))
             return len(data)
 
-        writer = PacedWriter(write, PacingSchedule(1000), Statistics())
+        writer = PacedWriter(write, 1000, Statistics())
         for size in (60, 3):
             writer.send(bytes(size))
         await writer.drain()
@@ -98,6 +98,12 @@ def test_a_paced_message_is_written_at_the_moment_its_last_byte_ends() -> None:
     loop = SimulatedLoop()
     loop.run_until_complete(main(loop))
     loop.close()
+
+
+@pytest.mark.parametrize("baud", [0, -1])
+def test_a_bit_rate_must_be_positive(baud: int) -> None:
+    with pytest.raises(TransportError, match="must be positive"):
+        open_serial("auto", baud)
 
 
 @pytest.mark.parametrize("kind", SERIAL_KINDS)

@@ -422,6 +422,25 @@ def test_all_test_frames_are_on_the_grid_and_moved_ones_are_not():
             assert 0.2 < away.mean() < 0.3
 
 
+def test_the_quick_run_of_the_accuracy_evaluates_fewer_frames(tmp_path):
+    accuracy = registry.experiments()["lsi-accuracy"]
+    context = Context(tmp_path, tmp_path, "lsi-accuracy", 1, accuracy.quick, quick=True)
+    parts, results, rng = accuracy.parts(accuracy.quick), {}, np.random.default_rng(1)
+    for part in parts:
+        frames = centres(1 if part.values["percent"] == 99.5 else accuracy.quick["every"])
+        kinds = ("author_mse", "author_1se", "mse", "1se", "fine", "stars")
+        names = [f"{quantity}_{kind}" for quantity in ("f", "theta") for kind in kinds]
+        errors = {
+            name: rng.uniform(0.0, 1.0, len(frames)) for name in (*names, "psi_mse", "psi_author", "residual")
+        }
+        results[part.key] = {"frames": frames, **errors}
+    evaluation = Evaluation(context, parts, results)
+    accuracy.evaluate(evaluation)
+    files = set(evaluation.outcome().files)
+    assert {"figure_6_1_on.png", "figure_6_4.csv", "errors_p99.5-off.csv"} <= files
+    assert "figure_6_3_on.png" not in files
+
+
 def test_the_worked_example_agrees_with_the_thesis(tmp_path):
     example = registry.experiments()["worked-example"]
     outcome = runner.run([example], tmp_path, quick=True, jobs=1)[0].outcome
