@@ -362,6 +362,11 @@ ALTERNATIVES: Final = (
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
 """Device parameters that describe the camera; by default, the device is calibrated exactly."""
 
+PATHS: Final = frozenset(
+    {"truth.path", "orbit.path", "catalog.path", "images.folder", "images.dark", "run.state_dir"}
+)
+"""Keys of files and folders, which refer to the folder of the profile that has them."""
+
 LINK_PARAMETERS: Final[dict[str, str]] = {
     "serial_dialect": "links.serial.dialect",
     "serial_baud": "links.serial.baud",
@@ -480,6 +485,10 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
         if not isinstance(below, dict):
             raise EmulatorError(f"--set {override}: {name} is a value, not a section")
         table = below
+    if ".".join(names) in PATHS and isinstance(value, str) and value:
+        value = str(
+            Path(value).expanduser().absolute()
+        )  # relative to the working directory, as on any command line
     if names[-1] == "kind":
         value = text.strip().strip("\"'")  # a name, even if it is a number: 42
     if names[-1] == "kind" and table.get("kind") != value:

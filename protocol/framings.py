@@ -234,8 +234,8 @@ class Escaped(Framing):
 
     ::
 
-    escape start   body, escape doubled   escape end
-      10     02    48 10 10 99              10    03
+        escape start   body, escape doubled   escape end
+          10     02    48 10 10 99              10    03
 
     Parameters
     ----------
@@ -420,8 +420,8 @@ class Counted(Framing):
 
     ::
 
-    start   body: header (with its length), data, check   end
-    DE AD   00 00 00 02                                   BE EF
+        start   body: header (with its length), data, check   end
+        DE AD   00 00 00 02                                   BE EF
     """
 
     def __init__(self, start: list[int], end: list[int], stuffing: ByteStuffing | None = None) -> None:
@@ -536,8 +536,8 @@ class Delimited(Framing):
 
     ::
 
-    start   body, as it is or two digits a byte   end
-      24    30 32 46 46  (the body 02 FF)        0D 0A
+        start   body, as it is or two digits a byte   end
+          24    30 32 46 46  (the body 02 FF)        0D 0A
     """
 
     def __init__(self, model: DelimitedFraming) -> None:

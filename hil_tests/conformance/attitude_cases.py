@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, Protocol, Self
+from typing import Any, Final, Protocol, Self
 
-from starhil.hil_tests.attitude import Quaternion, attitude_error, unit
+from starhil.hil_tests.attitude import Quaternion, attitude_error, conjugate, from_matrix, product, unit
 from starhil.hil_tests.conformance.case import CaseSkipped, check
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
@@ -22,7 +22,13 @@ SEARCHING: Final = "lost_in_space"
 STANDBY: Final = "standby"
 
 TruthSource = Callable[[], Quaternion]
-"""Returns the true attitude at present."""
+"""Returns the true attitude at present, as the unit reports attitudes."""
+
+
+def as_reported(attitude: Quaternion, conventions: Any) -> Quaternion:
+    """Return an attitude from ICRS to the sensor with the direction and axes of a unit's `[conventions]`."""
+    turned = product(from_matrix(conventions.rows), attitude)
+    return conjugate(turned) if conventions.quaternion == "attitude" else turned
 
 
 class RowAccess(Protocol):

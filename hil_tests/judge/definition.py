@@ -64,6 +64,7 @@ class Unit:
     serial: Any
     can: Any
     byte_order: Literal["little", "big"]
+    conventions: Any = None
     classes: tuple[Any, ...] = ()
     unanswered: frozenset[str] = frozenset()
     errors: Mapping[str, int] = field(default_factory=dict)
@@ -130,6 +131,7 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         serial=serial,
         can=icd.link.can,
         byte_order=icd.conventions.byte_order,
+        conventions=icd.conventions,
         classes=icd.classes,
         unanswered=frozenset(
             {row.name for row in icd.rows if not row.answers}

@@ -1,4 +1,5 @@
 from itertools import permutations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -133,6 +134,20 @@ def test_a_profile_s_camera_is_known_exactly_by_default(tmp_path):
 def test_a_profile_extends_a_path_beside_it(tmp_path):
     write(tmp_path, "[run]\nseed = 77\n", "base.toml")
     assert load_profile(write(tmp_path, 'extends = "base.toml"\n')).run.seed == 77
+
+
+def test_paths_of_overrides_are_relative_to_the_working_directory(tmp_path, monkeypatch):
+    (tmp_path / "profiles").mkdir()
+    (tmp_path / "profiles" / "own.toml").write_text(
+        '[truth]\nkind = "file"\npath = "own.csv"\n[catalog]\npath = "own.npz"\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    name = "profiles/own.toml"
+    profile = load_profile(name, ["truth.path=slew.aem", "run.state_dir=", "images.dark=~/dark.png"])
+    assert profile.folder / profile.truth.path == tmp_path / "slew.aem"
+    assert profile.images.dark == str(Path.home() / "dark.png")
+    assert (profile.run.state_dir, profile.catalog.path) == ("", "own.npz")
+    assert (profile.folder / load_profile(name).truth.path).resolve() == tmp_path / "profiles" / "own.csv"
 
 
 def test_overrides_are_toml_or_text():

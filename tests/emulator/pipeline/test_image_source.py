@@ -97,7 +97,8 @@ def test_without_repeat_the_images_are_used_up(profile):
     assert "the 3 images" in failed.text
 
 
-def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photographs):
+def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photographs, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     dark = np.full(photographs[0].shape, 40, np.uint16)
     dark[100:110, 200:210] = 90
     write_image(tmp_path / "dark.png", dark)
@@ -118,7 +119,10 @@ def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photograp
         ("images.dark=other.png", "dark frame of 20×20"),
     ],
 )
-def test_images_that_cannot_serve_fail_the_start_in_one_line(profile, tmp_path, setting, message):
+def test_images_that_cannot_serve_fail_the_start_in_one_line(
+    profile, tmp_path, setting, message, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     write_image(tmp_path / "other.png", np.arange(400, dtype=np.uint16).reshape(20, 20))
     failed = make_pipeline(pipeline_setup(load_profile(str(profile), [setting])))
