@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Final, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from starhil.protocol.link_schema import HEX
 from starhil.protocol.values import DefinitionModel
 
-Index = Annotated[int, Field(ge=0x2000, le=0xFFFF, json_schema_extra=HEX)]
+OS_OBJECTS: Final = range(0x1023, 0x1026)
+"""Objects of the communication profile that a unit may define: OS command, its mode, debugger (CiA 301)."""
+
+
+def _index(index: int) -> int:
+    if index < 0x2000 and index not in OS_OBJECTS:
+        raise ValueError("must be at least 2000h, or 1023h to 1025h")
+    return index
+
+
+Index = Annotated[int, Field(ge=0x1023, le=0xFFFF, json_schema_extra=HEX), AfterValidator(_index)]
 Unsigned32 = Annotated[int, Field(ge=0, le=0xFFFFFFFF, json_schema_extra=HEX)]
 PackedType = Literal["u8", "i8", "u16", "i16", "u24", "i24", "u32", "i32", "u48"]
 
@@ -68,13 +78,13 @@ class PlacedObject(DefinitionModel):
     """A record of all rows, with the ID as sub-index: read a telemetry row, write a telecommand."""
     telemetry: str | None = None
     """A record of the fields of a telemetry row. With `telecommand`, which the row must include, a write to
-    one field executes the telecommand with the other fields unchanged."""
+    one field executes the telecommand with the other fields unchanged. With `type`, the row is a single entry."""
     value: str | None = None
     """A telemetry field to read, as `ROW.FIELD`."""
     telecommand: str | None = None
     """A telecommand, which a write executes."""
     type: Literal["u8", "u16", "u32", "u64"] | None = None
-    """Integer type that holds all data of the telecommand, so that a PDO can carry it."""
+    """Integer type that holds all data of the telecommand, the telemetry row or both, so that a PDO can carry it."""
     parameters: bool = False
     """A record of all parameters, with the ID as sub-index."""
     image: Literal["frame", "stored"] | None = None
@@ -100,10 +110,8 @@ class PlacedObject(DefinitionModel):
                 "needs exactly one of requests, telemetry, value and/or telecommand, parameters, image, packed, "
                 "members"
             )
-        if self.type is not None and (
-            self.telecommand is None or self.value is not None or self.telemetry is not None
-        ):
-            raise ValueError("`type` is only for a telecommand")
+        if self.type is not None and (self.value is not None or self.telecommand is self.telemetry is None):
+            raise ValueError("`type` is only for a telecommand or a telemetry row")
         return self
 
 
@@ -143,6 +151,8 @@ class CanopenModel(DefinitionModel):
     """Object 1018h, sub-index 2."""
     revision: Unsigned32
     """Object 1018h, sub-index 3."""
+    sdo_client: Annotated[int, Field(ge=1, le=127)] | None = None
+    """Object 1200h, sub-index 3: node ID of the client; none: the object has no such sub-index."""
     bit_rates: list[int] = Field(min_length=1)
     """Supported bit rates, in bit/s."""
     object: list[PlacedObject] = Field(min_length=1)

@@ -283,6 +283,12 @@ _quantity("clock.microseconds", int, "us", "The device's clock, fraction of the 
           lambda shot: shot.clock_ns % NANOSECONDS // 1_000)
 _quantity("clock.nanoseconds", int, "ns", "The device's clock, fraction of the second.",
           lambda shot: shot.clock_ns % NANOSECONDS)
+_quantity("clock.day", int, "", "The device's clock, whole days since the unit's epoch.",
+          lambda shot: shot.clock_ns // DAY_NS)
+_quantity("clock.day_milliseconds", int, "ms", "The device's clock, whole milliseconds of the day.",
+          lambda shot: shot.clock_ns % DAY_NS // 1_000_000)
+_quantity("clock.submilliseconds", int, "us", "The device's clock, fraction of the millisecond.",
+          lambda shot: shot.clock_ns % 1_000_000 // 1_000)
 _quantity("clock.set", bool, "", "Whether the clock has been set since start-up.",
           lambda shot: shot.device.time.was_set)
 _quantity("uptime", float, "s", "Time since start-up.", lambda shot: shot.uptime_ns / NANOSECONDS)

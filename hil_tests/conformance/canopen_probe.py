@@ -14,6 +14,7 @@ from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_eq
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
+    EXPEDITED,
     Entry,
     abort_code,
     expedited_data,
@@ -141,12 +142,14 @@ class CanopenProbe:
         return "nothing"
 
     def prepare(self) -> None:
-        """Record the values of the application objects."""
+        """Record the values of the application objects, except those above 4 bytes, such as the clock."""
         self.abandon_transfer()
         self._found = {
             (item.index, item.subindex): self.read(item.index, item.subindex)
             for item in self.variables()
-            if item.index >= FIRST_OWN_OBJECT and item.access_type == "rw" and size_of(item)
+            if item.index >= FIRST_OWN_OBJECT
+            and item.access_type == "rw"
+            and 0 < (size_of(item) or 0) <= EXPEDITED
         }
 
     def restore(self) -> None:

@@ -362,7 +362,8 @@ def _sent_with_frames(index: int, model: Any, found: list[Entry], probe: Canopen
 
 def _clock(index: int, model: Any, mapped: list[Entry], found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     """Yield the case for an RPDO that sets the clock, if an entry reads it."""
-    clock = next((item for item in found if _reports(item, "clock.seconds")), None)
+    numbers = (item for item in found if item.slot is not None and item.slot.kind == "integer")
+    clock = next((item for item in numbers if _reports(item, "clock.seconds")), None)
     (entry, *others) = mapped
     seconds = _argument(entry, "seconds")
     if (

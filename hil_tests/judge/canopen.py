@@ -111,7 +111,12 @@ def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
     """Yield the entries of the application."""
     for placed in layout.object:
         index, at = placed.index, f"{placed.index:04x}"
-        if placed.telemetry is not None:
+        if placed.telemetry is not None and placed.type is not None:
+            row = unit.telemetry[placed.telemetry]
+            command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
+            whole = Field("", "bytes", "bytes", "little", 0, row.size)
+            yield Entry(index, 0, at, row.size, row, whole, command)
+        elif placed.telemetry is not None:
             row = unit.telemetry[placed.telemetry]
             command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
             for number, slot in enumerate(places(row), 1):

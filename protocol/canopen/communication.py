@@ -132,6 +132,8 @@ def _members(layout: CanopenModel, record: Mapping[str, Any]) -> Iterator[ODVari
     """Yield the variables of a record of the profile, or the variable that stands alone."""
     first = 1 if "members" in record else 0
     for item in record.get("members", [record]):
+        if item.get("optional", False) and getattr(layout, item["from"]) is None:
+            continue
         for subindex in range(first, first + item.get("repeat", 1)):
             yield variable(
                 item["name"].format(subindex),

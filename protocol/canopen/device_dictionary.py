@@ -76,6 +76,8 @@ def placements(icd: InterfaceDefinition, placed: PlacedObject) -> Iterator[Place
     if placed.requests:
         for row in icd.rows:
             yield _request(row, (index, row.id))
+    elif placed.telemetry is not None and placed.type is not None:
+        yield _whole(icd, placed, icd.telemetry[placed.telemetry], DATA_TYPES[placed.type])
     elif placed.telemetry is not None:
         yield from _record(icd, placed, icd.telemetry[placed.telemetry])
     elif placed.parameters:
@@ -101,6 +103,21 @@ def _request(row: Row, key: Key) -> Placement:
     item = variable(row.name, *key, datatypes.OCTET_STRING, "ro")
     item.description = row.doc
     return Placement(item, (row.name,), Reading(row))
+
+
+def _whole(icd: InterfaceDefinition, placed: PlacedObject, row: Row, data_type: int) -> Placement:
+    """Return the entry that holds all data of a telemetry row, and executes a telecommand when written."""
+    if type_size(data_type) != row.size:
+        raise IcdError(
+            f"canopen.toml: {placed.index:04X}h: {row.name} has {row.size} bytes, not the size of {placed.type}"
+        )
+    key, command = (placed.index, 0), None
+    item = variable(placed.name, *key, data_type, "ro", mappable=True)
+    if placed.telecommand is not None:
+        command = icd.telecommands[placed.telecommand]
+        item = _command(placed.name, key, command, placed.type).variable
+        item.access_type = "rw"
+    return Placement(item, (placed.name,), Reading(row), telecommand=command)
 
 
 def _record(icd: InterfaceDefinition, placed: PlacedObject, row: Row) -> Iterator[Placement]:

@@ -272,6 +272,9 @@ def _content(placed: PlacedObject) -> str:
             )
             + "; a number beyond the range of its type is clipped"
         )
+    if placed.telemetry is not None and placed.type is not None:
+        written = f"; writing executes {placed.telecommand}" if placed.telecommand is not None else ""
+        return f"telemetry {placed.telemetry} as one number{written}"
     if placed.telemetry is not None:
         return f"telemetry {placed.telemetry}: one sub-index per field"
     if placed.members:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from starhil.emulator.device.device import Device
@@ -76,7 +77,9 @@ def handling(change: Callable[[Device, Request, Callable[[Request], list[Reply]]
 
     def damage(unit: SimulatedUnit) -> None:
         device, requests, handle = unit.device, unit.requests, unit.requests.handle
-        requests.handle = lambda request: change(device, request, handle)
+        requests.handle = lambda request, *, console=False: change(
+            device, request, partial(handle, console=console)
+        )
 
     return damage
 

@@ -34,6 +34,51 @@ def download(unit: Emulated, index: int, value: int) -> int:
     return 0 if reply.data[0] == 0x60 else struct.unpack_from("<I", reply.data, 4)[0]
 
 
+def long_upload(unit: Emulated, index: int, subindex: int = 0) -> bytes:
+    """Read an entry of 8 bytes by a segmented upload."""
+    request = struct.pack("<BHB4x", 0x40, index, subindex)
+    (reply,) = [f for f in unit.ask_can(0x600 + NODE, request, extended=False) if f.id == 0x580 + NODE]
+    assert reply.data[:1] == b"\x41", reply.data.hex()
+    assert struct.unpack_from("<I", reply.data, 4) == (8,)
+    data = b""
+    for command in (0x60, 0x70):
+        (reply,) = [
+            f
+            for f in unit.ask_can(0x600 + NODE, bytes([command, *bytes(7)]), extended=False)
+            if f.id == 0x580 + NODE
+        ]
+        data += reply.data[1 : 8 - (reply.data[0] >> 1 & 7)]
+    return data
+
+
+def test_the_clock_is_read_and_set_in_both_codes():
+    def scenario(unit: Emulated) -> None:
+        def clock() -> tuple[float, float]:
+            coarse, fine = struct.unpack("<II", long_upload(unit, 0x2010))
+            day, milliseconds, microseconds = struct.unpack("<HIH", long_upload(unit, 0x2011))
+            return coarse + fine / 1e6, day * 86400 + milliseconds / 1e3 + microseconds / 1e6
+
+        scet, utc = clock()
+        assert 0.0 <= utc - scet < 0.1
+        value = struct.pack("<HIH", 20_000, 45_296_789, 123)  # day 20000, 12:34:56.789123
+        unit.ask_can(0x600 + NODE, struct.pack("<BHBI", 0x21, 0x2011, 0, 8), extended=False)
+        for command, piece in ((0x00, value[:7]), (0x1D, value[7:].ljust(7, b"\0"))):
+            unit.ask_can(0x600 + NODE, bytes([command]) + piece, extended=False)
+        scet, utc = clock()
+        assert 0.0 <= scet - (20_000 * 86400 + 45_296.789123) < 0.5
+        assert 0.0 <= utc - scet < 0.1
+
+    with_unit("oresat", "canopen", scenario)
+
+
+def test_the_objects_of_the_common_profile_are_there():
+    def scenario(unit: Emulated) -> None:
+        assert upload(unit, 0x1200, 3) == b"\x01"
+        assert upload(unit, 0x1023, 2) == b"\x00"
+
+    with_unit("oresat", "canopen", scenario)
+
+
 def operational(unit: Emulated) -> None:
     unit.ask_can(0, bytes([1, NODE]), extended=False)
 
