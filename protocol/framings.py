@@ -375,7 +375,7 @@ class Stuffing:
 
     ::
 
-    41 F0 7F F3   ->   41 F0 00 7F F0 03   (escape F0, mask 0F)
+        41 F0 7F F3   ->   41 F0 00 7F F0 03   (escape F0, mask 0F)
     """
 
     def __init__(self, model: ByteStuffing | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import csv
 import dataclasses
@@ -513,3 +514,16 @@ def test_frames_that_a_page_types_are_answered_as_shown(name, tmp_path):
                 assert got is not None, f"no answer to {exchange.typed}"
                 frame = CanFrame(got.arbitration_id, bytes(got.data), extended=got.is_extended_id)
                 assert_shown(frame, answer, exchange.typed)
+
+
+def test_examples_in_docstrings_are_indented_below_their_colons():
+    """Otherwise `make docs` fails: docutils expects a literal block there."""
+    wrong = [
+        f"{path.relative_to(DOCS.parent)}: {node.name if hasattr(node, 'name') else 'module'}"
+        for package in ("emulator", "protocol", "hil_tests", "starid")
+        for path in sorted((DOCS.parent / package).rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef))
+        and re.search(r"::\n\n\S", ast.get_docstring(node) or "")
+    ]
+    assert wrong == []

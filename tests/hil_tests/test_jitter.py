@@ -106,7 +106,7 @@ MEASURED = {
     "event timer": (
         lambda spec: event_timer_jitter(spec, SECONDS, PERIOD_MS, node=NODE), "TPDO by event timer every 5 ms", [128, 1],
     ),
-    "SYNC": (lambda spec: sync_to_pdo(spec, SECONDS, 0.02, node=NODE), "SYNC to TPDO", [128, 1]),
+    "SYNC": (lambda spec: sync_to_pdo(spec, 0.6, 0.15, node=NODE), "SYNC to TPDO", [128, 1]),
 }  # fmt: skip
 
 

@@ -147,6 +147,32 @@ def test_a_unit_that_does_not_recover_is_a_violation(monkeypatch, is_valid, answ
     assert violation(monkeypatch, mute, {"do": "recover"}) == expected
 
 
+def command(name, **values):
+    row = ICD.telecommands[name]
+    return {**request(row.id, "telecommand"), "data": row.encode(values).hex()}
+
+
+FLOOD = {**request(IDENTIFICATION.id), "do": "flood", "count": 5}
+EXPOSURE = (
+    command("select_parameter", parameter=ICD.parameters["exposure"].id),
+    request(ICD.telemetry["parameter"].id),
+)
+HARMLESS = {
+    "a flood": ((FLOOD, *READ), 6),
+    "a flood to an unresponsive unit": ((STUCK, FLOOD), 0),
+    "the start of a long request": (({**request(37, "telecommand"), "do": "cut", "share": 0.5}, *READ), 1),
+    "the restored parameters": ((command("set_parameter", parameter=ICD.parameters["exposure"].id, value=80.0), command("restore_parameters"), *EXPOSURE), 4),
+    "the default parameters": ((command("default_parameters"), *EXPOSURE), 3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_what_a_unit_may_do_is_no_violation(name):
+    steps, requests = HARMLESS[name]
+    outcome = run_once(Life("cubestar", 1, ("can",), {}, ({"do": "wait", "s": 2.0}, *steps)))
+    assert (outcome.violation, outcome.requests) == ("", requests)
+
+
 # -- the node ----------------------------------------------------------------------------------------------------------
 
 NODE = 44
