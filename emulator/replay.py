@@ -40,7 +40,7 @@ from starhil.emulator.tape import (
     as_json,
     from_json,
 )
-from starhil.emulator.truth.config import FileConfig, OrbitFileConfig, Strict, TruthConfig
+from starhil.emulator.truth.config import FileConfig, Strict, TruthConfig
 from starhil.emulator.truth_log import WALL_TIMES, TruthLog
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.can_framing import CanFrame
@@ -156,8 +156,6 @@ def _copy_inputs(folder: Path, profile: Profile, scenario: str) -> None:
     if isinstance(profile.truth, FileConfig):
         shutil.copyfile(profile.folder / profile.truth.path, folder / TRUTH_SOURCE_FILE)
         values["truth"]["path"] = TRUTH_SOURCE_FILE
-    if isinstance(profile.orbit, OrbitFileConfig):
-        values["orbit"]["path"] = str((profile.folder / profile.orbit.path).absolute())
     state = profile.folder / profile.run.state_dir if profile.run.state_dir else None
     if state is not None and state.is_dir():
         shutil.copytree(state, folder / STATE_FOLDER)
@@ -300,8 +298,11 @@ def read_run(folder: Path) -> tuple[Profile, bool]:
     except EmulatorError as error:
         raise EmulatorError(f"{error}; give a folder made by starhil run --record") from None
     run = _validated(_RunFile, text, path)
-    is_copied = isinstance(run.profile.truth, FileConfig)
-    return run.profile.read_from((folder if is_copied else Path(run.folder)) / RUN_FILE), run.ends
+    truth = run.profile.truth
+    if isinstance(truth, FileConfig):
+        truth = truth.model_copy(update={"path": str((folder / truth.path).absolute())})
+    profile = run.profile.model_copy(update={"truth": truth})
+    return profile.read_from(Path(run.folder) / RUN_FILE), run.ends
 
 
 def _read(path: Path) -> str:

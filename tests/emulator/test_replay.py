@@ -12,8 +12,8 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
-from starhil.emulator.profile import Profile
-from starhil.emulator.replay import replay
+from starhil.emulator.profile import Profile, load_profile
+from starhil.emulator.replay import prepare_recording, read_run, replay
 from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
@@ -456,3 +456,20 @@ def test_a_run_with_truth_and_orbit_from_standard_files_is_repeated(record, tmp_
     (tmp_path / "truth").unlink()
     assert report_of(folder).differences == []
     assert seen[0] == (1774008002.0, pytest.approx(15_000.0, abs=1.0))
+
+
+def test_paths_of_the_profile_refer_to_its_folder_and_the_copied_truth_to_the_recording(tmp_path):
+    site, folder = tmp_path / "site", tmp_path / "recorded"
+    site.mkdir()
+    (site / "truth.csv").write_text("time_s,ra_deg,dec_deg,roll_deg\n0,10,20,30\n")
+    (site / "mine.toml").write_text(
+        '[truth]\nkind = "file"\npath = "truth.csv"\n[catalog]\npath = "hip.dat"\n[images]\nfolder = "sky"\n'
+    )
+    prepare_recording(folder, load_profile(str(site / "mine.toml")), "")
+    profile, _ = read_run(folder)
+    paths = (profile.catalog.path, profile.images.folder, profile.truth.path)
+    assert [profile.folder / path for path in paths] == [
+        site / "hip.dat",
+        site / "sky",
+        folder / "truth_source.csv",
+    ]
