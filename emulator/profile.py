@@ -312,6 +312,12 @@ class Profile(Strict):
     def _check_date(cls, sky: dict[str, Any]) -> dict[str, Any]:
         return {**sky, "date": unix_time(sky["date"])} if "date" in sky else sky
 
+    @model_validator(mode="after")
+    def _some_use_of_images(self) -> Self:
+        if self.images.used and self.run.worker == "error_model":
+            raise ValueError('images: run.worker = "error_model" uses no images; choose process or thread')
+        return self
+
     @property
     def start_unix_s(self) -> float:
         """Date of the sky, the orbit and the bodies at the start of the run, as Unix time."""

@@ -208,3 +208,8 @@ def test_the_control_channel_answers_as_the_page_shows():
             assert json.loads(given)["ok"] is json.loads(answer)["ok"]
             assert given.startswith(begin), given
             assert given.endswith(end), given
+        lines.write("{}\n")
+        lines.flush()
+        known = json.loads(lines.readline())["error"].removeprefix("do: must be one of ").split(", ")
+    rows = text.partition("| `do` |")[2].partition("\n\n")[0]
+    assert re.findall(r"^\| `(\w+)`", rows, re.MULTILINE) == known

@@ -6,28 +6,10 @@ and nothing was changed.
 
 `--control auto` and `unix:/PATH` listen on a Unix socket that only the user of the emulator can open. HOST:PORT
 listens on TCP, which is open to every local user and, unless on loopback, to the network: every peer can send all
-requests below. With a token (`--control-token`, or STARHIL_CONTROL_TOKEN), each request must contain it as
+requests. With a token (`--control-token`, or STARHIL_CONTROL_TOKEN), each request must contain it as
 `token`. With several heads, `head` in a request selects one; the default is 1, the first.
 
-========================  =======================================================================================
-`do`                      effect, and fields of the answer
-========================  =======================================================================================
-``status``                mode, simulation and device time, seed, clock, frames, counters, faults, truth
-``truth``                 truth at `run_time_s` or `unix_s` (default: now): `quaternion_xyzw`, `ra_deg`, `dec_deg`,
-                          `roll_deg`, `rate_deg_s`, `status`
-``frames``                the last `count` (default 1) measurements, newest last, as rows of the truth log
-``set_truth``             `truth`: a table as `[truth]` in a profile; takes effect at once
-``step``                  `seconds`: advance simulation time (stepped clock only); answered when this is done
-``fault``                 `optical`, `device`, `serial` or `can`: a table of the keys below; omitted keys are off
-``clear_faults``          end all faults
-``scenario``              `name`: run a scenario, a TOML file or a name in configs/scenarios, with times from now on
-``quit``                  end the emulator, like SIGTERM
-========================  =======================================================================================
-
-Keys of faults: `optical`: fields of `starhil.emulator.sky.objects.SkyObjects` (false_stars, missing_stars, moon, …)
-or blocked_share; `device`: stuck (requests are neither counted nor answered), error (a name in the enumeration
-`device_error`: enter the error mode), reset (a name in `reset_cause`: restart now); `serial` and `can` (including
-CANopen): drop, corrupt, junk (probabilities 0 … 1), delay_s, split (bytes per chunk, serial only), gap_s.
+docs/control.md lists the requests.
 """
 
 from __future__ import annotations

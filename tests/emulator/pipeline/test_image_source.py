@@ -161,3 +161,8 @@ def test_a_folder_is_taken_in_the_order_of_its_names(tmp_path, photographs):
 def test_folder_and_camera_exclude_each_other(profile):
     with pytest.raises(EmulatorError, match="exclude each other"):
         load_profile(str(profile), ["images.capture=0"])
+
+
+def test_images_are_not_for_the_error_model(profile):
+    with pytest.raises(EmulatorError, match="uses no images"):
+        load_profile(str(profile), ["run.worker=error_model"])
