@@ -834,7 +834,8 @@ class _Errors(logging.Handler):
 @target("http", lambda: HTTP)
 def _http(_folder: Path) -> Run:
     run_ = _Loop()
-    server = ConsoleServer([console_of(run_)], token="t")
+    server = ConsoleServer([console_of(run_)])
+    server.token = "t"
     host, _, port = (
         run_.call(server.start("127.0.0.1:0")).removeprefix("http://").partition("/")[0].partition(":")
     )
