@@ -836,9 +836,8 @@ def _http(_folder: Path) -> Run:
     run_ = _Loop()
     server = ConsoleServer([console_of(run_)])
     server.token = "t"
-    host, _, port = (
-        run_.call(server.start("127.0.0.1:0")).removeprefix("http://").partition("/")[0].partition(":")
-    )
+    view = run_.call(server.start("127.0.0.1:0"))["view"]
+    host, _, port = view.removeprefix("http://").partition("/")[0].partition(":")
     errors = _Errors()
     logging.getLogger().addHandler(errors)
     logging.getLogger("starhil").addHandler(errors)
