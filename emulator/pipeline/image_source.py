@@ -9,7 +9,7 @@ from typing import Any, Final, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from starhil.emulator.errors import EmulatorError
+from starhil.emulator.errors import EmulatorError, explained
 from starid.camera import Camera
 from starid.imaging.dark_frame import dark_excess, without_dark
 from starid.imaging.image_io import SUFFIXES, grey_of, read_image
@@ -31,13 +31,11 @@ class FolderImages:
     """The images in a folder in the order of their names, one for each exposure."""
 
     def __init__(self, folder: Path, *, repeat: bool) -> None:
-        if not folder.is_dir():
-            raise EmulatorError(
-                f"images.folder: {folder} is not a folder; name one with PNG, TIFF, JPEG or BMP images"
+        remedy = "name a folder with PNG, TIFF, JPEG or BMP images"
+        with explained(f"images.folder: {folder} cannot be read", remedy):
+            self._files = sorted(
+                file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in SUFFIXES
             )
-        self._files = sorted(
-            file for file in folder.iterdir() if file.is_file() and file.suffix.lower() in SUFFIXES
-        )
         self._folder = folder
         self._repeat = repeat
         if not self._files:

@@ -114,7 +114,8 @@ def test_a_dark_frame_is_subtracted_from_each_image(profile, tmp_path, photograp
     ("setting", "message"),
     [
         ("images.folder=empty", "contains no PNG"),
-        ("images.folder=missing", "is not a folder"),
+        ("images.folder=missing", "missing cannot be read (No such file or directory); name a folder"),
+        (f"images.folder={'a' * 300}", "cannot be read (File name too long); name a folder"),
         ("camera.width=512", "400×320 pixels, the camera of the profile has 512×320"),
         ("images.dark=other.png", "dark frame of 20×20"),
     ],
