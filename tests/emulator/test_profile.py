@@ -183,6 +183,7 @@ def test_overrides_are_toml_or_text():
         ),
         ("[run\n", "not TOML"),
         ('extends = "no_such"\n', "no_such"),
+        (f'extends = "{"a" * 300}"\n', "File name too long"),
         ("extends = 3\n", "extends"),
     ],
 )
