@@ -432,7 +432,11 @@ def _read_extended(path: Path, depth: int) -> dict[str, Any]:
         raise EmulatorError(
             f"profile {path}: extends: more than {MAX_EXTENDS_DEPTH} deep; does a profile extend itself?"
         )
-    below = _read_extended(find_toml("profile", base, path.parent), depth + 1)
+    try:
+        extended = find_toml("profile", base, path.parent)
+    except EmulatorError as error:
+        raise EmulatorError(f"profile {path}: extends: {error}") from None
+    below = _read_extended(extended, depth + 1)
     if "camera" in values:
         _drop_calibration(below)
     return merge(below, values)

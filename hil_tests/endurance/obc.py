@@ -218,10 +218,6 @@ class Obc:
             if verdict is None and expected:
                 await self._unknown_outcome(link, request)
                 return
-            if verdict is not ErrorCode.OK:
-                await self.settle(link)
-                if self._fixed_framing:
-                    self._oracle.forget()
         elif verdict not in (None, ErrorCode.OK):
             self._judge_acceptance(sent, link, row)
         elif sum(reply.final for reply in replies) != 1:
@@ -230,6 +226,10 @@ class Obc:
             refused_code = ErrorCode.INTERNAL if nack is not None else ErrorCode.OK
             sure = verdict is not None or not (nack or silent)
             await self._executed(row, request, verdict or refused_code, sure=sure)
+        if silent and nack is None and verdict is not ErrorCode.OK:
+            await self.settle(link)
+            if self._fixed_framing:
+                self._oracle.forget()
         for reply in replies:
             if reply.kind == "telemetry" and verdict in (None, ErrorCode.OK):
                 self._read(what, row, request, reply)

@@ -96,6 +96,15 @@ def test_a_message_of_a_wrong_length_that_nobody_sees_answered_may_be_uncounted(
     assert run_once(Life("nos3", 1, ("serial",), {}, steps)).violation == ""
 
 
+def test_a_refusal_without_an_answer_is_reported_by_telemetry_that_comes_before_the_next_request():
+    steps = (
+        {"do": "request", "link": "can", "row": ["", 104, "telecommand"], "data": "f02fce873c"},
+        {"do": "request", "link": "serial", "row": ["", 119, "telecommand"], "data": "1400"},
+    )
+    profile = {"parameters": {"start_mode": "standby"}}
+    assert run_once(Life("cubestar", 1, ("serial", "can"), profile, steps)).violation == ""
+
+
 def test_a_value_that_the_object_dictionary_refuses_may_be_uncounted():
     mode = {"do": "request", "link": "canopen", "row": ["", 96, "telecommand"], "data": "e7"}
     reads = [
