@@ -192,11 +192,8 @@ def check_length(entry: Entry, length: int) -> None:
 
 def check_value(variable: ODVariable, data: bytes) -> None:
     """Reject NaN, and a number outside the variable's limits or named values."""
-    data_type = variable.data_type or 0
-    if type_size(data_type) is None or data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
+    if type_size(variable.data_type) is None:
         return
-    if data_type == datatypes.BOOLEAN and data not in {b"\0", b"\1"}:
-        raise SdoAbortError(AbortCode.VALUE_HIGH, f"{variable.qualname} takes 0 or 1")
     value = variable.decode_raw(data)
     if not isinstance(value, int | float):
         return

@@ -3,6 +3,7 @@
 import asyncio
 import math
 import socket
+import struct
 
 import pytest
 
@@ -45,6 +46,14 @@ doc = "d"
 provenance = "ours"
 action = "nothing"
 fields = [{ name = "text", type = "text", size = 4 }]
+
+[[telecommand]]
+id = 3
+name = "turn"
+doc = "d"
+provenance = "ours"
+action = "nothing"
+fields = [{ name = "angle", type = "f32", scale = 0.5, offset = 10, min = -10, max = 30 }]
 """
 
 
@@ -60,6 +69,16 @@ def test_a_float_outside_its_limits_is_refused_when_received(icd, value):
     data = row.encode({"single": value, "double": 0.0, "centi": 0.0}, check=False)
     with pytest.raises(FieldError, match="outside"):
         row.decode(data)
+
+
+@pytest.mark.parametrize(
+    ("value", "raw", "read"), [(11.0, 2.0, 11.0), (-99.0, -40.0, -10.0), (99.0, 40.0, 30.0)]
+)
+def test_a_float_is_scaled_and_sent_as_the_nearest_limit(icd, value, raw, read):
+    row = icd.telecommands["turn"]
+    data = row.encode({"angle": value}, saturate=True)
+    assert struct.unpack("<f", data) == (raw,)
+    assert row.decode(data) == {"angle": read}
 
 
 def test_a_double_without_limits_may_exceed_single_precision(icd):

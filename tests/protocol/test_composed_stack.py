@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import ErrorCode, FaultKind, Reply, ReplyKind, Request
+from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
 from starhil.protocol.values import IcdError
 from tests.protocol.composed_links import (
     ALL_REPLIES,
@@ -84,6 +84,15 @@ def test_nos3_request_and_replies_have_the_published_bytes() -> None:
     assert NOS3.encode_reply(Reply.echo(request)) == NOS3.encode_request(request)
     reply = Reply(ReplyKind.TELEMETRY, 2, bytes(9), klass="telemetry")
     assert NOS3.encode_reply(reply).hex().upper() == "DEAD" + "00" * 9 + "BEEF"
+
+
+def test_start_in_pieces_is_not_lost_after_junk() -> None:
+    request = NOS3.encode_request(REQUESTS["nos3"][0])
+    for split in range(1, 4):
+        device = NOS3.device()
+        first = list(device.feed(b"\x00" + request[:split], 0.0))
+        rest = list(device.feed(request[split:], 0.0))
+        assert [type(event) for event in first + rest] == [LinkFault, Request]
 
 
 def test_nsp_reply_swaps_the_addresses_and_sets_ack_and_final() -> None:

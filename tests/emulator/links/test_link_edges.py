@@ -9,7 +9,7 @@ from starhil.emulator.clock import SteppedClock
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
-from starhil.emulator.links.serial import SerialDamage, SerialLink
+from starhil.emulator.links.serial import JUNK_BYTES, SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
 from starhil.protocol.can_framing import CanFrame
@@ -20,6 +20,12 @@ from starhil.protocol.serial_stack import build_serial_stack
 from tests.emulator.wire import Wire
 
 NODE = 44
+
+
+def test_junk_is_a_few_random_bytes():
+    rng = random.Random(1)
+    sizes = {len(SerialDamage().junk(rng)) for _ in range(200)}
+    assert sizes == set(range(1, JUNK_BYTES + 1))
 
 
 def test_damage_changes_every_byte_string():

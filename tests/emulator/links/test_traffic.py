@@ -7,7 +7,7 @@ import pytest
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect
 from tests.protocol.composed_links import CUBESPACE
 
@@ -24,6 +24,7 @@ def sent(item):
 
 LINES = {
     "an 11-bit frame": ("cubestar", CanFrame(0x62C, b"\x40\x18\x10", extended=False), ("canopen", "node 44 SDO request", "62C#401810")),
+    "an RPDO": ("cubestar", CanFrame(0x22C, b"\1", extended=False), ("canopen", "node 44 RPDO 1", "22C#01")),
     "a remote frame": ("cubestar", CanFrame(0x72C, extended=False, remote=True), ("canopen", "node 44 heartbeat", "72C#R")),
     "an acknowledge": ("cubestar", ACK, ("ack", "set_mode accepted", ACK.hex(" ").upper())),
     "a 29-bit frame without CAN": ("nos3", CanFrame(0x08AA0401, b"\1"), ("part", "29-bit frame", "08AA0401#01")),
@@ -37,6 +38,18 @@ def test_what_passes_is_named_as_far_as_the_unit_has_such_a_link(name):
     line = Decoder(load_unit(unit), lambda: Dialect.A).line(sent(item))
     assert (line["kind"], line["text"], line["raw"]) == expected
     assert not line["own"]
+
+
+def test_a_reply_without_an_id_is_that_to_the_last_request():
+    decoder = Decoder(ICD, lambda: Dialect.B)
+    asked = CUBESPACE.encode_request(Request(RequestKind.TELEMETRY, STATUS.id))
+    reply = Reply(ReplyKind.TELEMETRY, STATUS.id, STATUS.encode(STATUS.example(), saturate=True))
+    answer = CUBESPACE.encode_reply(reply, Dialect.B)
+    kinds = [
+        decoder.line(WireItem(0.0, "serial", outgoing=item is answer, item=item))["text"]
+        for item in (asked, answer)
+    ]
+    assert all(STATUS.name in text for text in kinds), kinds
 
 
 def test_frames_between_the_console_and_the_unit_are_its_own():

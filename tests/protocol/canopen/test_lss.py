@@ -72,6 +72,12 @@ def test_node_id_is_cleared_at_the_reset(bench):
     assert lss(bench, "4c") == ["5000000000000000"]
 
 
+@pytest.mark.parametrize("node_id", [1, 127])
+def test_first_and_last_node_id(bench, node_id):
+    lss(bench, "04 01")
+    assert lss(bench, bytes([0x11, node_id])) == ["1100000000000000"]
+
+
 @pytest.mark.parametrize("node_id", [0, 128, 200, 254])
 def test_node_id_out_of_range(bench, node_id):
     lss(bench, "04 01")

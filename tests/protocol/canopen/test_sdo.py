@@ -5,6 +5,7 @@ from __future__ import annotations
 from binascii import crc_hqx
 from unittest.mock import Mock
 
+import canopen
 import pytest
 
 from starhil.protocol.canopen import AbortCode, Deferred, SdoAbortError
@@ -535,3 +536,7 @@ def test_request_out_of_place_while_waiting(bench, later):
     bench.sdo("2f 00 60 00 02")
     assert bench.sdo("60") == abort("006000", AbortCode.COMMAND)
     assert finish(bench, later) == []
+
+
+def test_abort_codes_are_those_of_the_library():
+    assert {int(code) for code in AbortCode} <= set(canopen.SdoAbortedError.CODES)
