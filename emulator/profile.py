@@ -310,7 +310,10 @@ class Profile(Strict):
     @field_validator("sky")
     @classmethod
     def _check_date(cls, sky: dict[str, Any]) -> dict[str, Any]:
-        return {**sky, "date": unix_time(sky["date"])} if "date" in sky else sky
+        try:
+            return {**sky, "date": unix_time(sky["date"])} if "date" in sky else sky
+        except ValueError as error:
+            raise ValueError(f"date: {error}") from None
 
     @model_validator(mode="after")
     def _some_use_of_images(self) -> Self:

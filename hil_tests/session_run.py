@@ -97,14 +97,12 @@ def run_session(request: SessionRequest) -> SessionResult:
             bench = _open_bench(request, script, options, icd, folder, stack)
             show = _shown_on_console(request.view, script, bench, stack, show)
             result = SessionRunner(script, bench, folder, on_result=show, truth_path=request.truth).run()
+        if all(step.status == SKIPPED for step in result.results) and result.interruption is None:
+            result = _failed(result, "at least one step runs", "every step is skipped", show)
     except EmulatorProcessError as error:
         if result is None:
             raise
-        end = StepResult(
-            len(script.steps) + 1, "the emulator runs until it is ended", "", FAILED, str(error), 0.0
-        )
-        show(end)
-        result = replace(result, results=(*result.results, end))
+        result = _failed(result, "the emulator runs until it is ended", str(error), show)
     except Interrupted as interruption:  # before the first step, or after the last one
         if result is None:
             reason = f"not run: {interruption.reason}"
@@ -116,6 +114,15 @@ def run_session(request: SessionRequest) -> SessionResult:
     if not request.quiet:
         _print_summary(result, folder)
     return result
+
+
+def _failed(
+    result: SessionResult, name: str, detail: str, show: Callable[[StepResult], None]
+) -> SessionResult:
+    """Return a result with one more step, which has failed."""
+    end = StepResult(result.results[-1].number + 1, name, "", FAILED, detail, 0.0)
+    show(end)
+    return replace(result, results=(*result.results, end))
 
 
 def _open_bench(
@@ -196,7 +203,7 @@ def _emulator(
         truth_log = folder / script.truth.file
     return EmulatorProcess(
         emulator_command(
-            profile=request.profile or wanted.profile,
+            profile=request.profile or _beside(wanted.profile, request.script),
             unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
@@ -208,6 +215,14 @@ def _emulator(
             extra=["--view", "auto"] if request.view == "auto" else (),
         )
     )
+
+
+def _beside(profile: str | None, script: Path) -> str | None:
+    """Return the profile of a script: the file that its relative path names beside the script, or else its name."""
+    if profile is None:
+        return None
+    path = find_script(script).parent / profile
+    return str(path) if path.is_file() else profile
 
 
 def _pointed(script: Script) -> list[str]:

@@ -41,7 +41,7 @@ class Names(dict[str, _Item]):
         self._what = what
 
     def __missing__(self, name: str) -> _Item:
-        hint = did_you_mean(name, self) or "; `starhil icd export markdown` lists all"
+        hint = did_you_mean(name, self) or "; `starhil icd list` lists all"
         raise UnknownNameError(f"no {self._what} named {name!r} in the interface definition{hint}")
 
 

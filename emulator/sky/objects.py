@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final, Self
@@ -16,6 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.names import did_you_mean
 from starid.arrays import Array
 
 _MAX_OBJECTS: Final = 100_000
@@ -230,6 +231,15 @@ def _pair(name: str, value: Any) -> tuple[float, float]:
     return (value[0], value[1])
 
 
+def check_keys(where: str, given: Iterable[str], known: Iterable[str], taken: Iterable[str] = ()) -> None:
+    """Reject an unknown key; the error suggests similar known ones, or lists all, with those `taken` already."""
+    unknown = sorted(set(given) - set(known))
+    if unknown:
+        possible = sorted({*known, *taken})
+        hint = did_you_mean(unknown[0], possible) or f"; known: {', '.join(possible)}"
+        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}{hint}")
+
+
 def _from_table(name: str, kind: Any, values: Any) -> Any:
     """Make an object of class `kind` from a table; an instance is returned unchanged."""
     where = f"sky {name}".strip()
@@ -238,9 +248,7 @@ def _from_table(name: str, kind: Any, values: Any) -> Any:
     if not isinstance(values, Mapping):
         raise EmulatorError(f"{where}: must be a table, not {values!r}")
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    unknown = sorted(values.keys() - fields.keys())
-    if unknown:
-        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}; known: {', '.join(sorted(fields))}")
+    check_keys(where, values, fields, () if name else ("blocked_share",))
     required = {key for key, field in fields.items() if field.default is dataclasses.MISSING}
     missing = sorted(required - values.keys())
     if missing:

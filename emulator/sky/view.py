@@ -17,7 +17,7 @@ from starhil.emulator.sky.ephemeris import (
     planets_seen_by,
     sun_seen_by,
 )
-from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare
+from starhil.emulator.sky.objects import EarthLimb, Moon, SkyObjects, SunGlare, check_keys
 
 BODIES: Final = ("typed", "ephemeris")
 """Where Sun, Moon, Earth and planets are: only where they are typed in, or where the date puts them."""
@@ -146,9 +146,7 @@ def _styled(name: str, style: Any, fields: dict[str, Any], *, by_date: bool) -> 
         )
     del fields[name]
     place = dataclasses.asdict(style)
-    unknown = sorted(table.keys() - place.keys())
-    if unknown:
-        raise EmulatorError(f"sky {name}: unknown key {unknown[0]!r}; known: {', '.join(sorted(place))}")
+    check_keys(f"sky {name}", table, place)
     changed = dataclasses.replace(style, **table)
     SkyObjects(**{name: changed})
     return changed

@@ -56,6 +56,25 @@ def test_a_session_whose_expectation_does_not_hold_ends_with_status_1(emulator, 
     assert done.stderr == ""
 
 
+def test_a_session_of_which_no_step_runs_fails(emulator, tmp_path):
+    script, junit = tmp_path / "other.toml", tmp_path / "junit.xml"
+    script.write_text("[[step]]\nread = 'identification'\nlink = 'can'\n")
+    words = ("--serial", emulator.ready["serial"], "--log", tmp_path, "--junit", junit)
+    done = starhil("session", script, *words)
+    assert done.returncode == 1
+    assert "needs a can link" in done.stdout
+    assert (ET.parse(junit).getroot().get("failures"), "every step is skipped" in done.stdout) == ("1", True)
+
+
+def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
+    (tmp_path / "mine.toml").write_text("[run]\nwrong = 1\n")
+    script = tmp_path / "script.toml"
+    script.write_text("[emulator]\nprofile = 'mine.toml'\n[[step]]\nwait_s = 0\n")
+    monkeypatch.chdir("/")
+    done = starhil("session", script, "--start", "--serial", "auto", "--log", tmp_path / "log")
+    assert f"{tmp_path / 'mine.toml'}: run.wrong: unknown key" in done.stderr
+
+
 @pytest.mark.parametrize(
     ("text", "words", "message"),
     [
