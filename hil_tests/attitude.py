@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.conventions import Conventions
 
 ARCSEC_PER_RAD: Final = math.degrees(1.0) * 3600.0
 _NORM_TOLERANCE: Final = 0.02
@@ -75,6 +76,18 @@ def conjugate(q: Sequence[float]) -> Quaternion:
     """Return the inverse of a unit quaternion."""
     x, y, z, w = q
     return Quaternion(-x, -y, -z, w)
+
+
+def as_reported(attitude: Quaternion, conventions: Conventions) -> Quaternion:
+    """Return an attitude from ICRS to the sensor with the direction and axes of a unit's `[conventions]`."""
+    turned = product(from_matrix(conventions.rows), attitude)
+    return conjugate(turned) if conventions.quaternion == "attitude" else turned
+
+
+def from_reported(reported: Quaternion, conventions: Conventions) -> Quaternion:
+    """Return the attitude from ICRS to the sensor that a unit reports; the inverse of `as_reported`."""
+    turned = conjugate(reported) if conventions.quaternion == "attitude" else reported
+    return product(conjugate(from_matrix(conventions.rows)), turned)
 
 
 def from_radec_roll(ra_deg: float, dec_deg: float, roll_deg: float) -> Quaternion:

@@ -8,8 +8,16 @@ import socket
 import time
 from typing import Any, Final, Self
 
-from starhil.hil_tests.attitude import AttitudeError, Quaternion, attitude_error, unit
+from starhil.hil_tests.attitude import (
+    AttitudeError,
+    Quaternion,
+    as_reported,
+    attitude_error,
+    from_reported,
+    unit,
+)
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.conventions import Conventions
 
 __tracebackhide__ = operator.methodcaller(
     "errisinstance", BenchError
@@ -86,10 +94,11 @@ class ControlClient:
 
 
 class Truth:
-    """The true attitude of the emulated sensor."""
+    """The true attitude of the emulated sensor, whose unit has these conventions."""
 
-    def __init__(self, control: ControlClient) -> None:
+    def __init__(self, control: ControlClient, conventions: Conventions) -> None:
         self._control = control
+        self._conventions = conventions
 
     def set(self, **truth: Any) -> None:
         """Replace the truth; the keys are those of `[truth]` in a profile, such as `kind`."""
@@ -104,6 +113,11 @@ class Truth:
         keys = {} if unix_s is None else {"unix_s": unix_s}
         return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
 
+    def reported(self) -> Quaternion:
+        """Return the attitude now, as the unit reports attitudes."""
+        return as_reported(self.attitude(), self._conventions)
+
     def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeError:
-        """Return the error of an attitude measured at a time of the device's clock."""
-        return attitude_error(unit(quaternion_xyzw), self.attitude(unix_s))
+        """Return the error of an attitude as the unit reports it, measured at a time of the device's clock."""
+        measured = from_reported(unit(quaternion_xyzw), self._conventions)
+        return attitude_error(measured, self.attitude(unix_s))

@@ -22,12 +22,14 @@ from starhil.hil_tests.attitude import (
     Quaternion,
     attitude_error,
     from_radec_roll,
+    from_reported,
     from_vector_part,
     to_radec_roll,
     unit,
     wrapped_difference,
 )
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.conventions import Conventions
 from starhil.protocol.names import did_you_mean
 from starhil.protocol.values import Value
 
@@ -248,11 +250,11 @@ class AttitudeCheck(StatedAttitude):
         return self
 
     def judge(
-        self, values: Mapping[str, Value], truth: Quaternion
+        self, values: Mapping[str, Value], truth: Quaternion, conventions: Conventions
     ) -> tuple[AttitudeError | None, str | None]:
-        """Return the attitude error of telemetry `values`, and the problem or None."""
+        """Return the error of the attitude in telemetry `values` of a unit with these conventions, and the problem or None."""
         try:
-            measured = measured_attitude(values)
+            measured = from_reported(measured_attitude(values), conventions)
         except BenchError as refusal:
             return None, str(refusal)
         error = attitude_error(measured, truth)
@@ -285,7 +287,7 @@ def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
 
     Raises BenchError: the attitude in the row is flagged invalid, or there is none.
     """
-    if values.get("valid") is False:
+    if values.get("valid") in (False, "false"):  # a flag, or a member of a map
         raise BenchError(f"the attitude is not valid (reason {show(values.get('reason', '?'))})")
     parts = [float(values[key]) for key in ("q_x", "q_y", "q_z")]
     if "q_w" in values:

@@ -187,8 +187,10 @@ def starhil_control(starhil_emulator: EmulatorProcess) -> Iterator[ControlClient
 
 
 @pytest.fixture
-def starhil_truth(starhil_control: ControlClient) -> Truth:
+def starhil_truth(starhil_control: ControlClient, starhil_emulator: EmulatorProcess) -> Truth:
     """Return the truth of the emulator: `point`, `set`, `attitude` and `error`."""
     from starhil.hil_tests.control import Truth
+    from starhil.protocol.icd import load_unit
+    from starhil.protocol.unit_folders import DEFAULT_UNIT
 
-    return Truth(starhil_control)
+    return Truth(starhil_control, load_unit(starhil_emulator.unit or DEFAULT_UNIT).conventions)

@@ -359,7 +359,7 @@ class SessionRunner:
             if "time_of_exposure" not in reading.values:
                 raise BenchError(f"step {step.number}: {reading.name} has no time; read precise_attitude")
             truth = self._truth_log.at(float(reading["time_of_exposure"]))
-        error, problem = check.judge(reading.values, truth)
+        error, problem = check.judge(reading.values, truth, self._bench.icd.conventions)
         if error is not None:
             attempt.figures.update(vars(error))
             attempt.detail += f" error: {show_angle(error.cross_boresight_arcsec)} cross, {show_angle(error.roll_arcsec)} roll"

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final, Protocol, Self
+from typing import Final, Protocol, Self
 
-from starhil.hil_tests.attitude import Quaternion, attitude_error, conjugate, from_matrix, product, unit
+from starhil.hil_tests.attitude import Quaternion, attitude_error, unit
 from starhil.hil_tests.conformance.case import CaseSkipped, check
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
@@ -23,12 +23,6 @@ STANDBY: Final = "standby"
 
 TruthSource = Callable[[], Quaternion]
 """Returns the true attitude at present, as the unit reports attitudes."""
-
-
-def as_reported(attitude: Quaternion, conventions: Any) -> Quaternion:
-    """Return an attitude from ICRS to the sensor with the direction and axes of a unit's `[conventions]`."""
-    turned = product(from_matrix(conventions.rows), attitude)
-    return conjugate(turned) if conventions.quaternion == "attitude" else turned
 
 
 class RowAccess(Protocol):

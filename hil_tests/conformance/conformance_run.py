@@ -6,13 +6,10 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starhil.hil_tests.attitude import Quaternion
-from starhil.hil_tests.conformance.attitude_cases import as_reported
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
@@ -107,10 +104,6 @@ class ConformanceResult:
     """The signal that interrupted the run, if any."""
 
 
-def _reported_truth(source: Truth, unit: Unit) -> Quaternion:
-    return as_reported(source.attitude(), unit.conventions)
-
-
 def _facts(request: ConformanceRequest, unit: Unit) -> dict[str, str]:
     links = [
         f"serial {request.serial}" + (f" (dialect {request.dialect})" if request.dialect else "")
@@ -155,8 +148,8 @@ def run_conformance(
             if emulator is not None:
                 ports = emulator.ready
                 if "control" in emulator.ready:
-                    source = Truth(stack.enter_context(ControlClient(emulator.ready["control"])))
-                    truth = partial(_reported_truth, source, unit)
+                    control = stack.enter_context(ControlClient(emulator.ready["control"]))
+                    truth = Truth(control, unit.conventions).reported
             shown: Callable[[Outcome], None] = record
             if request.view is not None:
                 address = console_address(request.view, emulator)

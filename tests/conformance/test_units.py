@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.attitude import conjugate, from_radec_roll
-from starhil.hil_tests.conformance.attitude_cases import as_reported
+from starhil.hil_tests.attitude import as_reported, conjugate, from_radec_roll
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, canopen_suite
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pydantic import TypeAdapter
 
-from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.attitude import as_reported, from_radec_roll
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.expect import (
     AttitudeCheck,
@@ -15,6 +15,9 @@ from starhil.hil_tests.expect import (
     measured_attitude,
     show,
 )
+from starhil.protocol.conventions import Conventions
+
+SENSOR = Conventions()
 
 
 def expectation(value, known=()):
@@ -86,13 +89,13 @@ def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
     truth = from_radec_roll(10.0, 20.0, 30.0)
     off = from_radec_roll(10.0, 20.0 + 10.0 / 3600.0, 30.0)
     values = dict(zip(("q_x", "q_y", "q_z", "q_w"), off, strict=True)) | {"valid": True, "reason": "ok"}
-    error, problem = AttitudeCheck(within_arcsec=10.1).judge(values, truth)
+    error, problem = AttitudeCheck(within_arcsec=10.1).judge(values, truth, SENSOR)
     assert problem is None
     assert error.cross_boresight_arcsec == pytest.approx(10.0, abs=1e-6)
-    _, problem = AttitudeCheck(within_arcsec=9.9).judge(values, truth)
+    _, problem = AttitudeCheck(within_arcsec=9.9).judge(values, truth, SENSOR)
     assert problem == "cross-boresight error 10.0 arcsec, expected at most 9.9 arcsec"
     error, problem = AttitudeCheck(within_arcsec=1e9).judge(
-        values | {"valid": False, "reason": "no_match"}, truth
+        values | {"valid": False, "reason": "no_match"}, truth, SENSOR
     )
     assert error is None
     assert "no_match" in problem
@@ -101,7 +104,7 @@ def test_an_attitude_is_judged_in_arcseconds_and_an_invalid_one_fails():
 def test_a_large_error_is_given_in_degrees_with_both_attitudes():
     truth, measured = from_radec_roll(83.8, -1.2, 30.0), from_radec_roll(133.3438, -1.2, 30.0)
     values = dict(zip(("q_x", "q_y", "q_z", "q_w"), measured, strict=True))
-    _, problem = AttitudeCheck(within_arcsec=60.0).judge(values, truth)
+    _, problem = AttitudeCheck(within_arcsec=60.0).judge(values, truth, SENSOR)
     assert problem == (
         "cross-boresight error 49.532 deg, expected at most 60 arcsec; measured RA 133.3438, Dec -1.2000, "
         "roll 30.0000 deg, true RA 83.8000, Dec -1.2000, roll 30.0000 deg"
@@ -111,3 +114,21 @@ def test_a_large_error_is_given_in_degrees_with_both_attitudes():
 def test_an_all_zero_quaternion_is_not_an_attitude():
     with pytest.raises(BenchError, match="length is 0"):
         measured_attitude({"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 0.0})
+
+
+@pytest.mark.parametrize("valid", [True, "true"])
+def test_an_attitude_is_compared_as_the_unit_reports_it(valid):
+    truth = from_radec_roll(83.8, -1.2, 30.0)
+    conventions = Conventions(quaternion="attitude", axes=["+y", "-x", "+z"])
+    reported = as_reported(truth, conventions)
+    values = dict(zip(("q_x", "q_y", "q_z", "q_w"), reported, strict=True)) | {"valid": valid}
+    check = AttitudeCheck(within_arcsec=0.01, roll_within_arcsec=0.01)
+    assert check.judge(values, truth, conventions)[1] is None
+    for other in (SENSOR, Conventions(quaternion="attitude"), Conventions(axes=["+y", "-x", "+z"])):
+        assert "expected at most" in check.judge(values, truth, other)[1]
+
+
+def test_an_attitude_that_a_map_calls_invalid_is_not_compared():
+    values = {"q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 1.0, "valid": "false"}
+    with pytest.raises(BenchError, match="not valid"):
+        measured_attitude(values)
