@@ -415,6 +415,7 @@ def unit_definition() -> str:
         'check = { kind = "none" }': link_schema.NoCheck,
         'check = { kind = "sum" }': link_schema.SumCheck,
         'check = { kind = "xor" }': link_schema.XorCheck,
+        'check = { kind = "fletcher16" }': link_schema.FletcherCheck,
         'check = { kind = "crc" }': link_schema.CrcCheck,
         'check = { kind = "xxh32" }': link_schema.XxHashCheck,
         'check = { kind = "custom" }': link_schema.CustomCheck,
