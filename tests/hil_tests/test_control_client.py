@@ -12,6 +12,7 @@ import pytest
 from starhil.hil_tests import control
 from starhil.hil_tests.control import ControlClient, Truth
 from starhil.hil_tests.errors import BenchError
+from starhil.protocol.conventions import Conventions
 
 Answer = Callable[[dict], dict | None]
 
@@ -65,7 +66,7 @@ def test_a_channel_on_a_socket_in_a_folder_is_used(tmp_path):
         server.listen()
         Channel(server, lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
         with ControlClient(f"unix:{path}") as client:
-            assert Truth(client).attitude() == (0.0, 0.0, 0.0, 1.0)
+            assert Truth(client, Conventions()).attitude() == (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -118,7 +119,7 @@ def test_a_device_that_does_not_boot_is_reported(channel, monkeypatch):
 def test_the_truth_is_set_and_read_at_a_time(channel):
     served, address = channel(lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
     with ControlClient(address) as client:
-        truth = Truth(client)
+        truth = Truth(client, Conventions())
         truth.point(83.8, -1.2, 30.0)
         assert truth.error([0.0, 0.0, 0.0, 1.0], 5.0).total_arcsec == 0.0
     attitude = {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 30.0}
