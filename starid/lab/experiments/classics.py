@@ -214,10 +214,9 @@ def _figures(e: Evaluation, lines: list[dict[str, Any]]) -> None:
             rates = [line for line in members if line["sky"] == sky]
             curves = curves_of(rates, "level", "identified_percent", lambda line: SHORT[line["algorithm"]])
             settings = {"xlabel": label, "ylabel": "identified / %", "xticks": range(4), "ylim": (0, 102)}
-            shown.append(Panel(_SKY_LABELS[sky], [*curves, *known], settings, "best"))
-        e.draw(
-            f"figure_6_{number}_classics.png", shown, columns=len(shown), width=5.5 * len(shown), height=4.4
-        )
+            shown.append(Panel(_SKY_LABELS[sky], [*curves, *known], settings))
+        look = {"columns": len(shown), "width": 5.5 * len(shown), "height": 4.4, "legend": "best"}
+        e.draw(f"figure_6_{number}_classics.png", shown, **look)
 
 
 def evaluate(e: Evaluation) -> None:

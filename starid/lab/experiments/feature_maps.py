@@ -32,7 +32,7 @@ def _features(centres: Array, kappa: float) -> Array:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without stars."""
     from starid.thesis.frame_sky import cell_features
 
-    sky = planar_sky(kappa, "faintest", FRAME_DEG)
+    sky = planar_sky(kappa=kappa, fov_deg=FRAME_DEG)
     table = np.full((len(centres), 6), np.nan)
     sums, out = np.empty(8), np.empty(5)
     for i, (ra, dec) in enumerate(centres):

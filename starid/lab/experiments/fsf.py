@@ -13,7 +13,7 @@ from starid.arrays import Mask
 from starid.lab.experiments.author_noise import filter_noise
 from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Curve, panels
+from starid.lab.experiments.figures import Curve
 from starid.lab.experiments.tables import CONFUSION
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
 from starid.plots import colours
@@ -219,10 +219,10 @@ def _figures(e: Evaluation) -> None:
                 author = list(np.nanmean(distances[..., _DISTANCES.index(name)], axis=(1, 2)))
             curves.append((panel, Curve(FACTORS, author, "-o", f"f = {f}", colour | {"markersize": 3})))
         label = f"{name} / %" if name in _INDICATORS else f"mean {name} / °"
-        shown = panels(curves, xlabel="noise factor μ", ylabel=label)
-        size = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
+        axes = {"xlabel": "noise factor μ", "ylabel": label}
+        look = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
         title = f"{name}, as the author ran it (dotted: published)"
-        e.draw(f"figure_6_{number}.png", shown, title=title, **size)
+        e.draw(f"figure_6_{number}.png", curves, axes=axes, title=title, **look)
 
 
 def _compare_tables(e: Evaluation) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Curve, Panel, curves_of, panels
+from starid.lab.experiments.figures import Curve, Panel, curves_of, plane_axes
 from starid.lab.experiments.fsf import (
     RADIUS_DEG,
     author_distances,
@@ -68,10 +68,10 @@ def evaluate_choice(e: Evaluation) -> None:
         by_share, "share", "lost_stars", lambda line: f"lost a frame, ε = {line['epsilon']:g}"
     )
     shown = [
-        Panel("", curves, {"xlabel": "ε (min_samples = 3)"}, "best"),
-        Panel("", lost_stars, {"xlabel": "min_samples / number of objects"}, "best"),
+        Panel("", curves, {"xlabel": "ε (min_samples = 3)"}),
+        Panel("", lost_stars, {"xlabel": "min_samples / number of objects"}),
     ]
-    e.draw("figure_6_12.png", shown, columns=2)
+    e.draw("figure_6_12.png", shown, columns=2, legend="best")
     chosen = lines["share0.5-eps0.4"]
     quantity = "stars lost a frame, ε = 0.4, min_samples = 0.5·n, position noise 0.1°"
     e.compare(quantity, printed=chosen["lost_stars"])
@@ -128,9 +128,8 @@ def _draw_reconstruction(e: Evaluation) -> None:
         (x, y), (moved_x, moved_y) = second.positions[now].T, motion.apply(first.positions[before]).T
         curves.append((title, Curve(x, y, "o", "stars", {"fillstyle": "none"})))
         curves.append((title, Curve(moved_x, moved_y, "+", "reconstructed")))
-    limits = (-RADIUS_DEG, RADIUS_DEG)
-    shown = panels(curves, "upper right", xlabel="x / °", ylabel="y / °", xlim=limits, ylim=limits)
-    e.draw("figure_6_13.png", shown, columns=2, width=9.5, height=4.6, sharey=True)
+    look = {"columns": 2, "width": 9.5, "height": 4.6, "legend": "upper right", "sharey": True}
+    e.draw("figure_6_13.png", curves, axes=plane_axes(RADIUS_DEG), **look)
 
 
 def compute_correlation(context: Context, part: Part) -> Results:
@@ -169,8 +168,8 @@ def evaluate_correlation(e: Evaluation) -> None:
         trials = np.arange(min(50, len(motion)))
         for values, name in zip(motion[:50].T, ("μ_d", "σ_d"), strict=True):
             curves.append((f"μ = f = {factor}", Curve(trials, values, "-", f"{name} / °")))
-    shown = panels(curves, "upper right", xlabel="trial")
-    e.draw("figures_6_31_6_32_d.png", shown, height=1.6 * len(shown))
+    look = {"height": 1.6 * len(e.parts), "legend": "upper right"}
+    e.draw("figures_6_31_6_32_d.png", curves, axes={"xlabel": "trial"}, **look)
     e.write("table_6_5.csv", lines)
 
 

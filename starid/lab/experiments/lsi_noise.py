@@ -12,7 +12,7 @@ import numpy as np
 from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.comparison import Readings
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Curve, Panel, curves_of, panels, precision, precision_axes
+from starid.lab.experiments.figures import Curve, Panel, curves_of, precision, precision_axes
 from starid.lab.experiments.lsi_patterns import add_patterns
 from starid.lab.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label, share, solve_frames
 from starid.lab.simulation import NoiseModel
@@ -95,9 +95,10 @@ def _noise_figure(e: Evaluation, grid: str, quantity: str, reading: str) -> None
             _KINDS.items(), limits, cases
         )
     )
-    shown = panels(curves, "lower right", **precision_axes(f"{symbol} (MSE)"))
-    title = f"As {'the author ran it' if author else 'printed'}, frames {GRID_LABELS[grid]}"
-    e.draw(f"figure_6_{number}_{grid}_{reading}.png", shown, title=title, columns=2, width=8.5, height=9.0)
+    axes, title = precision_axes(f"{symbol} (MSE)"), "As the author ran it" if author else "As printed"
+    look = {"columns": 2, "width": 8.5, "height": 9.0, "legend": "lower right"}
+    title += f", frames {GRID_LABELS[grid]}"
+    e.draw(f"figure_6_{number}_{grid}_{reading}.png", curves, axes=axes, title=title, **look)
 
 
 def _false_figure(e: Evaluation) -> None:
@@ -109,8 +110,8 @@ def _false_figure(e: Evaluation) -> None:
         for grid, kind, count in itertools.product((ON, OFF), ("false", "missing"), range(4))
         if (key := _key(kind, count, grid)) in e.results
     )
-    shown = panels(curves, "center right", **precision_axes("ε_f (MSE)"))
-    e.draw("figure_6_8.png", shown, columns=2, width=8.5, height=6.6, sharey=True)
+    look = {"columns": 2, "width": 8.5, "height": 6.6, "sharey": True, "legend": "center right"}
+    e.draw("figure_6_8.png", curves, axes=precision_axes("ε_f (MSE)"), **look)
 
 
 def _rate_figures(e: Evaluation) -> None:
@@ -145,8 +146,8 @@ def _rate_figures(e: Evaluation) -> None:
             mark = {"ms": 8, "color": "red"}
             curves.append(Curve(list(known), list(known.values()), "x", "published (on the grid)", mark))
         words = f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %"
-        panel = Panel("", curves, {"xlabel": label, "ylabel": words, "xticks": range(4)}, "best")
-        e.draw(f"figure_6_{number}.png", [panel], width=6.0, height=4.0)
+        panel = Panel("", curves, {"xlabel": label, "ylabel": words, "xticks": range(4)})
+        e.draw(f"figure_6_{number}.png", [panel], width=6.0, height=4.0, legend="best")
 
 
 def _readings(e: Evaluation, kind: str, level: float, limit: float, grid: str) -> Readings:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from starid.lab.experiments.experiment import Evaluation, Part
-from starid.lab.experiments.figures import Curve, Panel, panels, precision, precision_axes
+from starid.lab.experiments.figures import Curve, Panel, precision, precision_axes
 from starid.lab.experiments.rsi_trials import BY_TABLE, FIELDS, LSI_ONLY, method_of, noise_label
 
 _SHOWN: Final = 40
@@ -28,10 +28,10 @@ def draw_sequences(e: Evaluation, parts: Sequence[Part], settling: int) -> None:
             if (part.values["scale"] == scale or part.values["factor"] == 0)
             and part.values["overlap"] == overlap
         )
-        shown = panels(curves, "lower right", **precision_axes("ε_f"))
         title = f"Figures 6.37 to 6.41 and F: p = {100 * overlap:g} %, {noise_label(scale)}"
         name = f"figures_6_37_to_6_41_and_f_p{100 * overlap:g}_x{scale:g}.png"
-        e.draw(name, shown, columns=2, width=9.0, height=7.0, title=title, sharey=True)
+        look = {"columns": 2, "width": 9.0, "height": 7.0, "sharey": True, "legend": "lower right"}
+        e.draw(name, curves, axes=precision_axes("ε_f"), title=title, **look)
     last = [part for part in parts if part.values["overlap"] == e.parameters["overlaps"][-1]]
     _draw_frames(
         e,
