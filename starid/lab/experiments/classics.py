@@ -123,7 +123,7 @@ def _solver(sky: ThesisSky, name: str) -> Any:
 
 def compute(context: Context, part: Part) -> Results:
     """ε_f and times of each case (n,), and size and build time of the database."""
-    sky, name = thesis_sky(part.values["sky"]), part.values["algorithm"]
+    sky, name = thesis_sky(part["sky"]), part["algorithm"]
     frames = centres(context.parameters["every"])
     solver = _solver(sky, name)
     first = _noise("none")
@@ -167,9 +167,9 @@ def _compare(e: Evaluation) -> None:
     skies = e.parameters["skies"]
     for sky, case in itertools.product(skies, e.parameters["cases"]):
         for part in e.parts:
-            if part.values["sky"] != sky:
+            if part["sky"] != sky:
                 continue
-            name, result = part.values["algorithm"], e.results[part.key]
+            name, result = part["algorithm"], e[part]
             wrong = _wrong(result, case)
             e.compare(
                 f"{SHORT[name]}, {_SKY_LABELS[sky]}, {_case_label(case)}: identified",
@@ -223,7 +223,7 @@ def evaluate(e: Evaluation) -> None:
     """Rates, wrong answers, sizes and times of each algorithm beside the quoted ones."""
     lines = []
     for part in e.parts:
-        result = e.results[part.key]
+        result = e[part]
         for case in e.parameters["cases"]:
             times = result[f"ms_{case}"]
             line = {**part.values, "case": case}

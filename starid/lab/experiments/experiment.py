@@ -53,6 +53,9 @@ class Part:
     key: str
     values: Parameters = field(default_factory=dict)
 
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
+
 
 def parts_of(parameters: Parameters) -> list[Part]:
     """List the parts that the parameter ``trials`` stands for.
@@ -96,22 +99,37 @@ class Experiment:
     start_order: int = 2
     revision: int = 1
 
+    def parameters(self, *, quick: bool) -> Parameters:
+        """Return the parameters of the full or the quick run.
+
+        Raises
+        ------
+        ReproduceError
+            There is no quick run.
+        """
+        chosen = self.quick if quick else self.full
+        if chosen is None:
+            raise ReproduceError(f"reproduce: {self.name} has no quick form; run it without --quick")
+        return chosen
+
     def fingerprint(self, parameters: Parameters, seed: int, part: Part | None = None) -> str:
-        """Checksum of everything on which the outcome, or one part, depends."""
+        """Checksum of everything on which the outcome, or one part, depends.
+
+        Lists, which say which parts there are, do not matter for a part.
+        """
         content = {
             "name": self.name,
             "revision": self.revision,
             "seed": seed,
-            "parameters": dict(parameters) if part is None else _without_lists(parameters),
+            "parameters": {
+                key: value
+                for key, value in parameters.items()
+                if part is None or not isinstance(value, list | tuple)
+            },
             "part": None if part is None else [part.key, dict(part.values)],
         }
         text = json.dumps(content, sort_keys=True)
         return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-
-
-def _without_lists(parameters: Parameters) -> dict[str, Any]:
-    """Parameters common to all parts; lists, which say which parts there are, are left out."""
-    return {key: value for key, value in parameters.items() if not isinstance(value, list | tuple)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +179,9 @@ class Evaluation:
         self._columns: dict[int, str] = {}
         self._used: set[str] = set()
 
+    def __getitem__(self, part: Part) -> Results:
+        return self.results[part.key]
+
     def published(self, quantity: str) -> list[float]:
         """Return the published numbers of a quantity of this experiment; none if the thesis has none."""
         self._used.add(quantity)
@@ -175,17 +196,13 @@ class Evaluation:
         digits: int = 2,
         check: str = "",
         column: str = "",
-        author: Any = None,
-        printed: Any = None,
-        ours: Any = None,
-        trials: int = 0,
-        remark: str = "",
+        **readings: Any,
     ) -> None:
         """Add a row that compares what was measured with the line of `published.csv`, as the line says.
 
         If the file has no line for the quantity, `text`, `unit`, `digits` and `check` stand for it (see `Published`).
-        Rows of one `column` of a table are reported together, and those that a constant meets are marked. The others
-        are the arguments of `compared`.
+        Rows of one `column` of a table are reported together, and those that a constant meets are marked. The
+        readings and the others are the arguments of `compared`.
         """
         self._used.add(quantity)
         line = PUBLISHED.get((self.context.name, quantity))
@@ -193,8 +210,7 @@ class Evaluation:
             line = Published("" if text is None else str(text), unit, digits, check)
         if column:
             self._columns[len(self.rows)] = column
-        readings = {"author": author, "printed": printed, "ours": ours, "trials": trials}
-        self.rows.append(compared(quantity, line, **readings, remark=remark))
+        self.rows.append(compared(quantity, line, **readings))
 
     def compare_line(
         self, table: str, part: str, where: str, known: Mapping[str, float], measured: Mapping[str, Any]
@@ -249,11 +265,9 @@ class Evaluation:
         groups: dict[str | int, list[Row]] = {}
         for i, each in enumerate(self.rows):
             groups.setdefault(self._columns.get(i, i), []).append(each)
-        rows = [
-            each
-            for name, group in groups.items()
-            for each in (null_model(group) if isinstance(name, str) else group)
-        ]
+        rows = itertools.chain.from_iterable(
+            null_model(group) if isinstance(name, str) else group for name, group in groups.items()
+        )
         path = Path(__file__).parent / "notes" / f"{self.context.name}.md"
         notes = (path.read_text(encoding="utf-8").strip().format(**self.note),) if path.exists() else ()
         return Outcome(tuple(rows), tuple(self.files), notes)

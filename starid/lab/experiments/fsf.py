@@ -102,7 +102,7 @@ def author_distances(
 
 def _author(context: Context, part: Part) -> Results:
     """Counts (6, first frames, frames, 4) and μ_d, σ_d (6, first frames, frames, 2)."""
-    kind, false_stars, stretch = (part.values[name] for name in ("kind", "false_stars", "stretch"))
+    kind, false_stars, stretch = (part[name] for name in ("kind", "false_stars", "stretch"))
     starts, count = int(context.parameters["first_frames"]), int(context.parameters["frames"])
     counts = np.zeros((len(FACTORS), starts, count, 4), dtype=np.int64)
     distances = np.full((len(FACTORS), starts, count, 2), math.nan)
@@ -121,7 +121,7 @@ def _author(context: Context, part: Part) -> Results:
 
 def _printed(context: Context, part: Part) -> Results:
     """Counts (6, 4) of the cluster filter and of ours, with the noise as printed."""
-    kind, false_stars = part.values["kind"], part.values["false_stars"]
+    kind, false_stars = part["kind"], part["false_stars"]
     counts: Results = {name: np.zeros((len(FACTORS), 4), dtype=np.int64) for name in ("any", "followed")}
     cluster = ClusterFilter()
     for k, factor in enumerate(FACTORS):

@@ -143,7 +143,8 @@ def _rate_figures(e: Evaluation) -> None:
         ]
         if known:
             mark = {"ms": 8, "color": "red"}
-            curves.append(Curve(*zip(*known, strict=True), "x", "published (on the grid)", mark))
+            levels, rates = zip(*known, strict=True)
+            curves.append(Curve(levels, rates, "x", "published (on the grid)", mark))
         words = f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %"
         axes = {"xlabel": label, "ylabel": words, "xticks": range(4)}
         shown = [Panel("", curves, axes)]

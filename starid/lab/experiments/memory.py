@@ -25,7 +25,7 @@ _LIMIT_MB: Final = 400.0
 
 def compute(context: Context, part: Part) -> Results:
     """Sizes that a separate process prints; it is run twice, to leave out the compilation."""
-    overlap = part.values["percent"] / 100.0
+    overlap = part["percent"] / 100.0
     context.database(overlap)
     command = [sys.executable, "-m", __name__, str(context.database_file(overlap))]
     for _ in range(2):
