@@ -58,17 +58,10 @@ INSTRUMENTED = (
 
 def modules() -> list[str]:
     """Return the names of all modules of the project."""
-    packages = {
-        "starhil/emulator": "emulator",
-        "starhil/protocol": "protocol",
-        "starhil/hil_tests": "hil_tests",
-        "starid": "starid",
-    }
+    folders = {folder: f"starhil.{folder}" for folder in ("emulator", "protocol", "hil_tests")}
     return [
-        ".".join([*package.split("/"), *path.relative_to(ROOT / folder).with_suffix("").parts]).removesuffix(
-            ".__init__"
-        )
-        for package, folder in packages.items()
+        ".".join((package, *path.relative_to(ROOT / folder).with_suffix("").parts)).removesuffix(".__init__")
+        for folder, package in {**folders, "starid": "starid"}.items()
         for path in (ROOT / folder).rglob("*.py")
     ]
 
