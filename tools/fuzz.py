@@ -1,4 +1,4 @@
-"""Fuzzing guided by coverage (atheris) of each decoder and reader in tests/fuzzing/targets.py.
+"""Fuzzing guided by coverage (atheris) of each decoder and reader in tests/fuzzing.
 
 python tools/fuzz.py [--seconds 60] [TARGET …]     for this long each; all targets by default
 python tools/fuzz.py --list
