@@ -161,12 +161,12 @@ def test_a_wrong_parameter_shows_the_refusal(page):
 def test_the_present_value_of_a_parameter_is_shown_with_its_unit_and_follows_the_telecommand(page):
     send(page, "set_parameter", parameter=1, value=200)
     note = "#telecommand-form [data-note=value]"
-    wait_for_text(page, note, "now 200 ms  (1 … 5000)")
+    wait_for_text(page, note, "now 200 ms\n1 … 5000")
     send(page, "set_parameter", parameter=1, value=100)
-    wait_for_text(page, note, "now 100 ms  (1 … 5000)")
+    wait_for_text(page, note, "now 100 ms\n1 … 5000")
     page.select_option("#telecommand-form [name=parameter]", "13")
     page.wait_for_function(
-        "selector => document.querySelector(selector).textContent.includes(' px ')", arg=note
+        "selector => document.querySelector(selector).textContent.includes(' px\\n')", arg=note
     )
 
 

@@ -213,7 +213,7 @@ export class Charts {
     plan.series.forEach((series, number) => {
       if (!series.name) return;
       const item = position < 0 ? NaN : rows.at(position, series.column) * (series.times || 1);
-      outputs[number].textContent = fixed(item, plan.digits, plan.digits ? plan.digits + 5 : 4);
+      outputs[number].textContent = fixed(item, plan.digits, plan.digits ? plan.digits + 4 : 4);
     });
   }
 

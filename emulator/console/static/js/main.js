@@ -149,7 +149,7 @@ store.on("status", ({ heard, wall_s: now }) => {
   const rate = asked && total >= asked.total ? (total - asked.total) / (now - asked.now) : 0;
   asked = { total, now };
   setText($("obc"), spoken.length ? `${spoken[0].link} ${fixed(rate, 1)}/s` : "silent");
-  $("obc").parentElement.parentElement.title = heard.map((each) => `${each.link}: ${each.requests} requests${each.age_s === null ? "" : `, the last ${age(each.age_s)} ago`}`).join("\n");
+  $("requests").title = heard.map((each) => `${each.link}: ${each.requests} requests${each.age_s === null ? "" : `, the last ${age(each.age_s)} ago`}`).join("\n");
 });
 
 setInterval(() => setText($("obc-last"), lastRequest === null ? "–" : `${age((performance.now() - lastRequest) / 1000)} ago`), 500);
@@ -206,7 +206,7 @@ store.on("shown", () => {
 // The moment that is shown.
 function showWhen() {
   if (store.cursor !== null) setText($("when"), `${duration(store.cursor)}  (−${fixed(store.now - store.cursor, 1)} s)`);
-  else if (document.body.classList.contains("past")) setText($("when"), "not live");
+  else if (lost !== null) setText($("when"), "not live");
   else if (!store.imageless) setText($("when"), "live");
   else setText($("when"), store.image ? `image of ${age(store.time - store.image.time)} ago` : "");
 }

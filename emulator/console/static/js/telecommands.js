@@ -57,7 +57,7 @@ export class Telecommands {
     const { values } = await this.link.request({ do: "parameters" });
     const { name, unit, min, max } = this.parameters.find((item) => String(item.id) === select.value);
     const present = values ? [short(values[name]), unit].filter(Boolean).join(" ") : "–";
-    setText(note, `now ${present}  (${short(min)} … ${short(max)})`);
+    setText(note, `now ${present}\n${short(min)} … ${short(max)}`);
   }
 
   control(field) {
