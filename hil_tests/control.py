@@ -53,17 +53,24 @@ class ControlClient:
 
         Raises BenchError: the request was rejected, or the channel does not answer.
         """
+        return self.exchange(f"control channel: {action}", {"do": action, **keys})
+
+    def exchange(self, what: str, message: dict[str, Any]) -> dict[str, Any]:
+        """Send a JSON object and return the answer, without its `ok`; `what` begins the text of errors.
+
+        Raises BenchError: the answer is an error, or there is none.
+        """
         try:
-            self._lines.write(json.dumps({"do": action, **keys}) + "\n")
+            self._lines.write(json.dumps(message) + "\n")
             self._lines.flush()
             line = self._lines.readline()
         except OSError as error:
-            raise BenchError(f"control channel: {action}: no answer: {error.strerror or error}") from None
+            raise BenchError(f"{what}: no answer: {error.strerror or error}") from None
         if not line:
-            raise BenchError(f"control channel: {action}: closed by the emulator")
+            raise BenchError(f"{what}: closed by the emulator")
         answer: dict[str, Any] = json.loads(line)
         if not answer.pop("ok"):
-            raise BenchError(f"control channel: {action}: {answer['error']}")
+            raise BenchError(f"{what}: {answer['error']}")
         return answer
 
     def reset(self) -> None:
