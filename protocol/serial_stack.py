@@ -309,7 +309,7 @@ class SerialStack:
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
-            for name in {name for item in header.fields for name in item.classes or ()}:
+            for name in (name for item in header.fields for name in item.classes or ()):
                 if name not in self.classes.by_name:
                     known = ", ".join(self.classes.by_name) or "none"
                     raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
