@@ -11,7 +11,6 @@ from typing import Any, Final, Self
 from starhil.hil_tests.attitude import (
     AttitudeError,
     Quaternion,
-    as_reported,
     attitude_error,
     from_reported,
     unit,
@@ -119,10 +118,6 @@ class Truth:
         """Return the attitude at a time of the device's clock, default: now."""
         keys = {} if unix_s is None else {"unix_s": unix_s}
         return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
-
-    def reported(self) -> Quaternion:
-        """Return the attitude now, as the unit reports attitudes."""
-        return as_reported(self.attitude(), self._conventions)
 
     def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeError:
         """Return the error of an attitude as the unit reports it, measured at a time of the device's clock."""
