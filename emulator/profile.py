@@ -22,6 +22,7 @@ from starhil.emulator.truth.config import (
     OrbitConfig,
     Strict,
     TruthConfig,
+    UserPath,
 )
 from starhil.emulator.validation_messages import explain
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
@@ -59,7 +60,7 @@ class RunConfig(Strict):
     worker: Literal["process", "thread", "error_model"] = "process"
     """Whether frames are rendered and solved in a worker process or in a thread of the emulator, or replaced by an
     error model: attitudes are the truth with noise, and there are no images of the sky."""
-    state_dir: str = ""
+    state_dir: UserPath = ""
     """Folder for state that survives a restart: saved parameters, boot count, CANopen settings. Empty: no
     state is kept."""
     start_unix_s: Date = 1_767_225_600.0
@@ -69,7 +70,7 @@ class RunConfig(Strict):
 class CatalogConfig(Strict):
     """The star catalogue."""
 
-    path: str = ""
+    path: UserPath = ""
     """Hipparcos file; empty: the installed catalogue."""
     epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] | None = None
     """Julian year of the star positions; default: that of the date at the start of the run, to a tenth."""
@@ -167,13 +168,13 @@ class RadiationConfig(Strict):
 class ImagesConfig(Strict):
     """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
-    folder: str = ""
+    folder: UserPath = ""
     """Folder of PNG, TIFF, JPEG or BMP images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
     """Whether to start again after the last image in the folder."""
-    dark: str = ""
+    dark: UserPath = ""
     """Dark image of the same camera and exposure, which is subtracted from each image."""
 
     @model_validator(mode="after")
@@ -190,7 +191,7 @@ class ImagesConfig(Strict):
     def resolved(self, relative_to: Path) -> dict[str, Any]:
         """Return the keys, with paths relative to a folder resolved."""
         files = {
-            key: str(relative_to / Path(value).expanduser())
+            key: str(relative_to / value)
             for key, value in (("folder", self.folder), ("dark", self.dark))
             if value
         }
@@ -223,7 +224,7 @@ class SerialConfig(Strict):
     """Bit rate."""
     pace: bool = True
     """Whether a message arrives, whole, only at the time at which its last byte would at the bit rate."""
-    symlink: str = ""
+    symlink: UserPath = ""
     """Path of a symbolic link to the pty, created at the start and removed at the end."""
 
 
@@ -263,7 +264,7 @@ class Profile(Strict):
 
     name: str = "ideal"
     """Name in messages and on the control channel."""
-    unit: str = DEFAULT_UNIT
+    unit: UserPath = DEFAULT_UNIT
     """Interface definition: name of a bundled unit, or a folder relative to the profile."""
     run: RunConfig = RunConfig()
     """Seed, clock, algorithm, files."""
@@ -353,7 +354,7 @@ class Profile(Strict):
         """The unit for `load_unit`: name of a bundled unit, or a folder relative to the profile."""
         if self.unit in bundled_units():
             return self.unit
-        return str(self.folder / Path(self.unit).expanduser())
+        return str(self.folder / self.unit)
 
     @property
     def folder(self) -> Path:
@@ -498,10 +499,8 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
         if not isinstance(below, dict):
             raise EmulatorError(f"--set {override}: {name} is a value, not a section")
         table = below
-    if ".".join(names) in PATHS and isinstance(value, str) and value:
-        value = str(
-            Path(value).expanduser().absolute()
-        )  # relative to the working directory, as on any command line
+    if ".".join(names) in PATHS and isinstance(value, str) and value and not value.startswith("~"):
+        value = str(Path(value).absolute())  # relative to the working directory, as on any command line
     if names[-1] == "kind":
         value = text.strip().strip("\"'")  # a name, even if it is a number: 42
     if names[-1] == "kind" and table.get("kind") != value:

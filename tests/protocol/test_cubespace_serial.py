@@ -13,7 +13,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import SerialStack
-from tests.protocol.composed_links import CUBESPACE, stack_of
+from tests.protocol.composed_links import CUBESPACE, shape, stack_of
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
 GOOD = Request(TC, 2, b"\x1f\x00\xff\x7f\x1f\x1f")
@@ -284,3 +284,15 @@ def test_the_host_survives_any_bytes(dialect: Dialect, noise: list[bytes]) -> No
     receiver.expect(Request.of(230))
     events = receiver.feed(CUBESPACE.encode_reply(TELEMETRY, dialect), 10.0)
     assert events[-1] == TELEMETRY
+
+
+def test_the_longest_row_is_read_in_each_dialect() -> None:
+    data = bytes(600)
+    stack = stack_of(
+        {"framing": {"kind": "cubespace"}}, rows=(shape("", 200, RequestKind.TELEMETRY, 0, 600),)
+    )
+    for dialect in Dialect:
+        receiver = stack.host(dialect)
+        receiver.expect(Request.of(200))
+        reply = Reply(ReplyKind.TELEMETRY, 200, data)
+        assert receiver.feed(stack.encode_reply(reply, dialect), 0.0) == [reply]
