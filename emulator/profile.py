@@ -22,10 +22,11 @@ from starhil.emulator.truth.config import (
     OrbitConfig,
     Strict,
     TruthConfig,
+    UserPath,
 )
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import did_you_mean, find
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starhil.protocol.validation_messages import problems
 from starhil.protocol.values import IcdError
@@ -64,7 +65,7 @@ class RunConfig(Strict):
     worker: Literal["process", "thread", "error_model"] = "process"
     """Whether frames are rendered and solved in a worker process or in a thread of the emulator, or replaced by an
     error model: attitudes are the truth with noise, and there are no images of the sky."""
-    state_dir: str = ""
+    state_dir: UserPath = ""
     """Folder for state that survives a restart: saved parameters, boot count, CANopen settings. Empty: no
     state is kept."""
     start_unix_s: Date = 1_767_225_600.0
@@ -74,7 +75,7 @@ class RunConfig(Strict):
 class CatalogConfig(Strict):
     """The star catalogue."""
 
-    path: str = ""
+    path: UserPath = ""
     """Hipparcos file; empty: the installed catalogue."""
     epoch: Annotated[float, Field(ge=1900.0, le=2200.0)] | None = None
     """Julian year of the star positions; default: that of the date at the start of the run, to a tenth."""
@@ -172,13 +173,13 @@ class RadiationConfig(Strict):
 class ImagesConfig(Strict):
     """Source of images instead of rendering; `[camera]` then describes the camera of the images."""
 
-    folder: str = ""
+    folder: UserPath = ""
     """Folder of PNG, TIFF, JPEG or BMP images, used in the order of their names; relative to the profile."""
     capture: Annotated[int, Field(ge=0, le=99)] | str = ""
     """Number of a camera (0 is the first), or a video file, as in OpenCV's `VideoCapture`."""
     repeat: bool = True
     """Whether to start again after the last image in the folder."""
-    dark: str = ""
+    dark: UserPath = ""
     """Dark image of the same camera and exposure, which is subtracted from each image."""
 
     @model_validator(mode="after")
@@ -195,7 +196,7 @@ class ImagesConfig(Strict):
     def resolved(self, relative_to: Path) -> dict[str, Any]:
         """Return the keys, with paths relative to a folder resolved."""
         files = {
-            key: str(relative_to / Path(value).expanduser())
+            key: str(relative_to / value)
             for key, value in (("folder", self.folder), ("dark", self.dark))
             if value
         }
@@ -228,7 +229,7 @@ class SerialConfig(Strict):
     """Bit rate."""
     pace: bool = True
     """Whether a message arrives, whole, only at the time at which its last byte would at the bit rate."""
-    symlink: str = ""
+    symlink: UserPath = ""
     """Path of a symbolic link to the pty, created at the start and removed at the end."""
 
 
@@ -272,7 +273,7 @@ class Profile(Strict):
 
     name: str = "ideal"
     """Name in messages and on the control channel."""
-    unit: str = DEFAULT_UNIT
+    unit: UserPath = DEFAULT_UNIT
     """Interface definition: name of a bundled unit, or a folder relative to the profile."""
     run: RunConfig = RunConfig()
     """Seed, clock, algorithm, files."""
@@ -361,7 +362,9 @@ class Profile(Strict):
     @property
     def unit_source(self) -> str:
         """The unit for `load_unit`: name of a bundled unit, or a folder relative to the profile."""
-        return _unit_source(self.unit, self.folder)
+        if self.unit in bundled_units():
+            return self.unit
+        return str(self.folder / self.unit)
 
     @property
     def folder(self) -> Path:
@@ -456,7 +459,7 @@ def _checks(
             yield "identifier", lambda table: check_options(algorithm, table)
     if "parameters" in values and isinstance(unit, str):
         try:
-            known = load_unit(_unit_source(unit, folder)).device_parameters
+            known = load_unit(folder / find("unit", unit)).device_parameters
         except IcdError:
             return  # reported when the unit is loaded
         yield "parameters", lambda table: _check_parameters(known, table)
@@ -484,10 +487,6 @@ def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) 
             known[name].check(value)
         except ProtocolError as error:
             raise EmulatorError(f"parameters.{error}") from None
-
-
-def _unit_source(unit: str, folder: Path) -> str:
-    return unit if unit in bundled_units() else str(folder / Path(unit).expanduser())
 
 
 def camera_of(name_or_path: str) -> Camera:
@@ -584,10 +583,8 @@ def _apply_override(values: dict[str, Any], override: str) -> Layer:
         if not isinstance(below, dict):
             raise EmulatorError(f"--set {override}: {name} is a value, not a section")
         table = below
-    if ".".join(names) in PATHS and isinstance(value, str) and value:
-        value = str(
-            Path(value).expanduser().absolute()
-        )  # relative to the working directory, as on any command line
+    if ".".join(names) in PATHS and isinstance(value, str) and value and not value.startswith("~"):
+        value = str(Path(value).absolute())  # relative to the working directory, as on any command line
     if names[-1] == "kind":
         value = text.strip().strip("\"'")  # a name, even if it is a number: 42
     if names[-1] == "kind" and table.get("kind") != value:

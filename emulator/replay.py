@@ -366,7 +366,8 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
             head.device.signals.frame_published.connect(log.write)
             if (folder / SCENARIO_FILE).exists():
                 text = _read(folder / SCENARIO_FILE)
-                _validated(Scenario, text, folder / SCENARIO_FILE).enter(head, again.truth)
+                scenario = _validated(Scenario, text, folder / SCENARIO_FILE)
+                head.device.scheduler.add(scenario.prepare(head, again.truth))
             play = _Playing(again, head, player, await head.imager.start())
             recording = await play.entries(folder, report, ends=ends)
             to_the_end = not report.differences

@@ -12,7 +12,6 @@ from typing import Any, Final, Self
 from starhil.hil_tests.attitude import (
     AttitudeError,
     Quaternion,
-    as_reported,
     attitude_error,
     from_reported,
     unit,
@@ -48,17 +47,24 @@ class ControlClient:
 
         Raises BenchError: the request was rejected, or the channel does not answer.
         """
+        return self.exchange(f"control channel: {action}", {"do": action, **keys})
+
+    def exchange(self, what: str, message: dict[str, Any]) -> dict[str, Any]:
+        """Send a JSON object and return the answer, without its `ok`; `what` begins the text of errors.
+
+        Raises BenchError: the answer is an error, or there is none.
+        """
         try:
-            self._lines.write(json.dumps({"do": action, **keys}) + "\n")
+            self._lines.write(json.dumps(message) + "\n")
             self._lines.flush()
             line = self._lines.readline()
         except OSError as error:
-            raise BenchError(f"control channel: {action}: no answer: {error.strerror or error}") from None
+            raise BenchError(f"{what}: no answer: {error.strerror or error}") from None
         if not line:
-            raise BenchError(f"control channel: {action}: closed by the emulator")
+            raise BenchError(f"{what}: closed by the emulator")
         answer: dict[str, Any] = json.loads(line)
         if not answer.pop("ok"):
-            raise BenchError(f"control channel: {action}: {answer['error']}")
+            raise BenchError(f"{what}: {answer['error']}")
         return answer
 
     def reset(self) -> None:
@@ -119,10 +125,6 @@ class Truth:
         """Return the attitude at a time of the device's clock, default: now."""
         keys = {} if unix_s is None else {"unix_s": unix_s}
         return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
-
-    def reported(self) -> Quaternion:
-        """Return the attitude now, as the unit reports attitudes."""
-        return as_reported(self.attitude(), self._conventions)
 
     def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeError:
         """Return the error of an attitude as the unit reports it, measured at a time of the device's clock."""

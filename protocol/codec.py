@@ -122,10 +122,15 @@ class Field(FieldKeys):
         """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0
 
+    @property
+    def type_limits(self) -> tuple[int, int]:
+        """Lowest and highest raw value that an integer type or a group of bits can hold."""
+        return (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+
     @cached_property
     def raw_limits(self) -> tuple[int, int]:
         """Lowest and highest raw value of an integer, flag, bit group or enumeration."""
-        low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+        low, high = self.type_limits
         lowest, highest = (self.minimum, self.maximum) if self.scale > 0.0 else (self.maximum, self.minimum)
         if lowest is not None:
             low = max(low, round((lowest - self.bias) / self.scale))
@@ -226,12 +231,12 @@ class Field(FieldKeys):
                 # what a telecommand has set is read back as it is, and tests may send any bytes
                 encoding = "ascii" if check and not saturate else "latin-1"
                 return self._text_to_raw(value, where, encoding, index)
-            case "flag":
-                if isinstance(value, bool) or value in (0, 1):
-                    return int(value)
-                raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
-            case "enum":
-                return self._enum_to_raw(value, where, check=check, index=index)
+            case "flag" | "enum":
+                raw = self._named_to_raw(value, where, check=check, index=index)
+                low, high = self.raw_limits
+                if check and not saturate and not low <= raw <= high:
+                    raise self._outside(value, where, index)
+                return raw
             case "float":
                 return self._float_to_raw(value, where, check=check, saturate=saturate, index=index)
             case _:
@@ -262,15 +267,14 @@ class Field(FieldKeys):
     def check_raw(self, raw: Any, where: str, index: int) -> None:
         """Raise FieldError if a received raw value is outside the limits or not finite."""
         match self.kind:
-            case "enum":
-                if self.enum is not None:
-                    self.enum.number(int(raw), where, index=index)
             case "float":
                 value = self.to_physical(raw)
                 if not isinstance(value, float) or not math.isfinite(value):
                     raise FieldError(f"{where}: {value!r} is not a finite number", index=index)
                 self._check_float(value, where, index)
-            case "integer" | "bits":
+            case "integer" | "bits" | "flag" | "enum":
+                if self.enum is not None:
+                    self.enum.number(int(raw), where, index=index)
                 low, high = self.raw_limits
                 if not low <= raw <= high:
                     raise self._outside(self.to_physical(raw), where, index)
@@ -306,12 +310,15 @@ class Field(FieldKeys):
             raise FieldError(f"{where}: {len(raw)} characters, at most {self.size}", index=index)
         return raw.ljust(self.size, b"\0")
 
-    def _enum_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
-        low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+    def _named_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
+        """Return the number of a flag or of a member of the enumeration."""
+        low, high = self.type_limits
+        if self.enum is None:
+            if isinstance(value, bool) or value in (0, 1):
+                return int(value)
+            raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
         if not check and isinstance(value, int) and low <= value <= high:
             return int(value)
-        if self.enum is None:
-            raise FieldError(f"{where}: has no enumeration", index=index)
         return self.enum.number(value, where, index=index)
 
     def _float_to_raw(self, value: Value, where: str, *, check: bool, saturate: bool, index: int) -> float:
@@ -343,7 +350,7 @@ class Field(FieldKeys):
         if not self.scaled and whole != raw and not saturate:
             raise FieldError(f"{where}: {value!r} is not a whole number", index=index)
         if not check:
-            low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+            low, high = self.type_limits
         if not low <= whole <= high:
             raise self._outside(value, where, index)
         return whole

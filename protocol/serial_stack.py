@@ -6,7 +6,7 @@
             └──────────────── body ─────────────────────────┘
 
 A link is composed of a framing, which marks where a body begins and ends (`framings`), a check (`checks`), a header of
-requests and one or several of replies (`envelope`). In most units all replies have one header, whose roles tell what
+requests and one or several of replies (`envelope`). In most units all replies have one header, whose roles give what
 they are. In the dialects of CubeSpace each kind of reply has its own (`cubespace`), and the kind follows from the
 start byte, the row, and the size.
 """
@@ -309,7 +309,7 @@ class SerialStack:
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
-            for name in {name for item in header.fields for name in item.classes or ()}:
+            for name in (name for item in header.fields for name in item.classes or ()):
                 if name not in self.classes.by_name:
                     known = ", ".join(self.classes.by_name) or "none"
                     raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")

@@ -282,9 +282,10 @@ class ControlServer:
     async def _run_scenario(self, head: Head, request: dict[str, Any]) -> Answer:
         if self._run.recorder is not None:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
-        scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
-        scenario.enter(head, self._run.truth, start_s=self._run.clock.now_ns() / NANOSECONDS)
-        return {"events": len(scenario.at)}
+        name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
+        events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+        head.device.scheduler.add(events)
+        return {"events": len(events)}
 
     async def _quit_run(self, _head: Head, _request: dict[str, Any]) -> Answer:
         asyncio.get_running_loop().call_soon(self._quit)

@@ -56,7 +56,7 @@ def packets(row: Row) -> Iterator[tuple[dict[str, Value], bytes]]:
 def _value(field: Field, number: int, turn: int) -> Value:
     match field.kind:
         case "flag":
-            return bool((number + turn) % 2)
+            return bool(field.const) if field.const is not None else bool((number + turn) % 2)
         case "enum":
             assert field.enum is not None
             return list(field.enum.values)[(number + turn) % len(field.enum.values)]
