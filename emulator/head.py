@@ -105,19 +105,19 @@ class Head:
                 SensorTruth(truth, mount),
                 wiring.background(background),
             )
+            self.requests = Requests(self.device)
+            self.faults = Faults(self.device, self.links)
+            self.device.signals.frame_published.connect(_log_frame)
+            self.device.power_on()
         except EmulatorError:
             store.close()
             raise
-        self.requests = Requests(self.device)
-        self.faults = Faults(self.device, self.links)
-        self.device.signals.frame_published.connect(_log_frame)
-        self.device.power_on()
 
     @property
     def _state_dir(self) -> Path | None:
         """Folder for state that survives a restart; None: it is kept in memory."""
         state_dir = self.profile.run.state_dir
-        return self.profile.folder / Path(state_dir).expanduser() if state_dir else None
+        return self.profile.folder / state_dir if state_dir else None
 
     def _in_background(self) -> Background:
         loop = asyncio.get_running_loop()
@@ -162,7 +162,7 @@ class Head:
         from starhil.protocol.transports.serial import open_serial
 
         config, baud = self.profile.links.serial, int(self.device.parameters["serial_baud"])
-        symlink = Path(config.symlink).expanduser() if config.symlink else None
+        symlink = Path(config.symlink) if config.symlink else None
         if symlink is not None:
             self._closers.append(lock_symlink(symlink).close)
         pace = None if config.pace and paced else False
@@ -206,10 +206,8 @@ class Head:
             device.signals.mode_changed.connect(self._mode_changed)
             self.pipeline_ready(warm)
         except EmulatorError as error:
-            device.withdraw_start()
             raise EmulatorError(f"{self.profile.source_of(error)}: {error}") from None
         except ProtocolError as error:  # a camera constant is outside the limits of its parameter
-            device.withdraw_start()
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
@@ -253,10 +251,15 @@ class Head:
         if self._revival is not None:
             closers.append(self._revival.close)
         closers += [link.close for link in reversed(self.links)]  # CAN after CANopen: it may run the hub
-        closers += [self.imager.close, partial(self._writer.shutdown, wait=True)]
+        closers += [self.imager.close, self._finish_writing]
         closers += reversed(self._closers)
         self._closers.clear()
         await close_all(closers)
+
+    async def _finish_writing(self) -> None:
+        """Wait for the writes in progress, and for their outcomes, which arrive in the event loop."""
+        self._writer.shutdown(wait=True)
+        await asyncio.sleep(0)
 
 
 async def _cancel(task: asyncio.Task[None]) -> None:

@@ -52,3 +52,4 @@ async def read_lines(
             return
         yield None if too_long else line
         too_long = False
+        await asyncio.sleep(0)  # many lines may have arrived at once: other tasks run in between

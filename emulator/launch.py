@@ -20,7 +20,6 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from starhil.emulator.tape import TRUTH_FILE, Recorder, Wiring
 from starhil.emulator.truth_log import TruthLog
-from starhil.protocol.errors import ProtocolError
 
 
 @dataclass(frozen=True)
@@ -101,8 +100,9 @@ class Emulator:
     def _rejecting(self) -> Iterator[None]:
         try:
             yield
-        except (EmulatorError, ProtocolError):
+        except Exception:
             self._rejected = True
+            self.run.withdraw_starts()
             raise
 
     async def _start(self, options: RunOptions, run: Run) -> None:
@@ -114,21 +114,18 @@ class Emulator:
         scenario = load_scenario(options.scenario) if options.scenario else None
         logs = self._open_logs()
         await run.open()
-        try:
-            for number, log in logs:
-                run.heads[number - 1].device.signals.frame_published.connect(log.write)
-            if scenario is not None:
-                for head in run.heads:
-                    scenario.enter(head, run.truth if head.number == 1 else None)
-            if options.control != "off" or options.watched:
-                self.control = ControlServer(run, self.ended.set, options.control_token)
-            if self.control is not None and options.control != "off":
-                self.ready_fields["control"] = await self.control.start(options.control)
-            if self.control is not None and options.watched:
-                await self._open_console(self.control)
-        except (EmulatorError, ProtocolError):
-            run.withdraw_starts()
-            raise
+        for number, log in logs:
+            run.heads[number - 1].device.signals.frame_published.connect(log.write)
+        if scenario is not None:
+            for head in run.heads:
+                events = scenario.prepare(head, run.truth if head.number == 1 else None)
+                head.device.scheduler.add(events)
+        if options.control != "off" or options.watched:
+            self.control = ControlServer(run, self.ended.set, options.control_token)
+        if self.control is not None and options.control != "off":
+            self.ready_fields["control"] = await self.control.start(options.control)
+        if self.control is not None and options.watched:
+            await self._open_console(self.control)
         run.begin()
 
     def _open_logs(self) -> list[tuple[int, TruthLog]]:

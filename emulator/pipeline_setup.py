@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import TypeAlias
 
 from starhil.emulator.pipeline.error_model import ErrorModelImager
@@ -37,7 +36,7 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         sensor=dict(profile.sensor),
         sky=dict(profile.sky),
         identifier=dict(profile.identifier),
-        catalog_path=str(profile.folder / Path(path).expanduser()) if path else "",
+        catalog_path=str(profile.folder / path) if path else "",
         epoch=profile.epoch,
         algorithm=profile.run.algorithm,
         seed=profile.run.seed,

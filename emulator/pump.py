@@ -107,6 +107,11 @@ class StepPump:
         self._stalled: dict[Transport[Any], int] = {}
         """Transports for which steps do not wait, with the items sent when the peer stopped reading."""
         self._lock = asyncio.Lock()
+        self._stopped = False
+
+    def stop(self) -> None:
+        """Run no more events; a step in progress is cancelled."""
+        self._stopped = True
 
     async def step(self, seconds: float) -> int:
         """Advance simulation time; on return, all events within the step are done. Return their number."""
@@ -137,12 +142,14 @@ class StepPump:
         return min(self._schedulers, key=due_ns).pop_due(end_ns)
 
     async def _settle(self) -> None:
-        """Wait for the pipelines and the links, and let other tasks of the loop run."""
+        """Wait for the pipelines and the links, and let other tasks of the loop run; CancelledError once stopped."""
         for imager in self._imagers:
             await imager.settle()
         await asyncio.sleep(0)
         for transport in self._transports:
             await self._drain(transport)
+        if self._stopped:
+            raise asyncio.CancelledError
 
     async def _drain(self, transport: Transport[Any]) -> None:
         """Wait until a transport has sent everything, while its peer reads."""

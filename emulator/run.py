@@ -33,7 +33,6 @@ from starhil.emulator.pump import StepPump
 from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import Truth, TruthHost
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.icd_bindings import unbound
 
@@ -89,20 +88,14 @@ class Run:
         return len(self.heads) + len(self._plans)
 
     async def open(self) -> None:
-        """Make the heads, open links and truth, and let the boot time pass. If one fails, no start is counted."""
-        try:
-            while self._plans:
-                profile, icd, imager = self._plans[0]
-                head = Head(
-                    len(self.heads) + 1, profile, icd, imager, self.truth, self.wiring, self._start_time
-                )
-                self.heads.append(head)
-                self._plans.pop(0)
-                await head.open_links()
-            await self.truth.open()
-        except (EmulatorError, ProtocolError):
-            self.withdraw_starts()
-            raise
+        """Make the heads, open links and truth, and let the boot time pass."""
+        while self._plans:
+            profile, icd, imager = self._plans[0]
+            head = Head(len(self.heads) + 1, profile, icd, imager, self.truth, self.wiring, self._start_time)
+            self.heads.append(head)
+            self._plans.pop(0)
+            await head.open_links()
+        await self.truth.open()
         boot_s = min(head.profile.device.boot_s for head in self.heads)
         self.clock.switch_on(self._switched_on_ns, round(boot_s * NANOSECONDS))
 
@@ -145,8 +138,9 @@ class Run:
         return list(await asyncio.gather(*(head.ready() for head in self.heads)))
 
     async def close(self) -> None:
-        """Close the heads, the last one first, even if one fails to close."""
-        closers: list[Callable[[], object]] = [self.truth.close]
+        """Stop time and close the heads, the last one first, even if one fails to close."""
+        closers: list[Callable[[], object]] = [] if self.stepper is None else [self.stepper.stop]
+        closers.append(self.truth.close)
         closers += [head.close for head in reversed(self.heads)]
         closers += [imager.close for _, _, imager in self._plans]
         await close_all(closers)
@@ -157,6 +151,6 @@ def _unit_of(profile: Profile) -> InterfaceDefinition:
     icd = load_unit(profile.unit_source)
     missing = unbound(icd)
     if missing:
-        raise EmulatorError(missing[0])
+        raise EmulatorError(*missing)
     check_links(profile, icd)
     return icd

@@ -19,6 +19,9 @@ _NORM_TOLERANCE: Final = 0.02
 """Largest deviation of an attitude quaternion from unit length; much more than four steps of 1e-4."""
 
 
+Vector = tuple[float, float, float]
+
+
 class Quaternion(NamedTuple):
     """A rotation ICRS → sensor, scalar last."""
 
@@ -122,12 +125,13 @@ def from_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
     return Quaternion(*(part / length for part in parts))
 
 
-def boresight(q: Quaternion) -> tuple[float, float, float]:
-    """Return the sensor's +z axis in ICRS."""
+def to_matrix(q: Quaternion) -> tuple[Vector, Vector, Vector]:
+    """Return the rows of the matrix that rotates vectors as a quaternion does: the sensor's axes in ICRS."""
+    x, y, z, w = q
     return (
-        2.0 * (q.x * q.z - q.w * q.y),
-        2.0 * (q.y * q.z + q.w * q.x),
-        1.0 - 2.0 * (q.x * q.x + q.y * q.y),
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
     )
 
 
@@ -136,19 +140,9 @@ def to_radec_roll(q: Quaternion) -> tuple[float, float, float]:
 
     Roll follows from the rows of the matrix in `from_radec_roll`: −y·n is its cosine, −x·n its sine.
     """
-    along = boresight(q)
+    row_x, row_y, along = to_matrix(q)
     ra, dec = math.atan2(along[1], along[0]), math.asin(min(1.0, max(-1.0, along[2])))
     north = (-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec))
-    row_x = (
-        1.0 - 2.0 * (q.y * q.y + q.z * q.z),
-        2.0 * (q.x * q.y - q.w * q.z),
-        2.0 * (q.x * q.z + q.w * q.y),
-    )
-    row_y = (
-        2.0 * (q.x * q.y + q.w * q.z),
-        1.0 - 2.0 * (q.x * q.x + q.z * q.z),
-        2.0 * (q.y * q.z - q.w * q.x),
-    )
     sine, cosine = (-math.fsum(a * b for a, b in zip(row, north, strict=True)) for row in (row_x, row_y))
     roll = math.degrees(math.atan2(sine, cosine))
     return math.degrees(ra) % 360.0, math.degrees(dec), roll % 360.0

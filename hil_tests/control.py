@@ -6,12 +6,12 @@ import json
 import operator
 import socket
 import time
+from contextlib import ExitStack
 from typing import Any, Final, Self
 
 from starhil.hil_tests.attitude import (
     AttitudeError,
     Quaternion,
-    as_reported,
     attitude_error,
     from_reported,
     unit,
@@ -36,15 +36,8 @@ class ControlClient:
     """
 
     def __init__(self, address: str) -> None:
-        path = address.removeprefix("unix:")
         try:
-            if path != address:
-                self._socket = socket.socket(socket.AF_UNIX)
-                self._socket.settimeout(ANSWER_WITHIN_S)
-                self._socket.connect(path)
-            else:
-                host, _, port = address.rpartition(":")
-                self._socket = socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+            self._socket = _connected(address)
         except OSError as error:
             raise BenchError(f"control channel {address}: {error.strerror or error}") from None
         self._lines = self._socket.makefile("rw", encoding="utf-8")
@@ -54,17 +47,24 @@ class ControlClient:
 
         Raises BenchError: the request was rejected, or the channel does not answer.
         """
+        return self.exchange(f"control channel: {action}", {"do": action, **keys})
+
+    def exchange(self, what: str, message: dict[str, Any]) -> dict[str, Any]:
+        """Send a JSON object and return the answer, without its `ok`; `what` begins the text of errors.
+
+        Raises BenchError: the answer is an error, or there is none.
+        """
         try:
-            self._lines.write(json.dumps({"do": action, **keys}) + "\n")
+            self._lines.write(json.dumps(message) + "\n")
             self._lines.flush()
             line = self._lines.readline()
         except OSError as error:
-            raise BenchError(f"control channel: {action}: no answer: {error.strerror or error}") from None
+            raise BenchError(f"{what}: no answer: {error.strerror or error}") from None
         if not line:
-            raise BenchError(f"control channel: {action}: closed by the emulator")
+            raise BenchError(f"{what}: closed by the emulator")
         answer: dict[str, Any] = json.loads(line)
         if not answer.pop("ok"):
-            raise BenchError(f"control channel: {action}: {answer['error']}")
+            raise BenchError(f"{what}: {answer['error']}")
         return answer
 
     def reset(self) -> None:
@@ -93,6 +93,19 @@ class ControlClient:
         self.close()
 
 
+def _connected(address: str) -> socket.socket:
+    path = address.removeprefix("unix:")
+    if path == address:
+        host, _, port = address.rpartition(":")
+        return socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+    with ExitStack() as stack:
+        found = stack.enter_context(socket.socket(socket.AF_UNIX))
+        found.settimeout(ANSWER_WITHIN_S)
+        found.connect(path)
+        stack.pop_all()
+    return found
+
+
 class Truth:
     """The true attitude of the emulated sensor, whose unit has these conventions."""
 
@@ -112,10 +125,6 @@ class Truth:
         """Return the attitude at a time of the device's clock, default: now."""
         keys = {} if unix_s is None else {"unix_s": unix_s}
         return unit(self._control.do("truth", **keys)["quaternion_xyzw"])
-
-    def reported(self) -> Quaternion:
-        """Return the attitude now, as the unit reports attitudes."""
-        return as_reported(self.attitude(), self._conventions)
 
     def error(self, quaternion_xyzw: list[float], unix_s: float) -> AttitudeError:
         """Return the error of an attitude as the unit reports it, measured at a time of the device's clock."""

@@ -30,6 +30,7 @@ class TruthLogReader:
         self._path = path
         self._times: list[float] = []
         self._attitudes: list[Quaternion] = []
+        self._last: Quaternion | None = None
 
     def at(self, time_s: float) -> Quaternion:
         """Return the attitude at a device time, interpolated by the shortest rotation.
@@ -51,6 +52,20 @@ class TruthLogReader:
             self._attitudes[after - 1], self._attitudes[after], (time_s - begin) / (end - begin)
         )
 
+    def latest(self) -> Quaternion:
+        """Return the attitude in the last complete line.
+
+        Raises BenchError: the file cannot be read, lacks a column, or has no line yet.
+        """
+        self._read()
+        if self._last is None:
+            raise BenchError(f"{self._path}: has no truth yet")
+        return self._last
+
+    def check(self) -> None:
+        """Raise BenchError if the file cannot be read or lacks a column; it may have no line yet."""
+        self._read()
+
     def _covers(self, time_s: float) -> bool:
         return bool(self._times) and self._times[0] - SLACK_S <= time_s <= self._times[-1] + SLACK_S
 
@@ -61,17 +76,17 @@ class TruthLogReader:
             raise BenchError(f"{self._path}: the truth cannot be read: {error.strerror}") from None
         except UnicodeDecodeError as error:
             raise BenchError(f"{self._path}: the truth cannot be read: not UTF-8, {error.reason}") from None
-        rows = list(csv.DictReader(io.StringIO(text, newline="")))
-        if not rows:
+        rows = csv.DictReader(io.StringIO(text, newline=""))
+        if rows.fieldnames is None:
             return
-        missing = [name for name in (TIME_COLUMN, *QUATERNION_COLUMNS) if name not in rows[0]]
+        missing = [name for name in (TIME_COLUMN, *QUATERNION_COLUMNS) if name not in rows.fieldnames]
         if missing:
             raise BenchError(f"{self._path}: no column {', '.join(missing)} in its first line")
         pairs: dict[float, Quaternion] = {}
         for row in rows:
             try:
                 values = [float(row[name]) for name in QUATERNION_COLUMNS]
-                pairs[float(row[TIME_COLUMN])] = unit(values)
+                pairs[float(row[TIME_COLUMN])] = self._last = unit(values)
             except (TypeError, ValueError):
                 continue  # the last line is still being written
         self._times = sorted(pairs)

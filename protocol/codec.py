@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
@@ -121,10 +122,15 @@ class Field(FieldKeys):
         """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0
 
+    @property
+    def type_limits(self) -> tuple[int, int]:
+        """Lowest and highest raw value that an integer type or a group of bits can hold."""
+        return (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+
     @cached_property
     def raw_limits(self) -> tuple[int, int]:
         """Lowest and highest raw value of an integer, flag, bit group or enumeration."""
-        low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+        low, high = self.type_limits
         lowest, highest = (self.minimum, self.maximum) if self.scale > 0.0 else (self.maximum, self.minimum)
         if lowest is not None:
             low = max(low, round((lowest - self.bias) / self.scale))
@@ -206,8 +212,13 @@ class Field(FieldKeys):
         margin = abs(self.scale) / 2.0 if self.kind == "integer" else 0.0
         return not low - margin <= value <= high + margin
 
+    @property
+    def required(self) -> bool:
+        """Whether a telecommand must give a value."""
+        return self.default is None and self.const is None
+
     def to_raw(
-        self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
+        self, value: Value, where: str, *, check: bool = True, saturate: bool = False, index: int = 0
     ) -> int | float | bytes:
         """Convert a physical value to the raw value of its slot or bits.
 
@@ -220,12 +231,12 @@ class Field(FieldKeys):
                 # what a telecommand has set is read back as it is, and tests may send any bytes
                 encoding = "ascii" if check and not saturate else "latin-1"
                 return self._text_to_raw(value, where, encoding, index)
-            case "flag":
-                if isinstance(value, bool) or value in (0, 1):
-                    return int(value)
-                raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
-            case "enum":
-                return self._enum_to_raw(value, where, check=check, index=index)
+            case "flag" | "enum":
+                raw = self._named_to_raw(value, where, check=check, index=index)
+                low, high = self.raw_limits
+                if check and not saturate and not low <= raw <= high:
+                    raise self._outside(value, where, index)
+                return raw
             case "float":
                 return self._float_to_raw(value, where, check=check, saturate=saturate, index=index)
             case _:
@@ -256,15 +267,14 @@ class Field(FieldKeys):
     def check_raw(self, raw: Any, where: str, index: int) -> None:
         """Raise FieldError if a received raw value is outside the limits or not finite."""
         match self.kind:
-            case "enum":
-                if self.enum is not None:
-                    self.enum.number(int(raw), where, index=index)
             case "float":
                 value = self.to_physical(raw)
                 if not isinstance(value, float) or not math.isfinite(value):
                     raise FieldError(f"{where}: {value!r} is not a finite number", index=index)
                 self._check_float(value, where, index)
-            case "integer" | "bits":
+            case "integer" | "bits" | "flag" | "enum":
+                if self.enum is not None:
+                    self.enum.number(int(raw), where, index=index)
                 low, high = self.raw_limits
                 if not low <= raw <= high:
                     raise self._outside(self.to_physical(raw), where, index)
@@ -300,12 +310,15 @@ class Field(FieldKeys):
             raise FieldError(f"{where}: {len(raw)} characters, at most {self.size}", index=index)
         return raw.ljust(self.size, b"\0")
 
-    def _enum_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
-        low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+    def _named_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
+        """Return the number of a flag or of a member of the enumeration."""
+        low, high = self.type_limits
+        if self.enum is None:
+            if isinstance(value, bool) or value in (0, 1):
+                return int(value)
+            raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
         if not check and isinstance(value, int) and low <= value <= high:
             return int(value)
-        if self.enum is None:
-            raise FieldError(f"{where}: has no enumeration", index=index)
         return self.enum.number(value, where, index=index)
 
     def _float_to_raw(self, value: Value, where: str, *, check: bool, saturate: bool, index: int) -> float:
@@ -337,7 +350,7 @@ class Field(FieldKeys):
         if not self.scaled and whole != raw and not saturate:
             raise FieldError(f"{where}: {value!r} is not a whole number", index=index)
         if not check:
-            low, high = (0, 2**self.width - 1) if self.width else INTEGER_RANGES[self.slot.type]
+            low, high = self.type_limits
         if not low <= whole <= high:
             raise self._outside(value, where, index)
         return whole
@@ -361,6 +374,16 @@ class Row(RowKeys):
     """Whether fields without a binding are sent as zeros."""
     request: str = ""
     """Text that requests the row on the serial line; empty: its header does."""
+
+    @property
+    def request_size(self) -> int:
+        """Bytes of data in its request."""
+        return self.size if self.kind == "telecommand" else 0
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of data in its reply."""
+        return self.size if self.kind == "telemetry" else 0
 
     def __repr__(self) -> str:
         """Return kind, ID and name."""
@@ -423,14 +446,16 @@ class Row(RowKeys):
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()
         if unknown:
+            name = min(unknown)
+            hint = did_you_mean(name, self.named_fields)
             known = ", ".join(self.named_fields) or "none"
-            raise FieldError(f"{self.name}.{min(unknown)}: no such field (fields: {known})")
+            raise FieldError(f"{self.name}.{name}: no such field{hint} (fields: {known})")
         raw: list[Any] = [0] * len(self._sent)
         for index, (name, item, position) in enumerate(self._values):
             where = f"{self.name}.{name}"
             value = given.get(name)
             if value is None:
-                if self.kind == "telecommand" and item.default is None and item.const is None:
+                if self.kind == "telecommand" and item.required:
                     raise FieldError(f"{where}: missing value", index=index)
                 value = item.empty
             packed: Any = item.to_raw(value, where, check=check, saturate=saturate, index=index)

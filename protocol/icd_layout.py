@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance, RepeatModel
+from starhil.protocol.validation_messages import wording
 from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError, Scalar
 
 NUMBER: Final = "[n]"
@@ -138,63 +139,13 @@ class Layout:
             return
         if model.bits:
             raise IcdError(f"{where}: only types bits8, bits16 and bits32 have bits")
-        if model.type in ("bytes", "text"):
-            if model.size is None:
-                raise IcdError(f"{where}: type {model.type} needs a size")
-        elif model.size is not None:
+        string = model.type in ("bytes", "text")
+        if string and model.size is None:
+            raise IcdError(f"{where}: type {model.type} needs a size")
+        if not string and model.size is not None:
             raise IcdError(f"{where}: type {model.type} has a fixed size; remove `size`")
-        self._append(self._field(model, model.type, where, suffix, number))
-
-    def _field(self, model: FieldModel, type_: str, where: str, suffix: str, number: int | None) -> Field:
-        if type_ in ("bytes", "text"):
-            slot = self._slot("bytes", model.size or 0)
-        else:
-            slot = self._scalar_slot(type_, model.order)
-        self._check_numbers(model, where, str(model.type), INTEGER_RANGES.get(str(model.type)))
-        keys = self._keys(model, where, suffix, number, unit=model.unit, named=type_.startswith("enum"))
-        if model.const is not None:
-            keys |= {"minimum": model.const, "maximum": model.const}
-        kind = "enum" if keys["enum"] is not None else _KINDS.get(type_, "integer")
-        return self._placed(model, slot, keys, kind)
-
-    def _keys(
-        self,
-        model: FieldModel | BitModel,
-        where: str,
-        suffix: str,
-        number: int | None,
-        *,
-        unit: str,
-        named: bool,
-    ) -> dict[str, Any]:
-        """Return the keys of a field that its model gives, references resolved; `named`: by `enum`."""
-        enum, aliases = self._enumeration(model, where, named=named)
-        given = vars(model)
-        return {key: given[key] for key in FieldKeys.model_fields if key in given} | {
-            "name": model.name + suffix if model.name else "",
-            "enum": enum,
-            "aliases": aliases,
-            "default": _default(model.default, enum, where),
-            "parameter": self._definitions.check_parameter(model.parameter, unit, where),
-            "value": _numbered(model.value, number, where),
-            "argument": _numbered(model.argument, number, where),
-        }
-
-    def _enumeration(
-        self, model: FieldModel | BitModel, where: str, *, named: bool
-    ) -> tuple[EnumDefinition | None, Mapping[str, str]]:
-        """Return the enumeration of a field, by name or in its `map`, and its aliases."""
-        if model.name is None:
-            return None, {}
-        if model.enumeration is not None and isinstance(model, FieldModel) and not named:
-            bits = str(model.type).removeprefix("u")
-            types = f"enum{bits}" if bits in ("8", "16", "32") else "enum8, enum16 or enum32"
-            raise IcdError(f"{where}: `enum` needs type {types}, not {model.type}")
-        if model.map is None:
-            return (self._definitions.enum_of(model.enumeration, where) if named else None), {}
-        if model.enumeration is not None:
-            raise IcdError(f"{where}: has both `map` and `enum`")
-        return mapped(model.map, where)
+        slot = self._slot("bytes", model.size or 0) if string else self._scalar_slot(model.type, model.order)
+        self._append(self._field(model, slot, where, suffix, number))
 
     def _add_bits(self, model: FieldModel, suffix: str, number: int | None) -> None:
         where = f"{self._where}: field {model.name or 'unused'}"
@@ -204,40 +155,70 @@ class Layout:
         shift = 0
         for bit in model.bits:
             here = f"{self._where}: field {bit.name or 'unused'}"
-            self._append(self._bit(model, bit, slot, shift, here, suffix, number))
+            field = self._field(bit, slot, here, suffix, number)
+            provenance = bit.provenance or model.provenance or self._provenance
+            self._append(field.changed(shift=shift, width=bit.width, provenance=provenance))
             shift += bit.width
         if shift != 8 * slot.size:
             raise IcdError(f"{where}: the bits add up to {shift}, must be {8 * slot.size}")
 
-    def _bit(
-        self,
-        model: FieldModel,
-        bit: BitModel,
-        slot: Slot,
-        shift: int,
-        where: str,
-        suffix: str,
-        number: int | None,
+    def _field(
+        self, model: FieldModel | BitModel, slot: Slot, where: str, suffix: str, number: int | None
     ) -> Field:
-        keys = self._keys(bit, where, suffix, number, unit=bit.unit, named=bit.enumeration is not None)
-        self._check_numbers(bit, where, f"u{bit.width}", (0, 2**bit.width - 1))
-        enum = keys["enum"]
-        if enum is not None and max(enum.values.values()) >= 2**bit.width:
-            raise IcdError(f"{where}: enumeration {enum.name} does not fit {bit.width} bits")
-        if bit.const is not None and not (isinstance(bit.const, int) and 0 <= bit.const < 2**bit.width):
-            raise IcdError(f"{where}: const {bit.const:g} does not fit {bit.width} bits")
-        kind: FieldKind = "enum" if enum is not None else "flag" if bit.width == 1 else "bits"
-        if kind != "bits" and (bit.scale, bit.bias) != (1.0, 0.0):
+        """Return a field that is a whole slot; the place of bits is still to be set."""
+        kind: FieldKind
+        limits: tuple[int, int] | None
+        if isinstance(model, BitModel):
+            kind = "flag" if model.width == 1 else "bits"
+            limits, described = (0, 2**model.width - 1), f"{model.width} bits"
+        else:
+            kind = _KINDS.get(str(model.type), "integer")
+            limits, described = INTEGER_RANGES.get(slot.type), f"type {model.type}"
+        _check_numbers(model, limits, described, where)
+        enum, aliases = self._enumeration(model, where)
+        if enum is not None:
+            kind = "enum"
+            low, high = limits or (0, -1)
+            if not all(low <= value <= high for value in enum.values.values()):
+                raise IcdError(f"{where}: enumeration {enum.name} does not fit {described}")
+        if kind not in ("integer", "float", "bits") and (model.scale, model.bias) != (1.0, 0.0):
             raise IcdError(f"{where}: scale and offset need a number of at least 2 bits")
-        keys |= {"provenance": bit.provenance or model.provenance, "shift": shift, "width": bit.width}
-        return self._placed(bit, slot, keys, kind)
-
-    def _placed(
-        self, model: FieldModel | BitModel, slot: Slot, keys: dict[str, Any], kind: FieldKind
-    ) -> Field:
-        keys["provenance"] = keys["provenance"] or self._provenance
-        keys |= {"kind": "unused" if model.name is None else kind, "slot": slot}
+        given = vars(model)
+        keys = {key: given[key] for key in FieldKeys.model_fields if key in given}
+        if model.const is not None:
+            keys |= {"minimum": model.const, "maximum": model.const}
+        keys |= {
+            "name": model.name + suffix if model.name else "",
+            "kind": "unused" if model.name is None else kind,
+            "slot": slot,
+            "enum": enum,
+            "aliases": aliases,
+            "default": _default(model.default, enum, where),
+            "parameter": self._definitions.check_parameter(model.parameter, model.unit, where),
+            "value": _numbered(model.value, number, where),
+            "argument": _numbered(model.argument, number, where),
+            "provenance": model.provenance or self._provenance,
+        }
         return _UNPLACED.model_copy(update=keys)
+
+    def _enumeration(
+        self, model: FieldModel | BitModel, where: str
+    ) -> tuple[EnumDefinition | None, Mapping[str, str]]:
+        """Return the enumeration of a field, by name or in its `map`, and its aliases."""
+        if model.name is None:
+            return None, {}
+        is_number = isinstance(model, FieldModel) and not str(model.type).startswith("enum")
+        if isinstance(model, FieldModel) and is_number and model.enumeration is not None:
+            bits = str(model.type).removeprefix("u")
+            types = f"enum{bits}" if bits in ("8", "16", "32") else "enum8, enum16 or enum32"
+            raise IcdError(f"{where}: `enum` needs type {types}, not {model.type}")
+        if model.map is not None:
+            if model.enumeration is not None:
+                raise IcdError(f"{where}: has both `map` and `enum`")
+            return mapped(model.map, where)
+        if is_number or (isinstance(model, BitModel) and model.enumeration is None):
+            return None, {}
+        return self._definitions.enum_of(model.enumeration, where), {}
 
     def _scalar_slot(self, type_: str, order: Order | None) -> Slot:
         """Return the slot of a number, an enumeration or a bit field."""
@@ -260,28 +241,27 @@ class Layout:
         self.fields.append(item)
         self._names |= {item.name} - {""}
 
-    @staticmethod
-    def _check_numbers(
-        model: FieldModel | BitModel, where: str, type_: str, limits: tuple[int, int] | None
-    ) -> None:
-        if abs(model.scale) < SMALLEST_SCALE:
-            raise IcdError(f"{where}: scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}")
-        if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
-            raise IcdError(f"{where}: min {model.minimum:g} is above max {model.maximum:g}")
-        if model.wrap and not type_.startswith("u"):
-            raise IcdError(f"{where}: wrap: only unsigned integers wrap")
-        if model.wrap and (model.minimum, model.maximum) != (None, None):
-            raise IcdError(f"{where}: wrap: a field that wraps has no min and max")
-        if limits is None:
-            return
-        described = f"type {type_}" if isinstance(model, FieldModel) else f"{type_[1:]} bits"
-        numbers = {"min": model.minimum, "max": model.maximum, "const": model.const, "default": model.default}
-        for name, value in numbers.items():
-            if (
-                isinstance(value, int | float)
-                and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]
-            ):
-                raise IcdError(f"{where}: {name} {value:g} does not fit {described} with its scale")
+
+def _check_numbers(
+    model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str, where: str
+) -> None:
+    if abs(model.scale) < SMALLEST_SCALE:
+        raise IcdError(f"{where}: scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}")
+    if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
+        raise IcdError(f"{where}: min {model.minimum:g} is above max {model.maximum:g}")
+    if model.wrap and isinstance(model, FieldModel) and not str(model.type).startswith("u"):
+        raise IcdError(f"{where}: wrap: only unsigned integers wrap")
+    if model.wrap and (model.minimum, model.maximum) != (None, None):
+        raise IcdError(f"{where}: wrap: a field that wraps has no min and max")
+    if limits is None:
+        return
+    numbers = {"min": model.minimum, "max": model.maximum, "const": model.const, "default": model.default}
+    for name, value in numbers.items():
+        if (
+            isinstance(value, int | float)
+            and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]
+        ):
+            raise IcdError(f"{where}: {name} {value:g} does not fit {described} with its scale")
 
 
 def mapped(
@@ -338,7 +318,7 @@ def fields_of(text: str) -> list[FieldModel]:
         return [FieldModel.model_validate(table) for table in tables]
     except ValidationError as error:
         first = error.errors()[0]
-        raise IcdError(f"{first['loc'][-1]}: {first['msg']}") from None
+        raise IcdError(f"{first['loc'][-1]}: {wording(first)}") from None
 
 
 def _scalars(type_: str, name: str, *words: str) -> list[dict[str, Any]]:

@@ -99,8 +99,11 @@ def c_comment(*paragraphs: str) -> str:
 
 
 def c_string(text: str) -> str:
-    """Return text as a C string, whose other characters than letters, digits and spaces are escaped."""
-    return '"' + re.sub(r"[^A-Za-z0-9 ]", lambda found: f"\\{ord(found[0]):03o}", text) + '"'
+    """Return text as a C string in UTF-8, whose other characters than letters, digits and spaces are escaped."""
+    escaped = (
+        chr(byte) if re.match(rb"[A-Za-z0-9 ]", bytes([byte])) else f"\\{byte:03o}" for byte in text.encode()
+    )
+    return f'"{"".join(escaped)}"'
 
 
 def dbc_string(text: str) -> str:

@@ -524,7 +524,8 @@ def command_parts(name: str, command: Any) -> Iterator[str]:
     """Yield the section of a command, or of each command in a group."""
     if hasattr(command, "commands"):
         for inner, item in command.commands.items():
-            yield from command_parts(f"{name} {inner}", item)
+            if not item.hidden:
+                yield from command_parts(f"{name} {inner}", item)
         return
     shown = [parameter for parameter in command.params if not getattr(parameter, "hidden", False)]
     arguments = [parameter for parameter in shown if parameter.param_type_name == "argument"]

@@ -39,6 +39,14 @@ class CaseOptions:
     ] = None
     eds: Annotated[Path | None, typer.Option(help="EDS file of the CANopen node; default: starhil's.")] = None
     settings: Settings = None
+    truth: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LOG|RA,DEC,ROLL",
+            help="Without --start: the true attitude, as the truth log of a running emulator (run --truth-log), or as right "
+            "ascension, declination and roll of a sensor at rest in degrees.",
+        ),
+    ] = None
     speed: Annotated[
         float,
         typer.Option(
@@ -73,6 +81,8 @@ class CaseOptions:
             serial, can, canopen = links_of(load_unit(bench.unit or DEFAULT_UNIT), canopen)
         if self.settings and not bench.start:
             raise BenchError("--set needs --start: it overrides a key of the emulator's profile")
+        if self.truth is not None and bench.start:
+            raise BenchError("--truth is for a unit that runs already; with --start the truth is known")
         if canopen is not None and can is None:
             raise BenchError("--canopen needs --can: give the channel of the node")
         if not bench.start and not list_only and serial == "auto":
@@ -86,6 +96,7 @@ class CaseOptions:
             start=bench.start,
             profile=bench.profile,
             settings=tuple(self.settings or ()),
+            truth=self.truth,
             dialect=checked_dialect(bench.dialect),
             baud=self.baud,
             host_address=bench.host_address,

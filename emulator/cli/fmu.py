@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,12 +11,10 @@ from starhil.emulator.cli.options import ProfileArgument
 from starhil.emulator.cli.output import writing
 from starid.cli.output import output_help
 
+if TYPE_CHECKING:
+    from starhil.emulator.fmu.variables import Fmi
+
 group = typer.Typer(help="Export the star tracker as a Functional Mock-up Unit (FMU).", no_args_is_help=True)
-
-
-@group.callback()
-def _about() -> None:
-    """Keep `export` a sub-command, although it is the only one."""
 
 
 @group.command()
@@ -31,7 +29,7 @@ def export(
 
     Where it is simulated, `starhil` must be installed: the FMU starts it.
     """
-    from typing import Literal, cast
+    from typing import cast
 
     from starhil.emulator.fmu.export import export_fmu
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
@@ -43,4 +41,12 @@ def export(
     load_profile(name)
     where = str(Path(name).absolute()) if name.endswith(".toml") else name
     with writing(output):
-        export_fmu(output, where, installed_command(), cast("Literal['2', '3']", fmi))
+        export_fmu(output, where, installed_command(), cast("Fmi", fmi))
+
+
+@group.command(hidden=True)
+def serve() -> None:
+    """Run the emulator of an FMU, whose packets are on standard input."""
+    from starhil.emulator.cli.fmu_process import serve
+
+    serve()

@@ -40,9 +40,9 @@ from starhil.emulator.run import Run
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
-from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
+from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -282,9 +282,10 @@ class ControlServer:
     async def _run_scenario(self, head: Head, request: dict[str, Any]) -> Answer:
         if self._run.recorder is not None:
             raise EmulatorError("scenario: a recorded run can only start with a scenario; use --scenario")
-        scenario = await asyncio.to_thread(load_scenario, str(request.get("name", "")))
-        scenario.enter(head, self._run.truth, start_s=self._run.clock.now_ns() / NANOSECONDS)
-        return {"events": len(scenario.at)}
+        name, start_s = str(request.get("name", "")), self._run.clock.now_ns() / NANOSECONDS
+        events = await asyncio.to_thread(lambda: load_scenario(name).prepare(head, self._run.truth, start_s))
+        head.device.scheduler.add(events)
+        return {"events": len(events)}
 
     async def _quit_run(self, _head: Head, _request: dict[str, Any]) -> Answer:
         asyncio.get_running_loop().call_soon(self._quit)
@@ -302,7 +303,7 @@ def _parse(model: type[Model], value: object) -> Model:
     try:
         return model.model_validate_json(json.dumps(value))
     except ValidationError as error:
-        raise EmulatorError(explain(error, model)) from None
+        raise EmulatorError(*map(str, problems(error, model, value))) from None
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:

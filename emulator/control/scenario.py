@@ -32,7 +32,7 @@ from starhil.emulator.head import Head
 from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
-from starhil.emulator.validation_messages import explain
+from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
@@ -85,18 +85,20 @@ class Scenario(Strict):
     at: Annotated[list[ScenarioEvent], Field(min_length=1)]
     """Events, in any order."""
 
-    def enter(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> None:
-        """Schedule all events, relative to a simulation time in seconds; their files are read and checked now.
+    def prepare(self, head: Head, truth: Truth | None, start_s: float = 0.0) -> list[tuple[int, Action]]:
+        """Return the time of each event, nanoseconds, and its action; all files are read and checked now.
 
-        The faults affect a head whose links are open. The truth is that of the run; None if another head sets it.
+        Times are relative to a simulation time in seconds. The faults affect a head whose links are open. The truth
+        is that of the run; None if another head sets it.
         """
+        events = []
         for event in sorted(self.at, key=lambda each: each.run_time_s):
             at_s = start_s + event.run_time_s
             try:
-                action = event.prepare(head, truth, at_s)
+                events.append((round(at_s * NANOSECONDS), event.prepare(head, truth, at_s)))
             except (EmulatorError, StaridError) as error:
                 raise EmulatorError(f"scenario at {event.run_time_s:g} s: {error}") from None
-            head.device.scheduler.at(round(at_s * NANOSECONDS), action)
+        return events
 
 
 def load_scenario(name_or_path: str) -> Scenario:
@@ -106,4 +108,5 @@ def load_scenario(name_or_path: str) -> Scenario:
     try:
         return Scenario.model_validate(values)
     except ValidationError as error:
-        raise EmulatorError(f"scenario {path}: {explain(error, Scenario)}") from None
+        found = problems(error, Scenario, values)
+        raise EmulatorError(*(f"scenario {path}: {problem}" for problem in found)) from None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -52,6 +52,11 @@ class Scheduler:
         heapq.heappush(self._queue, event)
         self.added.emit(event)
         return event
+
+    def add(self, events: Iterable[tuple[int, Action]]) -> None:
+        """Schedule actions, each with its simulation time in nanoseconds."""
+        for due_ns, action in events:
+            self.at(due_ns, action)
 
     def next_due_ns(self) -> int | None:
         """Return the time of the next event, nanoseconds, or None."""

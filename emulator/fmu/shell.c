@@ -1,22 +1,13 @@
 /* The star tracker as a Functional Mock-up Unit, versions 2.0 and 3.0, for co-simulation.
  *
- * A step sends the inputs to the live feed of an emulator on the stepped clock, waits for the answer in lock-step, and reads the
- * last measurement from the control channel. The shell starts the emulator and ends it, or connects to one that runs. The inputs
- * of a step are those at its begin: the emulator is one step behind the simulation.
- *
- * The emulator runs under a shell that ends it when its standard input ends, which is a pipe from this process: it ends with
- * this process, however this process ends. `model.h` is generated with the description: the variables and their start values.
+ * The shell holds the values of all variables and exchanges them with the process `starhil fmu serve`, in one packet each way. The
+ * first exchange starts the emulator or connects to one, each further one is a step. That process ends when this end of their
+ * socket is closed, thus also with this process, however it ends. `model.h` is generated with the description of the variables.
  */
 #define _GNU_SOURCE
 #include "model.h"
 
 #include <errno.h>
-#include <fcntl.h>
-#include <locale.h>
-#include <math.h>
-#include <netdb.h>
-#include <poll.h>
-#include <signal.h>
 #include <spawn.h>
 #include <stdarg.h>
 #include <stdbool.h>
@@ -26,17 +17,10 @@
 #include <stdlib.h>
 #include <string.h>
 #include <sys/socket.h>
-#include <sys/un.h>
 #include <sys/wait.h>
-#include <time.h>
 #include <unistd.h>
 
 #define EXPORT __attribute__((visibility("default")))
-#define LINE 16384
-#define START_MS 300000 /* the first start on a machine compiles kernels */
-#define ANSWER_MS 60000
-#define END_MS 10000
-
 extern char **environ;
 
 enum status { OK = 0, WARNING = 1, ERROR = 3 };
@@ -50,19 +34,18 @@ struct callbacks2 {
     void *environment;
 };
 
-struct stream {
-    int descriptor;
-    size_t filled;
-    char bytes[LINE];
+struct values { /* the packet */
+    double numbers[NUMBERS];
+    char texts[TEXTS][TEXT_SIZE];
+    char message[TEXT_SIZE]; /* for the host's log, with `status` */
+    int status;
 };
 
 struct unit {
-    double numbers[VARIABLES];
-    char *texts[VARIABLES];
-    struct stream feed, control, output;
-    int lifeline; /* write end of the pipe whose end ends the emulator */
+    struct values values;
+    int link;
     pid_t process;
-    char name[64], said[512];
+    char name[64];
     logger3 log3;
     logger2 log2;
     void *environment;
@@ -71,7 +54,7 @@ struct unit {
 static int report(struct unit *unit, enum status status, const char *format, ...)
 {
     const char *category = status == ERROR ? "logStatusError" : "logStatusWarning";
-    char message[1024];
+    char message[TEXT_SIZE + 256];
     va_list arguments;
     va_start(arguments, format);
     (void)vsnprintf(message, sizeof message, format, arguments);
@@ -84,294 +67,83 @@ static int report(struct unit *unit, enum status status, const char *format, ...
     return status;
 }
 
-/* --- lines over descriptors --- */
+/* --- the process of the emulator --- */
 
-static void close_stream(struct stream *stream)
+static void end(struct unit *unit)
 {
-    if (stream->descriptor >= 0) {
-        (void)close(stream->descriptor);
-    }
-    stream->descriptor = -1;
-    stream->filled = 0u;
-}
-
-/* Read a line of at most LINE bytes into `line`. Returns false at the end of the stream, or if none arrives in time. */
-static bool read_line(struct stream *stream, char *line, int patience_ms)
-{
-    for (;;) {
-        char *end = memchr(stream->bytes, '\n', stream->filled);
-        if (end != NULL) {
-            const size_t size = (size_t)(end - stream->bytes);
-            memcpy(line, stream->bytes, size);
-            line[size] = '\0';
-            stream->filled -= size + 1u;
-            memmove(stream->bytes, end + 1, stream->filled);
-            return true;
-        }
-        struct pollfd readable = {stream->descriptor, POLLIN, 0};
-        int ready = 0;
-        if (stream->filled == LINE) {
-            stream->filled = 0u; /* longer than any line of the emulator */
-            return false;
-        }
-        do {
-            ready = stream->descriptor < 0 ? 0 : poll(&readable, 1u, patience_ms);
-        } while (ready < 0 && errno == EINTR); /* a signal of the host */
-        if (ready <= 0) {
-            return false;
-        }
-        const ssize_t count = read(stream->descriptor, stream->bytes + stream->filled, LINE - stream->filled);
-        if (count <= 0) {
-            return false;
-        }
-        stream->filled += (size_t)count;
-    }
-}
-
-/* Keep the emulator's output from filling its pipe; its last line explains an end. */
-static void read_output(struct unit *unit, bool as_warnings)
-{
-    char line[LINE];
-    while (unit->output.descriptor >= 0 && read_line(&unit->output, line, 0)) {
-        (void)snprintf(unit->said, sizeof unit->said, "%.500s", line);
-        if (as_warnings) {
-            (void)report(unit, WARNING, "emulator: %s", line);
+    if (unit->process > 0) {
+        (void)close(unit->link);
+        while (waitpid(unit->process, NULL, 0) < 0 && errno == EINTR) { /* a signal of the host */
         }
     }
-}
-
-static bool ask(struct stream *stream, const char *request, char *answer)
-{
-    size_t sent = 0u;
-    const size_t size = strlen(request);
-    while (sent < size) {
-        const ssize_t count = send(stream->descriptor, request + sent, size - sent, MSG_NOSIGNAL);
-        if (count <= 0) {
-            return false;
-        }
-        sent += (size_t)count;
-    }
-    return read_line(stream, answer, ANSWER_MS);
-}
-
-/* Connect to unix:/PATH, tcp:HOST:PORT or HOST:PORT. */
-static bool connect_to(struct stream *stream, const char *address)
-{
-    close_stream(stream);
-    if (strncmp(address, "unix:", 5u) == 0) {
-        struct sockaddr_un place = {.sun_family = AF_UNIX};
-        (void)snprintf(place.sun_path, sizeof place.sun_path, "%.*s", (int)sizeof place.sun_path - 1, address + 5);
-        stream->descriptor = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
-        return stream->descriptor >= 0 && connect(stream->descriptor, (struct sockaddr *)&place, sizeof place) == 0;
-    }
-    char host[256];
-    (void)snprintf(host, sizeof host, "%s", strncmp(address, "tcp:", 4u) == 0 ? address + 4 : address);
-    char *port = strrchr(host, ':');
-    struct addrinfo hints = {.ai_family = AF_INET, .ai_socktype = SOCK_STREAM}, *found = NULL;
-    if (port == NULL) {
-        return false;
-    }
-    *port++ = '\0';
-    if (getaddrinfo(host, port, &hints, &found) != 0) {
-        return false;
-    }
-    stream->descriptor = socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-    const bool done = stream->descriptor >= 0 && connect(stream->descriptor, found->ai_addr, found->ai_addrlen) == 0;
-    freeaddrinfo(found);
-    return done;
-}
-
-/* --- the emulator --- */
-
-static void end_emulator(struct unit *unit)
-{
-    close_stream(&unit->feed);
-    close_stream(&unit->control);
-    if (unit->process <= 0) {
-        return;
-    }
-    (void)close(unit->lifeline);
-    for (int waited_ms = 0; waitpid(unit->process, NULL, WNOHANG) == 0; waited_ms += 10) {
-        const struct timespec pause = {0, 10000000};
-        read_output(unit, false);
-        if (waited_ms == END_MS) {
-            (void)kill(-unit->process, SIGKILL);
-        }
-        (void)nanosleep(&pause, NULL);
-    }
-    close_stream(&unit->output);
+    unit->link = -1;
     unit->process = 0;
 }
 
-static bool start_emulator(struct unit *unit)
+static int exchange(struct unit *unit)
 {
-    static const char script[] = "\"$@\" 2>&1 & exec >/dev/null; read end; kill $! 2>&1; wait";
-    char seed[32], convention[64], order[64], link[4096];
-    int input[2], output[2];
-    (void)snprintf(seed, sizeof seed, "%d", (int)unit->numbers[SEED]);
-    (void)snprintf(convention, sizeof convention, "truth.convention=%s", unit->texts[CONVENTION]);
-    (void)snprintf(order, sizeof order, "truth.order=%s", unit->texts[ORDER]);
-    (void)snprintf(link, sizeof link, "links.serial.symlink=%s", unit->texts[SYMLINK]);
-    const char *words[] = {
-        "/bin/sh", "-c", script, "sh", unit->texts[COMMAND], "run", unit->texts[PROFILE], "--clock", "stepped", "--seed", seed,
-        "--serial", unit->texts[SERIAL], "--can", unit->texts[CAN], "--control", "auto", "--set", "truth.kind=live",
-        "--set", "truth.protocol=tcp", "--set", "truth.port=0", "--set", "truth.lockstep=true",
-        "--set", convention, "--set", order, unit->texts[SYMLINK][0] != '\0' ? "--set" : NULL, link, NULL};
-    posix_spawn_file_actions_t actions;
-    posix_spawnattr_t attributes;
-    if (pipe2(input, O_CLOEXEC) != 0) {
-        return false;
+    ssize_t size = send(unit->link, &unit->values, sizeof unit->values, MSG_NOSIGNAL);
+    if (size > 0) {
+        do {
+            size = recv(unit->link, &unit->values, sizeof unit->values, 0);
+        } while (size < 0 && errno == EINTR);
     }
-    if (pipe2(output, O_CLOEXEC) != 0) {
-        (void)close(input[0]);
-        (void)close(input[1]);
-        return false;
+    if (size != (ssize_t)sizeof unit->values) {
+        end(unit);
+        return report(unit, ERROR, "%s has ended", unit->values.texts[COMMAND]);
     }
-    (void)posix_spawn_file_actions_init(&actions);
-    (void)posix_spawn_file_actions_adddup2(&actions, input[0], STDIN_FILENO);
-    (void)posix_spawn_file_actions_adddup2(&actions, output[1], STDOUT_FILENO);
-    (void)posix_spawnattr_init(&attributes);
-    (void)posix_spawnattr_setflags(&attributes, POSIX_SPAWN_SETPGROUP); /* Ctrl-C in the host's terminal does not reach it */
-    if (posix_spawn(&unit->process, "/bin/sh", &actions, &attributes, (char *const *)words, environ) != 0) {
-        unit->process = 0;
+    if (unit->values.message[0] != '\0') {
+        (void)report(unit, unit->values.status, "%s", unit->values.message);
     }
-    (void)posix_spawnattr_destroy(&attributes);
-    (void)posix_spawn_file_actions_destroy(&actions);
-    (void)close(input[0]);
-    (void)close(output[1]);
-    unit->lifeline = input[1];
-    unit->output.descriptor = output[0];
-    return unit->process > 0;
-}
-
-/* Copy the value of NAME=VALUE from the ready line. */
-static bool field(const char *line, const char *name, char *value, size_t size)
-{
-    const char *found = strstr(line, name);
-    if (found == NULL) {
-        return false;
+    if (unit->values.status != ERROR) {
+        return OK;
     }
-    found += strlen(name);
-    (void)snprintf(value, size, "%.*s", (int)strcspn(found, " \n"), found);
-    return true;
+    end(unit);
+    return ERROR;
 }
 
 static int begin(struct unit *unit)
 {
-    char feed[256], control[256], line[LINE];
-    (void)snprintf(feed, sizeof feed, "%s", unit->texts[FEED]);
-    (void)snprintf(control, sizeof control, "%s", unit->texts[CONTROL]);
-    if (feed[0] == '\0') {
-        if (!start_emulator(unit)) {
-            return report(unit, ERROR, "no process for the emulator: %s", strerror(errno));
-        }
-        do {
-            if (!read_line(&unit->output, line, START_MS)) {
-                end_emulator(unit);
-                return report(unit, ERROR, "%s does not start: %s", unit->texts[COMMAND], unit->said);
-            }
-            (void)snprintf(unit->said, sizeof unit->said, "%.500s", line);
-        } while (strncmp(line, "ready ", 6u) != 0);
-        if (!field(line, " truth=", feed, sizeof feed) || !field(line, " control=", control, sizeof control)) {
-            end_emulator(unit);
-            return report(unit, ERROR, "the emulator names no feed and control channel: %s", line);
-        }
-        (void)fcntl(unit->output.descriptor, F_SETFL, O_NONBLOCK);
-        free(unit->texts[READY]);
-        unit->texts[READY] = strdup(line);
+    char *command = unit->values.texts[COMMAND], *words[] = {command, "fmu", "serve", NULL};
+    int ends[2], fault;
+    posix_spawn_file_actions_t actions;
+    posix_spawnattr_t attributes;
+    if (socketpair(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC, 0, ends) != 0) {
+        return report(unit, ERROR, "no socket: %s", strerror(errno));
     }
-    if (!connect_to(&unit->feed, feed) || !connect_to(&unit->control, control)) {
-        end_emulator(unit);
-        return report(unit, ERROR, "no emulator at %s and %s: %s", feed, control, strerror(errno));
+    (void)posix_spawn_file_actions_init(&actions);
+    (void)posix_spawn_file_actions_adddup2(&actions, ends[1], STDIN_FILENO);
+    (void)posix_spawnattr_init(&attributes);
+    (void)posix_spawnattr_setflags(&attributes, POSIX_SPAWN_SETPGROUP); /* Ctrl-C in the host's terminal does not reach it */
+    fault = posix_spawnp(&unit->process, command, &actions, &attributes, words, environ);
+    (void)posix_spawnattr_destroy(&attributes);
+    (void)posix_spawn_file_actions_destroy(&actions);
+    (void)close(ends[1]);
+    unit->link = ends[0];
+    if (fault != 0) {
+        (void)close(ends[0]);
+        unit->process = 0;
+        return report(unit, ERROR, "%s does not start: %s", command, strerror(fault));
     }
-    return OK;
-}
-
-static int lost(struct unit *unit, const char *during)
-{
-    read_output(unit, false);
-    end_emulator(unit);
-    return report(unit, ERROR, "the emulator has ended or does not answer (%s); its last line: %s", during, unit->said);
-}
-
-/* Take the outputs from the row of the last measurement; what it does not have, such as the attitude of an invalid one, stays. */
-static void read_outputs(struct unit *unit, const char *row)
-{
-    for (int index = 0; index < VARIABLES; ++index) {
-        char key[64];
-        if (KEYS[index] == NULL || snprintf(key, sizeof key, "\"%s\": ", KEYS[index]) < 0) {
-            continue;
-        }
-        const char *value = strstr(row, key);
-        if (value == NULL) {
-            continue;
-        }
-        value += strlen(key);
-        if (*value == '"') {
-            free(unit->texts[index]);
-            unit->texts[index] = strndup(value + 1, strcspn(value + 1, "\""));
-        } else if (strncmp(value, "null", 4u) != 0) {
-            unit->numbers[index] = *value == 't' ? 1.0 : *value == 'f' ? 0.0 : strtod(value, NULL);
-        }
-    }
-}
-
-static size_t add_vector(char *text, size_t size, const char *name, const double *numbers, int count)
-{
-    size_t length = (size_t)snprintf(text, size, ", \"%s\": [", name);
-    for (int index = 0; index < count; ++index) {
-        length += (size_t)snprintf(text + length, size - length, "%s%.17g", index > 0 ? ", " : "", numbers[index]);
-    }
-    return length + (size_t)snprintf(text + length, size - length, "]");
+    return exchange(unit);
 }
 
 static int step(struct unit *unit, double time, double size)
 {
-    const double *numbers = unit->numbers, *position = numbers + POSITION_X;
-    char message[2048], answer[LINE];
-    const locale_t c_locale = newlocale(LC_ALL_MASK, "C", (locale_t)0);
-    const locale_t hosts = uselocale(c_locale); /* the decimal point of numbers */
-    size_t length = (size_t)snprintf(message, sizeof message, "{\"t\": %.9f", time);
-    length += add_vector(message + length, sizeof message - length, "q", numbers + Q_1, 4);
-    if (numbers[CHECK_RATES] != 0.0) {
-        length += add_vector(message + length, sizeof message - length, "rate", numbers + RATE_X, 3);
-    }
-    if (position[0] != 0.0 || position[1] != 0.0 || position[2] != 0.0) {
-        length += add_vector(message + length, sizeof message - length, "position_m", position, 3);
-        length += add_vector(message + length, sizeof message - length, "velocity_m_s", numbers + VELOCITY_X, 3);
-    }
-    if (numbers[UNIX_S] != 0.0) {
-        length += (size_t)snprintf(message + length, sizeof message - length, ", \"unix_s\": %.9f", numbers[UNIX_S]);
-    }
-    (void)snprintf(message + length, sizeof message - length, "}\n");
-    int status = OK;
-    if (!ask(&unit->feed, message, answer)) {
-        status = lost(unit, "step");
-    } else if (strncmp(answer, "{\"ok\": true", 11u) != 0) {
-        status = report(unit, ERROR, "inputs at %g s rejected: %s", time, answer);
-    } else if (!ask(&unit->control, "{\"do\": \"frames\"}\n", answer)) {
-        status = lost(unit, "measurement");
-    } else {
-        read_outputs(unit, answer);
-        unit->numbers[TIME] = time + size;
-        read_output(unit, true);
-    }
-    (void)uselocale(hosts);
-    freelocale(c_locale);
+    unit->values.numbers[TIME] = time;
+    const int status = exchange(unit);
+    unit->values.numbers[TIME] += status == OK ? size : 0.0;
     return status;
 }
 
 /* --- instances and values, for both versions --- */
 
-static void clear(struct unit *unit)
+static int clear(struct unit *unit)
 {
-    end_emulator(unit);
-    for (int index = 0; index < VARIABLES; ++index) {
-        unit->numbers[index] = START_NUMBERS[index];
-        free(unit->texts[index]);
-        unit->texts[index] = strdup(START_TEXTS[index]);
-    }
-    unit->said[0] = '\0';
+    static const struct values start = {.numbers = START_NUMBERS, .texts = START_TEXTS};
+    end(unit);
+    unit->values = start;
+    return OK;
 }
 
 static struct unit *make(const char *name, const char *token, logger3 log3, logger2 log2, void *environment)
@@ -383,53 +155,54 @@ static struct unit *make(const char *name, const char *token, logger3 log3, logg
     unit->log3 = log3;
     unit->log2 = log2;
     unit->environment = environment;
-    unit->feed.descriptor = unit->control.descriptor = unit->output.descriptor = -1;
     (void)snprintf(unit->name, sizeof unit->name, "%.63s", name);
     if (strcmp(token, TOKEN) != 0) {
         (void)report(unit, ERROR, "the instantiation token is not that of this FMU");
         free(unit);
         return NULL;
     }
-    clear(unit);
+    (void)clear(unit);
     return unit;
 }
 
 static void drop(struct unit *unit)
 {
     if (unit != NULL) {
-        end_emulator(unit);
-        for (int index = 0; index < VARIABLES; ++index) {
-            free(unit->texts[index]);
-        }
+        end(unit);
         free(unit);
     }
 }
 
-/* Getter and setter of a type: the values of variables by their references. */
-#define FOR_EACH(BODY)                                                                                                             \
+static int set_text(struct unit *unit, uint32_t number, const char *text)
+{
+    return snprintf(unit->values.texts[number], TEXT_SIZE, "%s", text) < TEXT_SIZE ? OK : report(unit, ERROR, "a text is too long");
+}
+
+/* Getter and setter of a type: the values of COUNT variables, those from BEGIN on, by their references. */
+#define FOR_EACH(BEGIN, COUNT, BODY)                                                                                               \
     for (size_t index = 0; index < count; ++index) {                                                                               \
-        const uint32_t variable = references[index];                                                                               \
-        if (variable >= VARIABLES) {                                                                                               \
+        const uint32_t variable = references[index] - (BEGIN);                                                                     \
+        if (variable >= (COUNT)) {                                                                                                 \
             return ERROR;                                                                                                          \
         }                                                                                                                          \
         BODY                                                                                                                       \
     }                                                                                                                              \
     return OK;
-#define ACCESS(VERSION, NAME, TYPE, GET, SET, ...)                                                                                 \
+#define ACCESS(VERSION, NAME, TYPE, BEGIN, COUNT, GET, SET, ...)                                                                   \
     EXPORT int VERSION##Get##NAME(struct unit *unit, const uint32_t *references, size_t count, TYPE *values __VA_ARGS__)           \
     {                                                                                                                              \
-        FOR_EACH(GET)                                                                                                              \
+        FOR_EACH(BEGIN, COUNT, GET)                                                                                                \
     }                                                                                                                              \
     EXPORT int VERSION##Set##NAME(struct unit *unit, const uint32_t *references, size_t count, const TYPE *values __VA_ARGS__)     \
     {                                                                                                                              \
-        FOR_EACH(SET)                                                                                                              \
+        FOR_EACH(BEGIN, COUNT, SET)                                                                                                \
     }
 #define NUMBER(VERSION, NAME, TYPE, ...)                                                                                           \
-    ACCESS(VERSION, NAME, TYPE, values[index] = (TYPE)unit->numbers[variable];,                                                    \
-           unit->numbers[variable] = (double)values[index];, __VA_ARGS__)
+    ACCESS(VERSION, NAME, TYPE, 0u, NUMBERS, values[index] = (TYPE)unit->values.numbers[variable];,                                \
+           unit->values.numbers[variable] = (double)values[index];, __VA_ARGS__)
 #define TEXT(VERSION, ...)                                                                                                         \
-    ACCESS(VERSION, String, char *, values[index] = unit->texts[variable];, free(unit->texts[variable]);                           \
-           unit->texts[variable] = strdup(values[index]);, __VA_ARGS__)
+    ACCESS(VERSION, String, char *, NUMBERS, TEXTS, values[index] = unit->values.texts[variable];,                                 \
+           if (set_text(unit, variable, values[index]) != OK) { return ERROR; }, __VA_ARGS__)
 #define SIZE , size_t size __attribute__((unused))
 
 NUMBER(fmi2, Real, double, )
@@ -449,8 +222,8 @@ TEXT(fmi3, SIZE)
 #define UNSUPPORTED(NAME) EXPORT int NAME(struct unit *unit) { return report(unit, ERROR, #NAME ": not supported"); }
 
 BOTH(ExitInitializationMode, return begin(unit);)
-BOTH(Terminate, end_emulator(unit); return OK;)
-BOTH(Reset, clear(unit); return OK;)
+BOTH(Terminate, end(unit); return OK;)
+BOTH(Reset, return clear(unit);)
 EXPORT void fmi2FreeInstance(struct unit *unit) { drop(unit); }
 EXPORT void fmi3FreeInstance(struct unit *unit) { drop(unit); }
 NOTHING(fmi2SetDebugLogging) NOTHING(fmi2SetupExperiment) NOTHING(fmi2EnterInitializationMode)

@@ -102,7 +102,7 @@ class WorkerImager:
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Send a request to the worker, for a preview too if anything shows the images."""
-        if not self.worker.running or self._writer is None:
+        if self._writer is None:
             done(Failure("pipeline worker: not running"))
             return
         if self.watchers and isinstance(request, FrameRequest):
@@ -172,5 +172,7 @@ class WorkerImager:
         if self._task is not None:
             self._task.cancel()
         await asyncio.get_running_loop().run_in_executor(None, self.worker.end)
+        self._waiting.clear()
+        self._idle.set()
         if self._started.done() and not self._started.cancelled():
             self._started.exception()  # asyncio would report a failed start again at exit

@@ -25,11 +25,6 @@ class WorkerThread:
         self._thread = threading.Thread(target=serve_in_thread, args=[link], name="pipeline", daemon=True)
         self._thread.start()
 
-    @property
-    def running(self) -> bool:
-        """Whether the thread is still running."""
-        return self._thread.is_alive()
-
     def end(self) -> None:
         """Close the socket, which ends the thread, and wait."""
         self.socket.close()
@@ -49,11 +44,6 @@ class WorkerProcess:
             command, pass_fds=[inherited.fileno()], stdin=subprocess.DEVNULL, process_group=0
         )
         inherited.close()
-
-    @property
-    def running(self) -> bool:
-        """Whether the process is still running."""
-        return self.process.poll() is None
 
     def end(self) -> None:
         """Close the socket, which ends the worker, and wait; kill it if it does not end."""

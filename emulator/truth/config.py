@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Final, Literal, Self, TypeAlias
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from starhil.emulator.truth.feed import Socket
 from starhil.emulator.truth.feed_message import JsonFormat
@@ -42,6 +42,18 @@ SegmentSeconds: TypeAlias = Annotated[float, Field(gt=0.0, le=1e9)]
 
 Date: TypeAlias = Annotated[float, Field(ge=0.0, le=LATEST_UNIX_S), BeforeValidator(unix_time)]
 """A date in UTC, stored as Unix time."""
+
+
+def _expanded(path: str) -> str:
+    """Return a path with the home folder in place of `~`; ValueError if the user has none."""
+    try:
+        return str(Path(path).expanduser()) if path.startswith("~") else path
+    except RuntimeError:
+        raise ValueError(f"{path.partition('/')[0]} has no home folder; give another path") from None
+
+
+UserPath: TypeAlias = Annotated[str, AfterValidator(_expanded)]
+"""A path as a user writes it, which may begin with `~`; expanded when it is read."""
 
 
 class Strict(BaseModel):
@@ -254,7 +266,7 @@ class FileConfig(SourceConfig):
     """A file of attitudes: CSV, CCSDS AEM, STK `.a` or SPICE; a relative path refers to the profile's folder."""
 
     kind: Literal["file"]
-    path: str
+    path: UserPath
     """The file; its content says which format it has, see truth-files.md."""
     start: Literal["run", "now"] = "run"
     """Time zero of the file, which is the first row of a file with dates: the start of the run, or the time at which
@@ -437,7 +449,7 @@ class OrbitFileConfig(Strict):
 
     kind: Literal["file"]
     """Selects this form of the orbit."""
-    path: str
+    path: UserPath
     """The file, see truth-files.md."""
 
     def build(self, start_unix_s: float, folder: Path) -> Orbit:  # noqa: ARG002 (one signature for all)

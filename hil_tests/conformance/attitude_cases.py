@@ -1,4 +1,4 @@
-"""Cases on the attitude in a row, on any link: |q| = 1, invalid in standby, and the truth where the tester knows it."""
+"""Cases on the attitudes in a row, on any link: |q| = 1, invalid in standby, one attitude in all forms, and the truth if it is given."""
 
 from __future__ import annotations
 
@@ -8,21 +8,27 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final, Protocol, Self
 
-from starhil.hil_tests.attitude import Quaternion, attitude_error, unit
-from starhil.hil_tests.conformance.case import CaseSkipped, check
+from starhil.hil_tests.attitude import Quaternion, as_reported
+from starhil.hil_tests.conformance.attitude_forms import (
+    Conventions,
+    Reading,
+    angle_deg,
+    axes_of,
+    readings,
+)
+from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check
 from starhil.hil_tests.judge.messages import Value
 from starhil.hil_tests.judge.rows import Field, Row
 
 ATTITUDE_S: Final = 20.0
 """Maximum time until an attitude is valid."""
 TRUTH_DEG: Final = 2.0
-"""Largest difference from the truth, which may have moved since the exposure."""
-QUATERNION: Final = ("attitude.x", "attitude.y", "attitude.z", "attitude.w")
+"""Largest difference from the truth, which may have moved since the exposure, and between the attitudes in a row."""
 SEARCHING: Final = "lost_in_space"
 STANDBY: Final = "standby"
 
 TruthSource = Callable[[], Quaternion]
-"""Returns the true attitude at present, as the unit reports attitudes."""
+"""Returns the true attitude from ICRS to the sensor at present."""
 
 
 class RowAccess(Protocol):
@@ -54,25 +60,34 @@ class RowAccess(Protocol):
 
 @dataclass(frozen=True)
 class AttitudeRow:
-    """A row with a quaternion and a flag of its validity; `names` of the fields by quantity."""
+    """A row with attitudes in any form; `flag` is the field of their validity, if it has one."""
 
     row: Row
-    names: Mapping[str, str]
+    conventions: Conventions
+    readings: tuple[Reading, ...]
+    flag: str | None
 
     @classmethod
-    def of(cls, row: Row) -> Self | None:
-        """Return the attitude in a row; None if it has none."""
-        names = {item.value: name for name, item in row.named.items() if item.value is not None}
-        return cls(row, names) if names.keys() >= {"attitude.valid", *QUATERNION} else None
+    def of(cls, row: Row, conventions: Conventions, fields: Iterable[Field] | None = None) -> Self | None:
+        """Return the attitudes in the fields of a row, default: all; None if there are none."""
+        chosen = list(row.named.values() if fields is None else fields)
+        found = tuple(readings(chosen, conventions))
+        flag = next((item.name for item in chosen if item.value == "attitude.valid"), None)
+        return cls(row, conventions, found, flag) if found else None
 
     @property
     def title(self) -> str:
         """Title of the case."""
-        return f"{self.row.name} has a quaternion of length 1 if it is valid"
+        return f"{self.row.name} has one attitude in all forms if it is valid, and the true one"
 
     def is_valid(self, seen: Mapping[str, Value]) -> bool:
-        """Return whether the flag, which may be a number, is set."""
-        return str(seen[self.names["attitude.valid"]]).lower() in ("true", "1")
+        """Return whether the flag, which may be a number, is set; without a flag, whether any number is not 0."""
+        if self.flag is not None:
+            return str(seen[self.flag]).lower() in ("true", "1")
+        return self._is_stated(seen)
+
+    def _is_stated(self, seen: Mapping[str, Value]) -> bool:
+        return any(seen[item.name] for reading in self.readings for item in reading.fields)
 
     def becomes_valid(self, access: RowAccess) -> None:
         """Have the unit identify stars, and check the first attitude that is valid; before, in standby, none is."""
@@ -90,28 +105,47 @@ class AttitudeRow:
             end = access.now() + ATTITUDE_S
             while not self.is_valid(seen := access.values(self.row)):
                 if access.now() > end:
+                    self._check_flag(access, seen)
                     raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
                 access.sleep(0.1)
             self.check(access, seen)
 
     def check(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
-        """Fail the case if an attitude is valid in standby, not of length 1, or not the truth."""
+        """Fail the case if an attitude is valid in standby, of a wrong length, not the truth, or not that of other fields."""
         if not self.is_valid(seen):
             return
         if in_standby(access):
             still = self.is_valid(access.values(self.row)) and in_standby(access)
             check(not still, "no valid attitude in standby (R11, docs/rules.md)", "a valid one")
-        parts = [float(seen[self.names[name]]) for name in QUATERNION]
-        step = max(abs(self.row.named[self.names[name]].scale) for name in QUATERNION)
-        length = sum(part**2 for part in parts) ** 0.5
-        tolerance = 1e-5 + (2.0 * step if step < 1.0 else 0.0)
-        check(abs(length - 1.0) < tolerance, "a quaternion of length 1", f"{length:.7f}")
+        self._check_attitudes(access, seen)
+
+    def _check_attitudes(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
+        """Compare the first attitude with the truth, and the others with both."""
+        known = []
         if access.truth is not None:
             truth = access.truth()
-            error_deg = attitude_error(unit(parts), truth).total_arcsec / 3600.0
-            wanted, seen_parts = (tuple(round(part, 4) for part in each) for each in (truth, parts))
-            expected = f"the true attitude {wanted}, to {TRUTH_DEG:g} deg"
-            check(error_deg <= TRUTH_DEG, expected, f"{seen_parts}, {error_deg:.2f} deg off")
+            parts = tuple(round(part, 4) for part in as_reported(truth, self.conventions))
+            known.append((f"the true attitude {parts}", axes_of(truth), 0.0))
+        for reading in self.readings:
+            axes = reading.axes(seen, self.conventions)
+            for what, other, rounding_deg in known[:2]:
+                error_deg = angle_deg(axes, other)
+                limit_deg = TRUTH_DEG + reading.rounding_deg + rounding_deg
+                numbers = tuple(round(float(seen[item.name]), 4) for item in reading.fields)
+                wanted = f"{what} in {reading}, to {limit_deg:.3g} deg"
+                check(error_deg <= limit_deg, wanted, f"{numbers}, {error_deg:.2f} deg off")
+            known.append((f"the attitude of {reading}", axes, reading.rounding_deg))
+
+    def _check_flag(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
+        """Fail the case if the true attitude is reported, but never as valid."""
+        if self.flag is None or access.truth is None or not self._is_stated(seen):
+            return
+        try:
+            self._check_attitudes(access, seen)
+        except CaseFailed:
+            return
+        wanted = f"{self.flag} set within {ATTITUDE_S:g} s, because the reported attitude is the true one"
+        raise CaseFailed(wanted, f"{self.flag} = {seen[self.flag]!r}")
 
 
 def _mode_fields(access: RowAccess) -> Iterator[tuple[Row, Field]]:

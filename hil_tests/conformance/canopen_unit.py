@@ -8,7 +8,6 @@ from typing import Any, Final
 
 from starhil.hil_tests.conformance.attitude_cases import (
     ATTITUDE_S,
-    QUATERNION,
     AttitudeRow,
     identifying_stars,
     reported_mode,
@@ -150,11 +149,8 @@ def _rows(unit: Unit, found: list[Entry]) -> Iterator[Case[CanopenProbe]]:
     for row in unit.telemetry.values():
         if not any(entry.row is row for entry in found):
             continue
-        attitude = AttitudeRow.of(row)
-        if attitude is not None and not all(
-            _carries(found, row, row.named[attitude.names[name]]) for name in ("attitude.valid", *QUATERNION)
-        ):
-            attitude = None
+        fields = [item for item in row.named.values() if _carries(found, row, item)]
+        attitude = AttitudeRow.of(row, unit.conventions, fields)
         title = f"the entries of {row.name} have the right sizes, and values within the limits"
         yield _case("rows", row.name, title, partial(_values, row, attitude, found), row, safe=True)
         if attitude is not None:

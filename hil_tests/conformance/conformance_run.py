@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -10,6 +11,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.conformance.attitude_cases import TruthSource
 from starhil.hil_tests.conformance.can_probe import CanProbe
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
@@ -34,6 +37,7 @@ from starhil.hil_tests.private_can_bus import private_can_bus
 from starhil.hil_tests.results import FAILED
 from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
+from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.icd import load_unit
 from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.unit_folders import DEFAULT_UNIT
@@ -56,6 +60,8 @@ class ConformanceRequest:
     profile: str | None = None
     settings: tuple[str, ...] = ()
     """With `start`: overrides of the profile, `section.key=value`."""
+    truth: str | None = None
+    """Without `start`: a truth log, or right ascension, declination and roll of the sensor in degrees, as RA,DEC,ROLL."""
     dialect: str | None = None
     baud: int | None = None
     host_address: int = 1
@@ -143,13 +149,13 @@ def run_conformance(
     try:
         with ExitStack() as stack:
             ports: Mapping[str, str | None] = {"serial": request.serial, "can": request.can}
+            truth = None if request.truth is None else truth_source(request.truth)
             emulator = _start_emulator(request, stack) if request.start else None
-            truth = None
             if emulator is not None:
                 ports = emulator.ready
                 if "control" in emulator.ready:
                     control = stack.enter_context(ControlClient(emulator.ready["control"]))
-                    truth = Truth(control, unit.conventions).reported
+                    truth = Truth(control, unit.conventions).attitude
             shown: Callable[[Outcome], None] = record
             if request.view is not None:
                 address = console_address(request.view, emulator)
@@ -173,6 +179,23 @@ def run_conformance(
                 record(not_run(item, interruption.reason))
         return ConformanceResult(outcomes, facts, interruption)
     return ConformanceResult(outcomes, facts)
+
+
+def truth_source(text: str) -> TruthSource:
+    """Return the true attitude that RA,DEC,ROLL in degrees states, or the newest one in the truth log of this name.
+
+    Raises BenchError: the log cannot be read or is none, or an angle is out of range.
+    """
+    try:
+        ra_deg, dec_deg, roll_deg = map(float, text.split(","))
+    except ValueError:
+        log = TruthLogReader(Path(text))
+        log.check()
+        return log.latest
+    if not (math.isfinite(ra_deg + roll_deg) and abs(dec_deg) <= 90.0):
+        raise BenchError(f"--truth {text}: give RA, Dec from -90 to 90 and roll in degrees")
+    attitude = from_radec_roll(ra_deg, dec_deg, roll_deg)
+    return lambda: attitude
 
 
 def _shown_on_console(

@@ -133,7 +133,7 @@ def _refused(row: Row, data: bytes, error: str, index: int | None, probe: LinkPr
 
 
 def _telemetry(unit: Unit, row: Row) -> Iterator[Case[LinkProbe]]:
-    attitude = AttitudeRow.of(row)
+    attitude = AttitudeRow.of(row, unit.conventions)
 
     def read_twice(probe: LinkProbe) -> None:
         for _ in range(2):

@@ -8,6 +8,7 @@ What comes without a request is heard at the end of each step, in the order of i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Final
 
 from starhil.hil_tests.endurance.life import ADDRESSES, Outcome
@@ -23,6 +24,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.link_schema import FixedFraming
 from starhil.protocol.messages import ErrorCode
+from starhil.protocol.values import Value
 
 TIME_OUT_S: Final = 0.7
 """Silence after which a unit has dropped an incomplete message."""
@@ -48,33 +50,25 @@ class Obc:
         self._ports: dict[str, Port] = {}
 
     def connect(self) -> None:
-        """Make the end of each link, for the addresses and format in use."""
-        unit, values = self._unit, self._oracle.values
+        """Make the end of each link, for the address or format in use."""
+        for link in self._unit.links:
+            name = _ADDRESS[link]
+            in_use = self._oracle.in_use(name)
+            if in_use is None:
+                in_use = self._icd.device_parameters[name].default
+                if name in self._icd.parameters:
+                    self._oracle.disturbed.add(link)  # until the unit is restored
+            self._ports[link] = self._port(link, in_use)
 
-        def number(name: str, default: int) -> int:
-            known = values.get(name)
-            return default if known is None else int(known[0])
-
-        for link in unit.links:
-            address = _ADDRESS[link]
-            if address in self._icd.parameters and values[address] is None:
-                self._oracle.disturbed.add(link)  # until the unit is restored
-
-            def deliver(item: Any, link: str = link) -> None:
-                unit.deliver(link, item)
-
-            def take(link: str = link) -> list[tuple[float, Any]]:
-                return unit.take(link)
-
-            if link == "serial":
-                known = values.get("serial_dialect")
-                dialect = None if known is None else str(known[0])
-                self._ports[link] = SerialPort(self._judged, deliver, take, dialect)
-            elif link == "can":
-                self._ports[link] = CanPort(deliver, take, number("can_address", 4))
-            else:
-                node = number("canopen_node", 44)
-                self._ports[link] = CanopenPort(self._judged, self._objects, deliver, take, node)
+    def _port(self, link: str, address: Value) -> Port:
+        deliver, take = partial(self._unit.deliver, link), partial(self._unit.take, link)
+        match link:
+            case "serial":
+                return SerialPort(self._judged, deliver, take, str(address))
+            case "can":
+                return CanPort(deliver, take, int(address))
+            case _:
+                return CanopenPort(self._judged, self._objects, deliver, take, int(address))
 
     async def pass_time(self, seconds: float, *, most: int | None = None) -> None:
         """Let time pass, and judge what comes meanwhile."""

@@ -29,6 +29,8 @@ BOOT_S: Final = 0.6
 RECOVERY_S: Final = 15.0
 """Longest time from the end of the last fault to a valid attitude, with default parameters."""
 IMAGING: Final = frozenset({"lost_in_space", "tracking"})
+AT_START: Final = frozenset({"canopen_node"})
+"""Parameters of which a new value takes effect at the next start of the unit; all others do at once."""
 SECOND_NS: Final = 1_000_000_000
 
 
@@ -100,6 +102,7 @@ class Oracle:
     def _start(self, at_s: float) -> None:
         self._started_s: float | None = at_s
         self.values = {**self._defaults, **self._stored}
+        self._at_start = {name: self.values[name] for name in AT_START}
         self.modes = {"boot"}
         self.counts = {"telecommands": 0, "telemetry": 0}
         self._is_counted = not self.disk_full
@@ -144,12 +147,18 @@ class Oracle:
     def forget(self) -> None:
         """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
         self.values = dict.fromkeys(self.values)
+        self._at_start = dict.fromkeys(AT_START)
         self._stored = dict.fromkeys(self.values)
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
         self.modes = {"boot", "standby", "error", *IMAGING}
         self.bursts = self._subscribed = True
         self.attitudes.retimed(self.now_s, self.values)
+
+    def in_use(self, name: str) -> Value | None:
+        """Return the value of a parameter that the unit works with, None if it is not known."""
+        known = (self._at_start if name in AT_START else self.values)[name]
+        return None if known is None else known[0]
 
     # --- requests ---
 

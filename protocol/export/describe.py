@@ -74,7 +74,8 @@ def facts(row: Row) -> str:
 
 def beyond(row: Row, field: Field) -> str:
     """Return how telemetry treats a number beyond its range: "clipped", "wraps" or nothing."""
-    if row.kind != "telemetry" or field.kind not in ("integer", "float", "bits"):
+    constant = field.const is not None
+    if row.kind != "telemetry" or constant or field.kind not in ("integer", "float", "bits"):
         return ""
     if field.wrap:
         return "wraps"

@@ -138,7 +138,7 @@ def test_a_valid_quaternion_that_is_not_of_length_1_fails_a_safe_case(tmp_path):
     assert not case.intrusive
     assert outcome_of("telemetry.attitude", unit).status == "passed"
     outcome = outcome_of("telemetry.attitude", unit, served)
-    assert (outcome.status, outcome.expected) == ("failed", "a quaternion of length 1")
+    assert (outcome.status, outcome.expected) == ("failed", "a quaternion of length 1 in x, y, z, w")
 
 
 class Rows:
@@ -173,7 +173,7 @@ class Rows:
 
 def test_an_attitude_that_is_valid_in_standby_fails(tmp_path):
     rows = Rows(tmp_path, "standby")
-    attitude = AttitudeRow.of(rows.unit.telemetry["attitude"])
+    attitude = AttitudeRow.of(rows.unit.telemetry["attitude"], rows.unit.conventions)
     with pytest.raises(CaseFailed, match="in standby"):
         attitude.check(rows, rows.values(attitude.row))
     rows.mode = "tracking"
@@ -185,7 +185,7 @@ def test_a_number_that_stands_for_several_modes_is_not_standby(tmp_path):
     rows = Rows(
         tmp_path, "standby", '{ 0 = "boot", 3 = ["standby", "lost_in_space", "tracking"], 4 = "error" }'
     )
-    attitude = AttitudeRow.of(rows.unit.telemetry["attitude"])
+    attitude = AttitudeRow.of(rows.unit.telemetry["attitude"], rows.unit.conventions)
     attitude.check(rows, rows.values(attitude.row))
 
 

@@ -113,13 +113,19 @@ def test_the_truth_lies_between_the_rows_of_the_file_while_it_grows(tmp_path):
         truth.at(102.0)
     path.write_text(head + "".join(rows) + "3,103,0.1")
     assert attitude_error(truth.at(102.0), from_radec_roll(12.0, 0.0, 0.0)).total_arcsec < 1e-3
+    assert attitude_error(truth.latest(), from_radec_roll(12.0, 0.0, 0.0)).total_arcsec < 1e-3
+    path.write_text(head + "".join(rows[::-1]))  # the clock was set back
+    assert attitude_error(truth.latest(), from_radec_roll(10.0, 0.0, 0.0)).total_arcsec < 1e-3
     path.write_bytes(head.encode() + b"\xff\n")
     with pytest.raises(BenchError, match="cannot be read: not UTF-8"):
         TruthLogReader(path).at(1.0)
     path.write_text(head)
     with pytest.raises(BenchError, match="it covers nothing"):
         TruthLogReader(path).at(1.0)
-    path.write_text("time,qx\n1,2\n")
+    TruthLogReader(path).check()
+    with pytest.raises(BenchError, match="has no truth yet"):
+        TruthLogReader(path).latest()
+    path.write_text("time,qx\n")
     with pytest.raises(BenchError, match="no column time_of_exposure_s"):
         TruthLogReader(path).at(1.0)
     with pytest.raises(BenchError, match="cannot be read"):

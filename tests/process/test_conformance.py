@@ -6,14 +6,17 @@ Choice of cases.
 from __future__ import annotations
 
 import json
+import shutil
 import warnings
 from itertools import dropwhile
+from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.protocol.unit_folders import find_unit
 from tests.process.test_sessions import starhil
 
 pytestmark = pytest.mark.process
@@ -90,6 +93,29 @@ def test_safe_cases_change_nothing(tmp_path):
     assert last in (0, 103)
 
 
+@pytest.mark.parametrize("wrong", [False, True])
+def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stated_attitude(wrong, tmp_path):
+    """A unit that reports the conjugate fails only where the truth is given."""
+    served = Path(shutil.copytree(find_unit("sagitta"), tmp_path / "sagitta"))
+    if wrong:
+        file = served / "10-link.toml"
+        text = file.read_text()
+        assert 'quaternion = "attitude"' in text
+        file.write_text(text.replace('quaternion = "attitude"', 'quaternion = "rotation"'))
+    log = tmp_path / "truth.csv"
+    attitude = "truth.attitude={ra_deg=83.8, dec_deg=-1.2, roll_deg=30}"
+    command = emulator_command(
+        unit=str(served), seed=1, state_dir=tmp_path, truth_log=log, settings=["truth.kind=fixed", attitude]
+    )
+    with EmulatorProcess(command) as emulator:
+        words = ("serial.attitude", "--unit", "sagitta", "--serial", emulator.ready["serial"])
+        seen = [
+            run_cases((*words, *truth))[1] for truth in ((), ("--truth", log), ("--truth", "83.8,-1.2,30"))
+        ]
+    failed = ["serial.attitude.solution"] if wrong else []
+    assert seen == [[], failed, failed]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -98,6 +124,9 @@ def test_safe_cases_change_nothing(tmp_path):
         (["--serial", "/dev/no-such-tty"], "/dev/no-such-tty"),
         (["--serial", "auto"], "needs --start"),
         (["--canopen", "5"], "--canopen needs --can"),
+        (["--start", "--truth", "1,2,3"], "--truth is for a unit that runs already"),
+        (["--serial", "/dev/null", "--truth", "no.csv"], "no.csv: the truth cannot be read"),
+        (["--serial", "/dev/null", "--truth", "0,91,0"], "--truth 0,91,0: give RA, Dec from -90 to 90"),
         (["--serial", "/dev/null", "--dialect", "x"], "must be a, b or c"),
     ],
 )

@@ -56,7 +56,7 @@ def packets(row: Row) -> Iterator[tuple[dict[str, Value], bytes]]:
 def _value(field: Field, number: int, turn: int) -> Value:
     match field.kind:
         case "flag":
-            return bool((number + turn) % 2)
+            return bool(field.const) if field.const is not None else bool((number + turn) % 2)
         case "enum":
             assert field.enum is not None
             return list(field.enum.values)[(number + turn) % len(field.enum.values)]
@@ -497,7 +497,7 @@ def test_example_messages_decode_to_the_values_that_are_printed(name: str) -> No
         stack = build_serial_stack(icd)
         request = icd.request(row)
         receiver = stack.host()
-        receiver.expect(request, row.size)
+        receiver.expect(request)
         events = receiver.feed(bytes.fromhex("".join(exchange.answers)), 0.0)
         replies = [
             event for event in events if isinstance(event, Reply) and event.kind is ReplyKind.TELEMETRY

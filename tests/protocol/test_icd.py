@@ -147,7 +147,7 @@ def _values_of(field: Field) -> st.SearchStrategy[Value]:
     """Values that a field can carry exactly."""
     match field.kind:
         case "flag":
-            return st.booleans()
+            return st.booleans() if field.const is None else st.just(bool(field.const))
         case "enum":
             assert field.enum is not None
             return st.sampled_from(sorted(field.enum.values))
@@ -466,6 +466,13 @@ BAD_DEFINITIONS = [
     ("map and enum", HEAD + _row(fields='[{ name = "a", type = "enum8", enum = "mode", map = { 1 = "x" } }]'), "has both `map` and `enum`"),
     ("no bits", HEAD + _row(fields='[{ name = "a", type = "bits8" }]'), "type bits8 needs `bits` and takes no count"),
     ("bits too narrow", HEAD + _row(fields='[{ type = "bits8", bits = [{ name = "b", map = { 2 = "x" } }, { width = 7 }] }]'), "enumeration map does not fit 1 bits"),
+    ("negative number of bits", HEAD + _row(fields='[{ type = "bits8", bits = [{ name = "b", map = { -1 = "x" } }, { width = 7 }] }]'), "enumeration map does not fit 1 bits"),
+    ("map beyond the type", HEAD + _row(fields='[{ name = "a", type = "u8", map = { 300 = "x" } }]'), "field a: enumeration map does not fit type u8"),
+    ("map of a float", HEAD + _row(size=4, fields='[{ name = "a", type = "f32", map = { 1 = "x" } }]'), "field a: enumeration map does not fit type f32"),
+    ("map of a string", HEAD + _row(fields='[{ name = "a", type = "text", size = 1, map = { 1 = "x" } }]'), "field a: enumeration map does not fit type text"),
+    ("enumeration beyond the type", HEAD + '[[enum]]\nname = "e"\ndoc = "d"\nvalues = { a = 300 }\n' + _row(fields='[{ name = "a", type = "enum8", enum = "e" }]'), "field a: enumeration e does not fit type enum8"),
+    ("scaled enumeration", HEAD + _row(fields='[{ name = "a", type = "u8", scale = 2.0, map = { 1 = "x" } }]'), "field a: scale and offset need a number of at least 2 bits"),
+    ("unknown class of a header field", HEAD + '[link.serial]\nframing = { kind = "slip" }\nrequest_header = [{ role = "id", type = "u8" }, { default = 1, type = "u8", classes = ["b", "a", "c", "d"] }]\n', "request_header: no class named 'b'"),
     ("constant too wide", HEAD + _row(fields='[{ type = "bits8", bits = [{ name = "b", const = 2 }, { width = 7 }] }]'), "const 2 does not fit 1 bits"),
     ("scale 0", HEAD + _row(fields='[{ name = "a", type = "u8", scale = 0.0 }]'), "field a: scale 0 is smaller than 1e-100"),
     ("scale that is no number", HEAD + _row(fields='[{ name = "a", type = "u8", scale = nan }]'), "scale: .*finite"),
@@ -505,6 +512,27 @@ def test_a_bad_definition_is_rejected_by_file_and_row(tmp_path: Path, text: str,
         load_unit(file)
     assert str(caught.value).startswith(str(file))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("field", "const", "other"),
+    [
+        ('{ name = "a", type = "u8", const = 3 }', 3, 1),
+        ('{ name = "a", type = "u8", map = { 1 = "one", 3 = "three" }, const = 3 }', "three", "one"),
+        ('{ type = "bits8", bits = [{ name = "a", width = 3, const = 3 }, { width = 5 }] }', 3, 1),
+        ('{ type = "bits8", bits = [{ name = "a", const = 1 }, { width = 7 }] }', True, False),
+        ('{ type = "bits8", bits = [{ name = "a", width = 2, map = { 1 = "one", 3 = "three" }, const = 3 }, { width = 6 }] }', "three", "one"),
+    ],
+)  # fmt: skip
+def test_a_constant_of_any_kind_is_required_in_a_telecommand(tmp_path, field, const, other) -> None:
+    file = tmp_path / "unit.toml"
+    file.write_text(HEAD + _row('action = "nothing"', kind="telecommand", identifier=1, fields=f"[{field}]"))
+    row = load_unit(file).telecommands["row"]
+    assert row.decode(row.encode()) == {"a": const}
+    with pytest.raises(FieldError, match=r"row\.a: .* is outside"):
+        row.encode({"a": other})
+    with pytest.raises(FieldError, match=r"row\.a: .* is outside"):
+        row.decode(row.encode({"a": other}, check=False))
 
 
 def test_a_missing_or_empty_definition_is_reported(tmp_path: Path) -> None:

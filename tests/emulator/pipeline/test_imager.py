@@ -11,6 +11,7 @@ from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageReques
 from starhil.emulator.pipeline.worker_process import WorkerThread
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
+from tests.emulator.runs import CAMERA
 from tests.emulator.workers import ANSWERING, WORKER
 
 SETUP = pipeline_setup(Profile())
@@ -101,6 +102,21 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_i
     run(make_imager, scenario)
     (said,) = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
     assert [said] == losses
+
+
+def test_requests_fail_in_their_order_before_the_death_of_the_worker_is_noticed(worker):
+    answers = []
+
+    async def scenario(imager):
+        imager.submit(REQUEST, lambda answer: answers.append(("first", type(answer))))
+        imager.worker.process.kill()
+        imager.worker.process.wait()
+        imager.submit(REQUEST, lambda answer: answers.append(("second", type(answer))))
+        await imager.settle()
+
+    silent = f"{WORKER}send(PipelineReady({CAMERA}, 5, 0.0))\nreceive()\nreceive()\n"
+    run(lambda: WorkerImager(SETUP, worker(silent)), scenario)
+    assert answers == [("first", Failure), ("second", Failure)]
 
 
 def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, caplog):

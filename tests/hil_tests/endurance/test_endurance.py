@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import pairwise
 
 import pytest
@@ -13,6 +14,7 @@ from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
@@ -103,6 +105,33 @@ def test_a_refusal_without_an_answer_is_reported_by_telemetry_that_comes_before_
     )
     profile = {"parameters": {"start_mode": "standby"}}
     assert run_once(Life("cubestar", 1, ("serial", "can"), profile, steps)).violation == ""
+
+
+def node_id_set(*then):
+    """Return the outcome of a life in which the node ID is set to 127 and stored, and then this happens."""
+    icd = load_unit("cubestar")
+    command = icd.telecommands["set_parameter"]
+    data = command.encode({"parameter": icd.parameters["canopen_node"].id, "value": 127.0}).hex()
+    stored = (request_on("can", command, data), request_on("can", icd.telecommands["save_parameters"]))
+    return run_once(Life("cubestar", 1, ("can", "canopen"), {}, (*stored, *then)))
+
+
+def test_a_node_keeps_its_id_until_the_next_restart():
+    icd = load_unit("cubestar")
+    read, reset = request_on("canopen", icd.telemetry["identification"]), icd.telecommands["reset"]
+    wait = {"do": "wait", "s": 3.0}
+    restart = request_on("can", reset, reset.encode(reset.example()).hex())
+    outcome = node_id_set(read, wait, restart, wait, read)
+    assert (outcome.violation, outcome.readings) == ("", 2)
+
+
+def test_a_node_that_takes_its_new_id_at_once_is_found(monkeypatch):
+    def restart_node(link, _names):
+        link._run_action(partial(link.slave.reset_node, node_id=link._wanted_node))
+
+    monkeypatch.setattr(CanopenLink, "_parameters_changed", restart_node)
+    expected = "canopen: a frame 77Fh 00 that the unit does not define"
+    assert node_id_set({"do": "wait", "s": 1.0}).violation == expected
 
 
 def test_a_value_that_the_object_dictionary_refuses_may_be_uncounted():
