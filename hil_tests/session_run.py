@@ -33,9 +33,8 @@ from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import find, not_found
+from starhil.protocol.names import DEFAULT_UNIT, find, not_found
 from starhil.protocol.serial_interface import Dialect
-from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 DEFAULT_FOLDER: Final = Path("out") / "session"
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}

@@ -30,11 +30,10 @@ from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.text_messages import words
-from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
 from starhil.protocol.values import (

@@ -164,16 +164,12 @@ class SerialStack:
         framing, check, classes = self.link.framing, self.link.check, list[str]()
         if item is not None:
             framing, check, classes = item.framing or framing, item.check or check, item.classes or []
-        return MessageFormat(
-            build_framing(framing, self._plugin.framings),
-            framing,
-            build_check(check, self.byte_order, self._plugin.checks),
-            models,
-            self.byte_order,
-            self.classes.requests if name == "request_header" else self.classes.replies,
-            f"link.serial.{name}",
-            classes,
-        )
+        frames = build_framing(framing, self._plugin.framings)
+        checks = build_check(check, self.byte_order, self._plugin.checks)
+        overhead = {"start": len(frames.start), "check": checks.size, "end": len(frames.end)}
+        codes = self.classes.requests if name == "request_header" else self.classes.replies
+        header = Header(models, self.byte_order, codes, overhead, f"link.serial.{name}")
+        return MessageFormat(frames, framing, checks, header, classes)
 
     @property
     def framing(self) -> Framing:
@@ -213,7 +209,7 @@ class SerialStack:
                     known = ", ".join(self.classes.by_name) or "none"
                     raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
             formats = self.request_formats if where == "request" else self.reply_formats
-            if any(form.kind == "length" for form in formats.all) and "length" not in header.roles:
+            if any(form.model.kind == "length" for form in formats.all) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
         if self.request_header.counts:
             raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
@@ -221,9 +217,9 @@ class SerialStack:
         if self.texts.acknowledge is not None or self.texts.refusal is not None:
             texts.append(self.replies)
         for form in texts:
-            if form.kind in ("length", "fixed"):
+            if form.model.kind in ("length", "fixed"):
                 raise IcdError(
-                    f"link.serial: texts need a framing with an end, such as delimited, not {form.kind}"
+                    f"link.serial: texts need a framing with an end, such as delimited, not {form.model.kind}"
                 )
         if "id" not in self.request_header.roles and len(self.text_formats) < len(self.request_formats.all):
             raise IcdError("link.serial.request_header: needs a field with role id")

@@ -39,8 +39,8 @@ from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import DEFAULT_UNIT
 from starhil.protocol.serial_stack import chosen_dialect
-from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import IcdError
 
 if TYPE_CHECKING:

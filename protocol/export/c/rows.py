@@ -19,17 +19,7 @@ MAP: Final = "map"
 
 
 class RowCode:
-    """Writes the C code of the rows of a definition.
-
-    Parameters
-    ----------
-    icd
-        The definition.
-    prefix
-        Beginning of every declared name.
-    scope
-        Names that the rest of the code uses; those of the rows are claimed in it.
-    """
+    """Writes the C code of the rows of a definition; every declared name begins with `prefix`, and is claimed in `scope`."""
 
     def __init__(self, icd: InterfaceDefinition, prefix: str, scope: Scope) -> None:
         self._prefix = prefix

@@ -18,9 +18,9 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
+from starhil.protocol.names import bundled_units
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
-from starhil.protocol.unit_folders import bundled_units
 from tests.conformance.links import LINKS, write_unit
 
 
