@@ -29,7 +29,7 @@ from starhil.protocol.values import (
     Value,
     limits_text,
     number_of,
-    to_f32,
+    representable,
 )
 
 RowKind = Literal["telecommand", "telemetry"]
@@ -286,9 +286,7 @@ class Field(FieldKeys):
         return FieldError(f"{where}: {value!r} is outside {limits_text(low, high, self.unit)}", index=index)
 
     def _check_float(self, value: float, where: str, index: int) -> None:
-        low, high = self.physical_limits
-        if self.slot.type == "f32":
-            low, high = min(low, to_f32(low)), max(high, to_f32(high))
+        low, high = representable(*self.physical_limits, self.slot.type)
         if not low <= value <= high:
             raise self._outside(value, where, index)
 

@@ -20,7 +20,7 @@ from starhil.protocol import cubespace
 from starhil.protocol.checks import Check, build_check
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Order
-from starhil.protocol.cubespace import DialectReplies
+from starhil.protocol.cubespace import Dialect, DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.errors import ProtocolError
@@ -46,7 +46,6 @@ from starhil.protocol.messages import (
     error_code,
 )
 from starhil.protocol.plugin import Plugin
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
 

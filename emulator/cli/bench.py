@@ -188,7 +188,7 @@ class TargetOptions:
     def target(self) -> Target:
         """Return the links."""
         from starhil.emulator.cli.bench_bus import Target
-        from starhil.protocol.serial_interface import Dialect
+        from starhil.protocol.cubespace import Dialect
 
         dialect = Dialect(checked_dialect(self.dialect) or "b")
         return Target(self.can, self.serial, self.canopen, self.device_address, self.baud, dialect)

@@ -6,7 +6,7 @@ import datetime as dt
 
 import pytest
 
-from starhil.protocol.canopen import AbortCode
+from starhil.protocol.canopen.abort import AbortCode
 from starhil.protocol.canopen.timestamp import decode_time_of_day
 
 
