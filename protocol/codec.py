@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
+from starhil.protocol.messages import RequestKind
 from starhil.protocol.names import did_you_mean
 from starhil.protocol.values import (
     F32_MAX,
@@ -32,7 +33,6 @@ from starhil.protocol.values import (
     representable,
 )
 
-RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
 STRUCT_CODES: Final = dict(
@@ -358,7 +358,7 @@ class Row(RowKeys):
     """A telecommand or telemetry row: its keys, its layout, and the codec of its values."""
 
     provenance: Provenance = "ours"
-    kind: RowKind
+    kind: RequestKind
     size: int
     """Bytes of data."""
     fields: tuple[Field, ...]

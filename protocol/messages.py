@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import Enum, IntEnum, StrEnum
 from typing import Final, Protocol, TypeVar
 
 from starhil.protocol.errors import ProtocolError
@@ -41,8 +41,8 @@ class ErrorCode(IntEnum):
     PASSTHROUGH_TARGET = 10
 
 
-class RequestKind(Enum):
-    """Kinds of requests that an OBC sends."""
+class RequestKind(StrEnum):
+    """Kinds of rows, and of the requests that an OBC sends."""
 
     TELECOMMAND = "telecommand"
     TELEMETRY = "telemetry"

@@ -335,7 +335,7 @@ class SerialStack:
             row = self._by_text.get(words(text.decode("latin-1")))
             if row is None:
                 return Request(RequestKind.TELECOMMAND, self._unknown_id)
-            return Request(RequestKind(row.kind), row.id, klass=row.klass)
+            return Request(row.kind, row.id, klass=row.klass)
         opened = form.open(body)
         if isinstance(opened, LinkFault):
             return opened
@@ -361,7 +361,7 @@ class SerialStack:
             return RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
         item = self.classes.by_name.get(klass)
         row = self.row(klass, row_id)
-        return item.kind if item is not None else RequestKind(row.kind) if row is not None else None
+        return item.kind if item is not None else row.kind if row is not None else None
 
     def _request_size(self, form: MessageFormat, body: bytes) -> int | None:
         """Return the size of a request that begins with these bytes, or None if more are needed."""

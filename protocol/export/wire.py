@@ -105,7 +105,7 @@ def _classes(icd: InterfaceDefinition) -> Section:
         return "" if number is None else f"{number:02X}h"
 
     rows = (
-        (item.name, item.kind.value, code(item.code), code(item.reply_code), code(item.unsolicited_code))
+        (item.name, item.kind, code(item.code), code(item.reply_code), code(item.unsolicited_code))
         for item in icd.classes
     )
     return _section("classes", rows)
