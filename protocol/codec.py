@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
@@ -216,8 +217,13 @@ class Field(FieldKeys):
         margin = abs(self.scale) / 2.0 if self.kind == "integer" else 0.0
         return not low - margin <= value <= high + margin
 
+    @property
+    def required(self) -> bool:
+        """Whether a telecommand must give a value."""
+        return self.default is None and self.const is None
+
     def to_raw(
-        self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
+        self, value: Value, where: str, *, check: bool = True, saturate: bool = False, index: int = 0
     ) -> int | float | bytes:
         """Convert a physical value to the raw value of its slot or bits.
 
@@ -435,14 +441,16 @@ class Row(RowKeys):
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()
         if unknown:
+            name = min(unknown)
+            hint = did_you_mean(name, self.named_fields)
             known = ", ".join(self.named_fields) or "none"
-            raise FieldError(f"{self.name}.{min(unknown)}: no such field (fields: {known})")
+            raise FieldError(f"{self.name}.{name}: no such field{hint} (fields: {known})")
         raw: list[Any] = [0] * len(self._sent)
         for index, (name, item, position) in enumerate(self._values):
             where = f"{self.name}.{name}"
             value = given.get(name)
             if value is None:
-                if self.kind == "telecommand" and item.default is None and item.const is None:
+                if self.kind == "telecommand" and item.required:
                     raise FieldError(f"{where}: missing value", index=index)
                 value = item.empty
             packed: Any = item.to_raw(value, where, check=check, saturate=saturate, index=index)

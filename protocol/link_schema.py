@@ -310,7 +310,7 @@ class HeaderFieldModel(DefinitionModel):
 class FormatModel(DefinitionModel):
     """Another framing or checksum for the messages of a direction, or of some classes.
 
-    The first format that fits a message applies. If several remain in a direction, messages are told apart by their first
+    The first format that fits a message applies. If several remain in a direction, messages are distinguished by their first
     byte: each has another `start`, and at most one has none.
     """
 

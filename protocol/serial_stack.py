@@ -6,7 +6,7 @@
             └──────────────── body ─────────────────────────┘
 
 A link is composed of a framing, which marks where a body begins and ends (`framings`), a check (`checks`), a header of
-requests and one or several of replies (`envelope`). In most units all replies have one header, whose roles tell what
+requests and one or several of replies (`envelope`). In most units all replies have one header, whose roles give what
 they are. In the dialects of CubeSpace each kind of reply has its own (`cubespace`), and the kind follows from the
 start byte, the row, and the size.
 """

@@ -91,13 +91,14 @@ def examine(
     name_or_folder: str | Path, *, run_plugin: bool = True
 ) -> tuple[InterfaceDefinition, list[str], list[Exchange]]:
     """Return what is valid of a unit, all errors, and if there are none an exchange of each row on each link."""
-    definition, errors = read_definition(find_unit(name_or_folder), run_plugin=run_plugin)
+    path = find_unit(name_or_folder)
+    definition, errors = read_definition(path, run_plugin=run_plugin)
     errors += unbound(definition)
     for row in definition.rows:
         try:
             row.encode(row.example(), saturate=row.kind == "telemetry")
         except ProtocolError as error:
-            errors.append(f"unit {definition.name}: {row.kind} {row.name}: example: {error}")
+            errors.append(f"{definition.files[row.name]}: {row.kind} {row.name}: example: {error}")
     examples: list[Exchange] = []
     if not errors:
         try:
@@ -105,7 +106,7 @@ def examine(
                 build_dictionary(definition)
             examples += exchanges(definition)
         except ProtocolError as error:
-            errors.append(f"unit {definition.name}: {error}")
+            errors.append(f"{path}: {error}")
     return definition, errors, examples
 
 

@@ -1,4 +1,4 @@
-"""Fuzzing guided by coverage (atheris) of each decoder and reader in tests/fuzzing/targets.py.
+"""Fuzzing guided by coverage (atheris) of each decoder and reader in tests/fuzzing.
 
 python tools/fuzz.py [--seconds 60] [TARGET …]     for this long each; all targets by default
 python tools/fuzz.py --list
@@ -58,17 +58,10 @@ INSTRUMENTED = (
 
 def modules() -> list[str]:
     """Return the names of all modules of the project."""
-    packages = {
-        "starhil/emulator": "emulator",
-        "starhil/protocol": "protocol",
-        "starhil/hil_tests": "hil_tests",
-        "starid": "starid",
-    }
+    folders = {folder: f"starhil.{folder}" for folder in ("emulator", "protocol", "hil_tests")}
     return [
-        ".".join([*package.split("/"), *path.relative_to(ROOT / folder).with_suffix("").parts]).removesuffix(
-            ".__init__"
-        )
-        for package, folder in packages.items()
+        ".".join((package, *path.relative_to(ROOT / folder).with_suffix("").parts)).removesuffix(".__init__")
+        for folder, package in {**folders, "starid": "starid"}.items()
         for path in (ROOT / folder).rglob("*.py")
     ]
 

@@ -6,6 +6,7 @@ import random
 import pytest
 
 from starhil.emulator.clock import SteppedClock
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
@@ -62,6 +63,25 @@ class Linked:
 
 def in_loop(scenario):
     asyncio.run(scenario)
+
+
+def test_what_a_request_causes_follows_its_answer_also_when_the_answer_takes_time(bench, monkeypatch):
+    async def scenario():
+        linked = await Linked(bench).start()
+        saved = PendingAnswer()
+
+        def save():
+            bench.device.signals.unsolicited.emit(Reply(ReplyKind.UNSOLICITED, 230, bytes(16), destination=1))
+            return saved
+
+        monkeypatch.setattr(bench.device, "save_parameters", save)
+        assert linked.over_can(bench.icd.telecommands["save_parameters"].id) == []
+        saved.end(None)
+        host = CanHostReceiver(1, 4)
+        events = [event for frame in linked.bus.take() for event in host.feed(frame, 0.0)]
+        assert [event.kind for event in events] == [ReplyKind.ACK, ReplyKind.UNSOLICITED]
+
+    in_loop(scenario())
 
 
 @pytest.mark.parametrize("fails", [False, True])
