@@ -380,6 +380,16 @@ class Row(RowKeys):
     request: str = ""
     """Text that requests the row on the serial line; empty: its header does."""
 
+    @property
+    def request_size(self) -> int:
+        """Bytes of data in its request."""
+        return self.size if self.kind == "telecommand" else 0
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of data in its reply."""
+        return self.size if self.kind == "telemetry" else 0
+
     def __repr__(self) -> str:
         """Return kind, ID and name."""
         return f"Row({self.kind} {self.id} {self.name})"
