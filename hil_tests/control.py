@@ -6,6 +6,7 @@ import json
 import operator
 import socket
 import time
+from contextlib import ExitStack
 from typing import Any, Final, Self
 
 from starhil.hil_tests.attitude import (
@@ -35,15 +36,8 @@ class ControlClient:
     """
 
     def __init__(self, address: str) -> None:
-        path = address.removeprefix("unix:")
         try:
-            if path != address:
-                self._socket = socket.socket(socket.AF_UNIX)
-                self._socket.settimeout(ANSWER_WITHIN_S)
-                self._socket.connect(path)
-            else:
-                host, _, port = address.rpartition(":")
-                self._socket = socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+            self._socket = _connected(address)
         except OSError as error:
             raise BenchError(f"control channel {address}: {error.strerror or error}") from None
         self._lines = self._socket.makefile("rw", encoding="utf-8")
@@ -97,6 +91,19 @@ class ControlClient:
 
     def __exit__(self, *_error: object) -> None:
         self.close()
+
+
+def _connected(address: str) -> socket.socket:
+    path = address.removeprefix("unix:")
+    if path == address:
+        host, _, port = address.rpartition(":")
+        return socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+    with ExitStack() as stack:
+        found = stack.enter_context(socket.socket(socket.AF_UNIX))
+        found.settimeout(ANSWER_WITHIN_S)
+        found.connect(path)
+        stack.pop_all()
+    return found
 
 
 class Truth:

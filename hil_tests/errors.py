@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from starhil.protocol.errors import OneLineError, escape_controls
+from starhil.protocol.errors import OneLineError
 
 
 class BenchError(OneLineError):
@@ -10,11 +10,7 @@ class BenchError(OneLineError):
 
 
 class ScriptError(BenchError):
-    """An invalid session script; the arguments are its problems, each of which names file, step and key."""
-
-    def __str__(self) -> str:
-        """Return a line for each problem."""
-        return "\n".join(escape_controls(str(problem)) for problem in self.args)
+    """An invalid session script; each problem names file, step and key."""
 
 
 class DeviceError(BenchError):

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import chain
+from pathlib import Path
 from typing import Final, TypeVar
 
 from starhil.protocol.canopen_schema import CanopenModel
@@ -27,10 +28,6 @@ OTHER_ERROR: Final = "other"
 
 class UnknownNameError(ProtocolError, KeyError):
     """A name that is not in the interface definition; the text suggests similar ones."""
-
-    def __str__(self) -> str:
-        """Return the text without quotes, which KeyError would add."""
-        return str(self.args[0])
 
 
 class Names(dict[str, _Item]):
@@ -72,6 +69,8 @@ class InterfaceDefinition:
     first_telemetry_id: int | None = None
     """IDs from this one on are telemetry, even if there is no such row."""
     plugin: Plugin = field(default_factory=Plugin)
+    files: Mapping[str, Path] = field(default_factory=dict)
+    """Name of a row → the file that defines it."""
 
     @property
     def model(self) -> DeviceModel:

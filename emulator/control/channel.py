@@ -40,9 +40,9 @@ from starhil.emulator.run import Run
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
-from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
+from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -303,7 +303,7 @@ def _parse(model: type[Model], value: object) -> Model:
     try:
         return model.model_validate_json(json.dumps(value))
     except ValidationError as error:
-        raise EmulatorError(explain(error, model)) from None
+        raise EmulatorError(*map(str, problems(error, model, value))) from None
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:
