@@ -22,7 +22,7 @@ from starhil.hil_tests.transactions import Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import LinkFault, Reply, RequestKind
+from starhil.protocol.messages import LinkFault, Reply
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
@@ -166,6 +166,4 @@ class ObcClient:
     ) -> Reply:
         """Send a request by row ID (and class, if the unit has classes), data as bytes; return the reply."""
         request = self.icd.request_of(identifier, klass, data)
-        row = self.icd.rows_by_key.get((request.klass, identifier))
-        size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
-        return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
+        return self.run(self.core.transact(request, f"request {identifier}", timeout_s=timeout_s))[0]

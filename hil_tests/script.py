@@ -70,7 +70,7 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.names import did_you_mean, remedy
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import wording
-from starhil.protocol.values import Parameter
+from starhil.protocol.values import FLAGS, Parameter
 
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 
@@ -594,22 +594,29 @@ def _unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
 def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:
     """Yield why conditions can never hold: wrong type, or unknown name of an enumeration.
 
-    For a field of bytes, hexadecimal text is converted in place.
+    For a field of bytes, hexadecimal text is converted in place, and so are the names `true` and `false` of a flag's `map`.
     """
     if item.kind == "bytes":
         yield from _in_bytes(item, wanted)
         return
+    if item.is_flag and item.enum is not None:
+        wanted.value, wanted.differs_from = _as_flag(wanted.value), _as_flag(wanted.differs_from)
+        wanted.one_of = [_as_flag(value) for value in wanted.one_of]
     for value in (wanted.equals, wanted.differs_from, *wanted.one_of):
         if value is None or isinstance(value, Variable):
             continue
-        if item.enum is not None:
+        if item.enum is not None and not item.is_flag:
             if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
                 known = f"; one of: {', '.join(item.enum.values)}"
                 yield f"'{item.name}' is never '{show(value)}'{did_you_mean(show(value), item.enum.values) or known}"
-        elif (item.kind == "flag") != isinstance(value, bool):
-            yield f"'{item.name}' is {'true or false' if item.kind == 'flag' else 'not true or false'}, not {value!r}"
+        elif item.is_flag != isinstance(value, bool):
+            yield f"'{item.name}' is {'true or false' if item.is_flag else 'not true or false'}, not {value!r}"
         elif item.kind in ("integer", "float", "bits") and isinstance(value, str):
             yield f"'{item.name}' is a number, not {value!r}"
+
+
+def _as_flag(value: Any) -> Any:
+    return FLAGS.get(value, value) if isinstance(value, str) else value
 
 
 def _in_bytes(item: RowField, wanted: Conditions) -> Iterator[str]:

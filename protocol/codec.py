@@ -118,6 +118,11 @@ class Field(FieldKeys):
         return self.offset + (byte if self.slot.order == "little" else self.size - 1 - byte), position
 
     @property
+    def is_flag(self) -> bool:
+        """Whether the values are true and false: a bit, or numbers that a `map` assigns to them."""
+        return self.kind == "flag" or (self.enum is not None and self.enum.is_flag)
+
+    @property
     def scaled(self) -> bool:
         """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0
@@ -245,13 +250,13 @@ class Field(FieldKeys):
     def to_physical(self, raw: Any) -> Value:
         """Convert a raw value to the physical one.
 
-        A number that is not in the enumeration stays a number.
+        A number that is not in the enumeration stays a number; `true` and `false` are flags.
         """
         match self.kind:
             case "flag":
                 return bool(raw)
             case "enum":
-                return self.enum.names.get(raw, int(raw)) if self.enum is not None else int(raw)
+                return self.enum.value_of(int(raw)) if self.enum is not None else int(raw)
             case "bytes":
                 return bytes(raw)
             case "text":
@@ -317,7 +322,7 @@ class Field(FieldKeys):
             if isinstance(value, bool) or value in (0, 1):
                 return int(value)
             raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
-        if not check and isinstance(value, int) and low <= value <= high:
+        if not check and type(value) is int and low <= value <= high:
             return int(value)
         return self.enum.number(value, where, index=index)
 
@@ -374,6 +379,16 @@ class Row(RowKeys):
     """Whether fields without a binding are sent as zeros."""
     request: str = ""
     """Text that requests the row on the serial line; empty: its header does."""
+
+    @property
+    def request_size(self) -> int:
+        """Bytes of data in its request."""
+        return self.size if self.kind == "telecommand" else 0
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of data in its reply."""
+        return self.size if self.kind == "telemetry" else 0
 
     def __repr__(self) -> str:
         """Return kind, ID and name."""

@@ -16,7 +16,7 @@ from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect, serial_answers
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
@@ -56,7 +56,7 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
 def _on_serial(
     icd: InterfaceDefinition, stack: SerialStack, row: Row, values: Mapping[str, Value]
 ) -> Exchange:
-    request, replies = _messages(icd, row, values, serial_answers(icd, row))
+    request, replies = _messages(icd, row, values, stack.answers(row))
     _check_framing(stack, row, request)
     dialect = chosen_dialect(icd, None)
     link = "serial" if dialect is None else f"serial, dialect {dialect}"

@@ -137,6 +137,7 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             ["trackin", "did you mean tracking"],
         ),
         ("[[step]]\nread = 'precise_attitude'\nexpect = { valid = 1 }", ["'valid' is true or false"]),
+        ("[[step]]\nread = 'precise_attitude'\nexpect = { valid = 'true' }", ["'valid' is true or false"]),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = 'fast' }", ["'rate_x' is a number"]),
         (
             "[[step]]\nread = 'rates'\nexpect = { rate_x = { vale = 1 } }",
@@ -306,6 +307,21 @@ def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
     assert (wanted.equals, wanted.one_of, wanted.differs_from) == (zeros, [zeros, Variable("map")], ones)
     assert wanted.mismatch("map", zeros, {"map": ones}) is None
     assert wanted.mismatch("map", ones, {"map": ones}) is not None
+
+
+@pytest.mark.parametrize("wanted", ["true", "'true'", "{ not = false }", "{ one_of = [true] }"])
+def test_a_flag_that_a_map_defines_is_true_or_false(wanted, tmp_path):
+    unit = load_unit("sagitta")
+    path = tmp_path / "script.toml"
+    path.write_text(f"[[step]]\nread = 'solution'\nexpect = {{ valid = {wanted} }}")
+    conditions = load_script(path, unit).steps[0].expect["valid"]
+    row = unit.telemetry["solution"]
+    seen = [row.decode(row.encode({"valid": valid}))["valid"] for valid in (True, False)]
+    assert conditions.mismatch("valid", seen[0], {}) is None
+    assert conditions.mismatch("valid", seen[1], {}).startswith("valid is false, expected")
+    path.write_text("[[step]]\nread = 'solution'\nexpect = { valid = 'yes' }")
+    with pytest.raises(ScriptError, match="'valid' is true or false, not 'yes'"):
+        load_script(path, unit)
 
 
 def test_values_that_a_correct_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):
