@@ -131,9 +131,7 @@ class Decoder:
         requests = self._to_device.feed(data, now)
         for event in requests:
             if isinstance(event, Request):
-                row = self.row_of(event)
-                telemetry = row is not None and row.kind == "telemetry"
-                host.expect(event, row.size if row is not None and telemetry else 0)
+                host.expect(event)
         return requests
 
     def _can_events(self, frame: CanFrame, now: float) -> Sequence[Request | Reply | LinkFault]:
