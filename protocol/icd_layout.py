@@ -306,9 +306,12 @@ def _numbered(name: str | None, number: int | None, where: str) -> str | None:
 
 
 def _default(value: Scalar | None, enum: EnumDefinition | None, where: str) -> Scalar | None:
-    if enum is not None and value is not None and value not in enum.values:
+    if enum is None or value is None:
+        return value
+    name = text_of(value)
+    if name not in enum.values:
         raise IcdError(f"{where}: default {value!r} is not in enumeration {enum.name}")
-    return value
+    return name
 
 
 def fields_of(text: str) -> list[FieldModel]:

@@ -64,6 +64,12 @@ def find_unit(name_or_folder: str | Path) -> Path:
     raise IcdError(f"{not_found('unit', name_or_folder)}; `starhil unit new FOLDER` creates one")
 
 
+def remedy(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean …?` for an unknown name, or `; known: …` with all names if none is similar."""
+    names = sorted(known)
+    return did_you_mean(name, names) or f"; known: {', '.join(names) or 'none'}"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
     near = difflib.get_close_matches(name, list(known), n=3, cutoff=_MIN_SIMILARITY)

@@ -110,6 +110,15 @@ def test_rows_of_two_classes_may_have_one_id(unit):
     assert icd.request(icd.telemetry["two"]).klass == "watch"
 
 
+def test_a_flag_of_a_map_may_have_a_default(unit):
+    row = unit(
+        HEAD
+        + telemetry('{ name = "a", type = "u8", map = { 3 = true, 5 = false }, default = false }', "one", 5)
+    ).telemetry["one"]
+    assert row.encode() == b"\5"
+    assert row.decode(b"\3") == {"a": True}
+
+
 def test_a_parameter_defaults_to_the_device_s(unit):
     icd = unit(HEAD + '[[parameter]]\nid = 7\nname = "exposure"\nmax = 1000\ndefault = 200\n')
     exposure = icd.parameters["exposure"]
