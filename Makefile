@@ -19,7 +19,6 @@ SAMPLE ?= 40
 JOBS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
-OBC_PACKAGES := qemu-system-arm:qemu-system-arm arm-none-eabi-gcc:"gcc-arm-none-eabi libnewlib-arm-none-eabi"
 # pip's start-up look at the network for a newer pip is of no use here
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
@@ -45,7 +44,7 @@ demo: $(VENV)/.product
 	$(BIN)/python tools/demo.py --out out/demo
 
 test: $(VENV)/.developer
-	-@tools/install_test_packages tshark:tshark chromium:chromium java:default-jre-headless $(OBC_PACKAGES)
+	-@tools/install_test_packages tests obc
 	@tools/test_in_lanes $(BIN)/python
 
 lint: $(VENV)/.developer
@@ -98,7 +97,7 @@ years: $(VENV)/.product
 	$(BIN)/starhil endurance --hours $(HOURS) --jobs $(JOBS) --seed $$(date +%s)
 
 obc: $(VENV)/.product
-	@tools/install_test_packages $(OBC_PACKAGES)
+	@tools/install_test_packages obc
 	$(BIN)/python tools/obc_in_qemu.py $(OBC)
 
 SITE := import site; print(site.getsitepackages()[0])

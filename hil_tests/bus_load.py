@@ -10,22 +10,25 @@ import asyncio
 import multiprocessing as mp
 import random
 import time
-from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from typing import Final
 
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.async_client import AsyncObcClient
+from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
+from starhil.hil_tests.links import DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS, CanHostLink
 from starhil.hil_tests.load_figures import CanLoad, Spread
 from starhil.hil_tests.realtime import set_realtime_priority
-from starhil.protocol.can_framing import CanFrame, CanHostReceiver, CanId, MessageType, encode_request_frames
+from starhil.protocol.can_framing import CanFrame, CanId, MessageType
+from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.messages import Reply, Request
 from starhil.protocol.transports import open_can
 
-HOST: Final = 1
-DEVICE: Final = 4
+HOST: Final = DEFAULT_HOST_ADDRESS
+DEVICE: Final = DEFAULT_DEVICE_ADDRESS
 TALKER: Final = 0x20
 """CAN address of the sender of the other traffic; it sends to the unused address LISTENER."""
 LISTENER: Final = 0x21
@@ -135,49 +138,10 @@ class OtherTraffic:
 # --- CAN ---
 
 
-class _CanAsker:
-    """Requests telemetry over CAN, one row at a time, and measures the latency of the replies."""
-
-    def __init__(self, node: int, send: Callable[[CanFrame], bool]) -> None:
-        self._node = node
-        self._send = send
-        self._receiver = CanHostReceiver(HOST, node)
-        self._answer: asyncio.Future[Reply] | None = None
-        self.latencies: list[float] = []
-        self.requests = 0
-        self.unanswered = 0
-        self.faults = 0
-
-    def on_frame(self, frame: CanFrame) -> None:
-        """Process a frame from the bus."""
-        for event in self._receiver.feed(frame, time.monotonic()):
-            if isinstance(event, LinkFault):
-                self.faults += 1
-            elif self._answer is not None and not self._answer.done():
-                self._answer.set_result(event)
-
-    async def ask(self, row_id: int) -> Reply | None:
-        """Request a row; return the reply, or None if none came in time."""
-        self.requests += 1
-        self._answer = asyncio.get_running_loop().create_future()
-        begin = time.perf_counter()
-        for frame in encode_request_frames(Request.of(row_id), HOST, self._node):
-            self._send(frame)
-        try:
-            reply = await asyncio.wait_for(self._answer, REPLY_WITHIN_S)
-        except TimeoutError:
-            self.unanswered += 1
-            return None
-        self.latencies.append(time.perf_counter() - begin)
-        return reply
-
-
-def _is_right(icd: InterfaceDefinition, reply: Reply, row_id: int) -> bool:
-    """Return whether a reply is the requested telemetry, with every value within its limits."""
-    if reply.kind is not ReplyKind.TELEMETRY or reply.id != row_id:
-        return False
+def _is_right(row: Row, reply: Reply) -> bool:
+    """Return whether every value of a reply is within its limits."""
     try:
-        icd.telemetry_by_id[row_id].decode(reply.data, check=True)
+        row.decode(reply.data, check=True)
     except ProtocolError:
         return False
     return True
@@ -197,36 +161,47 @@ async def load_can(
     `spec` is a bus as for `open_can`, `rate` the frames per second of the other traffic, whose process gets real-time
     priority with `realtime`; `device` is the CAN address of the device.
     """
-    transport = open_can(spec)
-    asker, echo = _CanAsker(device, transport.send), _CanAsker(ECHO, transport.send)
-
-    def take(frame: CanFrame) -> None:
-        asker.on_frame(frame)
-        echo.on_frame(frame)
-
-    await transport.start(take)
+    asker, echo = (
+        AsyncObcClient(
+            CanHostLink(spec, host_address=HOST, device_address=node), icd, timeout_s=REPLY_WITHIN_S
+        )
+        for node in (device, ECHO)
+    )
+    await asker.start()
+    await echo.start()
     traffic = await asyncio.to_thread(OtherTraffic, spec, rate, realtime=realtime)
     rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
     end = time.monotonic() + seconds
-    wrong = 0
+    latencies: list[float] = []
+    echoes: list[float] = []
+    requests = unanswered = wrong = 0
     while time.monotonic() < end:
-        row = icd.telemetry[REQUESTED_ROWS[asker.requests % len(REQUESTED_ROWS)]]
-        reply = await asker.ask(row.id)
-        wrong += reply is not None and not _is_right(icd, reply, row.id)
+        row = icd.telemetry[REQUESTED_ROWS[requests % len(REQUESTED_ROWS)]]
+        requests += 1
+        try:
+            reply, latency = await asker.transact(icd.request(row), row.name)
+            latencies.append(latency)
+            wrong += not _is_right(row, reply)
+        except NackError:
+            wrong += 1
+        except (NoReplyError, LinkLostError):
+            unanswered += 1
         await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
-        await echo.ask(ECHO_ROW)
+        with suppress(NoReplyError, LinkLostError):
+            echoes.append((await echo.transact(Request.of(ECHO_ROW), "echo"))[1])
         await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
     duration, sent, lost, disordered, refused = await asyncio.to_thread(traffic.stop)
-    await transport.close()
+    await asker.close()
+    await echo.close()
     return CanLoad(
         seconds=round(duration, 1),
         offered_per_s=round(sent / duration, 1),
         sent=sent,
         lost=lost + refused,
         disordered=disordered,
-        requests=asker.requests,
-        unanswered=asker.unanswered,
-        wrong=wrong + asker.faults,
-        latency=Spread.of(asker.latencies),
-        machine=Spread.of(echo.latencies),
+        requests=requests,
+        unanswered=unanswered,
+        wrong=wrong + len(asker.faults) + len(asker.stray_replies),
+        latency=Spread.of(latencies),
+        machine=Spread.of(echoes),
     )

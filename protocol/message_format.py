@@ -1,7 +1,7 @@
 """Formats of messages on a serial line: header, data and check within a framing.
 
 A link has one format for both directions, unless its `format` gives a direction or some classes another framing or
-check. Messages of several formats are told apart by their first byte.
+check. Messages of several formats are distinguished by their first byte.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class MessageFormat:
 class Formats:
     """The formats of the messages of one direction; the last is that of messages without a class.
 
-    Raises IcdError if the messages of several formats cannot be told apart by their first byte.
+    Raises IcdError if the messages of several formats cannot be distinguished by their first byte.
     """
 
     def __init__(self, formats: Sequence[MessageFormat], direction: str) -> None:

@@ -1,4 +1,4 @@
-"""Fuzzing guided by coverage (atheris) of each decoder and reader in tests/fuzzing/targets.py.
+"""Fuzzing guided by coverage (atheris) of each decoder and reader in tests/fuzzing.
 
 python tools/fuzz.py [--seconds 60] [TARGET …]     for this long each; all targets by default
 python tools/fuzz.py --list
@@ -35,40 +35,23 @@ SLOWEST_S = 20
 MEMORY_MB = 3000
 CORPUS_BYTES = 3000
 INSTRUMENTED = (
-    *("starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.expect", "starhil.hil_tests.images"),
-    *("starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log", "starhil.hil_tests.emulator_process"),
-    *("starhil.emulator.control", "starhil.emulator.console"),
-    *(
-        "starhil.emulator.device",
-        "starhil.emulator.truth",
-        "starhil.emulator.profile",
-        "starhil.emulator.replay",
-    ),
-    *(
-        "starhil.emulator.cli.endurance",
-        "starhil.emulator.tape",
-        "starhil.emulator.json_lines",
-        "starhil.emulator.toml_file",
-        "starid.files",
-    ),
-    *("starid.imaging.image_io", "starid.camera_file", "starid.hipparcos", "starid.thesis.database_file"),
-)
+    "starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.expect",
+    "starhil.hil_tests.images", "starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log",
+    "starhil.hil_tests.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
+    "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",
+    "starhil.emulator.replay", "starhil.emulator.cli.endurance", "starhil.emulator.tape",
+    "starhil.emulator.json_lines", "starhil.emulator.toml_file", "starid.files",
+    "starid.imaging.image_io", "starid.camera_file", "starid.hipparcos", "starid.thesis.database_file",
+)  # fmt: skip
 """Modules whose coverage guides; not those with kernels, because numba cannot read instrumented code."""
 
 
 def modules() -> list[str]:
     """Return the names of all modules of the project."""
-    packages = {
-        "starhil/emulator": "emulator",
-        "starhil/protocol": "protocol",
-        "starhil/hil_tests": "hil_tests",
-        "starid": "starid",
-    }
+    folders = {folder: f"starhil.{folder}" for folder in ("emulator", "protocol", "hil_tests")}
     return [
-        ".".join([*package.split("/"), *path.relative_to(ROOT / folder).with_suffix("").parts]).removesuffix(
-            ".__init__"
-        )
-        for package, folder in packages.items()
+        ".".join((package, *path.relative_to(ROOT / folder).with_suffix("").parts)).removesuffix(".__init__")
+        for folder, package in {**folders, "starid": "starid"}.items()
         for path in (ROOT / folder).rglob("*.py")
     ]
 

@@ -29,10 +29,9 @@ from starid.attitude import Attitude
 SOURCE = Path(__file__).parent / "obc"
 COMPILER = "arm-none-eabi-gcc"
 MACHINE = "qemu-system-arm"
-PACKAGES = {COMPILER: "gcc-arm-none-eabi libnewlib-arm-none-eabi", MACHINE: "qemu-system-arm"}
 FLAGS = (
     *("-mcpu=cortex-m3", "-mthumb", "-std=c99", "-Os", "-Wall", "-Wextra", "-Werror"),
-    *("-nostartfiles", "-ffunction-sections", "-Wl,--gc-sections"),
+    *("-ffunction-sections", "-Wl,--gc-sections", "--specs=nano.specs", "--specs=rdimon.specs"),
 )
 ENDS_WITHIN_S = 180.0
 AGREES_ARCSEC = 5.0

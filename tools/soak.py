@@ -21,9 +21,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import random
-import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -36,6 +34,7 @@ from typing import Any
 
 from starhil.hil_tests.bench import LinkOptions
 from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.control import ControlClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
 from starhil.hil_tests.errors import BenchError, DeviceError
 from starhil.hil_tests.load_figures import percentile
@@ -146,40 +145,6 @@ def settled_descriptors(pids: Sequence[int]) -> int:
     return count
 
 
-class Control:
-    """A client of the control channel at `HOST:PORT` or `unix:/path`."""
-
-    def __init__(self, address: str) -> None:
-        if address.startswith("unix:"):
-            self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-            self._socket.connect(address.removeprefix("unix:"))
-        else:
-            host, _, port = address.rpartition(":")
-            self._socket = socket.create_connection((host.strip("[]"), int(port)))
-        self._lines = self._socket.makefile("rw", encoding="utf-8")
-
-    def do(self, action: str, **values: Any) -> dict[str, Any]:
-        """Send a request and return the answer.
-
-        Raises
-        ------
-        BenchError
-            The emulator rejects it, or has ended.
-        """
-        self._lines.write(json.dumps({"do": action, **values}) + "\n")
-        self._lines.flush()
-        line = self._lines.readline()
-        answer: dict[str, Any] = json.loads(line) if line else {"error": "the emulator closed the channel"}
-        if not answer.get("ok"):
-            raise BenchError(f"control channel: {action}: {answer.get('error')}")
-        return answer
-
-    def close(self) -> None:
-        """Leave the channel."""
-        self._lines.close()
-        self._socket.close()
-
-
 class Soak:
     """A running emulator with its hub, and the actions of a round."""
 
@@ -207,14 +172,11 @@ class Soak:
         for step in result.results:
             if step.status == "failed":
                 raise BenchError(f"round {number}: {step.link} {step.name}: {step.detail}")
-        control = Control(self._emulator.ready["control"])
-        try:
+        with ControlClient(self._emulator.ready["control"]) as control:
             control.do("fault", **FAULTS[number % len(FAULTS)])
             for link in self._links:
                 self._ask_in_vain(link)
             control.do("clear_faults")
-        finally:
-            control.close()
         latencies = (self._latency_p99_ms("serial"), self._latency_p99_ms("can"))
         both = (self._emulator, self._hub)
         memory_mb = sum(process.memory_bytes() for process in both) / 1e6

@@ -8,10 +8,9 @@ virtual environment of this clone works unchanged. Files written by the guest ar
 folders named by --share. The command gets the caller's environment, working folder and arguments, but no
 standard input. Its output is passed on as it is written, and its exit status is returned.
 
-Other exit statuses: 2 for a wrong call, 69 if a program is missing, 124 after a timeout, 125 if the guest did
-not start or died (its console is printed then). Root is not needed. Requires the Debian packages
-user-mode-linux, can-utils, kmod and iproute2; see tools/install_test_packages. Uses only the standard library
-and leaves no files.
+Other exit statuses: 2 for a wrong call, 69 if a package is missing, 124 after a timeout, 125 if the guest did
+not start or died (its console is printed then). Root is not needed. Requires the Debian packages of
+`tools/install_test_packages vcan`. Uses only the standard library and leaves no files.
 """
 
 from __future__ import annotations
@@ -38,14 +37,6 @@ EXIT_TIME_OUT: Final = 124
 EXIT_GUEST_FAILED: Final = 125
 
 SYSTEM_PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
-NEEDED: Final = {
-    "linux.uml": "user-mode-linux",
-    "ip": "iproute2",
-    "insmod": "kmod",
-    "candump": "can-utils",
-}
-"""Program → Debian package that provides it."""
-
 MODULES: Final = (
     "net/can/can",
     "net/can/can-raw",
@@ -84,15 +75,11 @@ def run_in_guest(command: list[str], *, shares: list[Path], time_out_s: float, m
     Raises
     ------
     GuestError
-        A program is missing, the command timed out, or the guest did not boot.
+        A package is missing, the command timed out, or the guest did not boot.
     """
-    missing = {name: NEEDED[name] for name in NEEDED if shutil.which(name, path=SYSTEM_PATH) is None}
-    if missing:
-        packages = " ".join(sorted(missing.values()))
-        raise GuestError(
-            f"{', '.join(missing)} not found: install {packages} (tools/install_test_packages)",
-            EXIT_UNAVAILABLE,
-        )
+    listing = [str(Path(__file__).with_name("install_test_packages")), "--list", "vcan"]
+    if missing := subprocess.run(listing, stdout=subprocess.PIPE, text=True, check=True).stdout.strip():
+        raise GuestError(f"Debian packages missing: {missing}", EXIT_UNAVAILABLE)
     with tempfile.TemporaryDirectory(prefix="vcan-guest-") as name:
         folder = Path(name)
         job = {

@@ -12,15 +12,15 @@ from typing import Any, Final
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.describe import describe, load_bright_stars
-from starhil.emulator.console.history import History, frame_message
-from starhil.emulator.console.obc import ConsoleObc, Exchange, ObcClient
+from starhil.emulator.console.history import History, frame_message, json_row
+from starhil.emulator.console.obc import POLL_S, ConsoleObc, Exchange, ObcClient
 from starhil.emulator.console.pointing import pointing_request
 from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.stepping import StepRunner
 from starhil.emulator.console.trace import RequestEncoder, WireTrace
 from starhil.emulator.console.viewer import Viewer
 from starhil.emulator.device.measurement import Measurement
-from starhil.emulator.device.modes import Transition
+from starhil.emulator.device.modes import Mode, Transition
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.guard import log_internal_error, one_line
 from starhil.emulator.head import Head
@@ -39,9 +39,6 @@ STATUS_S: Final = 0.5
 
 LINK_NAMES: Final = {"serial": "serial", "can": "CAN"}
 
-POLL_S: Final = 1.0
-"""Period in which every telemetry row shown on a page is read once, seconds."""
-
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
 
@@ -59,7 +56,7 @@ class Console:
         self.obc = ConsoleObc(client, device.icd)
         self.history = History()
         self.runs = runs
-        runs.listeners.append(self._broadcast)
+        runs.changed.connect(self._broadcast)
         self.trace = WireTrace(
             device.icd,
             head.traffic,
@@ -71,6 +68,8 @@ class Console:
         self._address = "canopen_node" if device.icd.canopen_only else "can_address"
         self._last_frame = b""
         """The latest message with an image; empty before the first."""
+        self._unresponsive_since_s: float | None = None
+        """Simulation time since which the device is unresponsive, seconds; None if it is not."""
         self.viewers: set[Viewer] = set()
         self._tasks: list[asyncio.Task[None]] = []
         self._rows_wanted = asyncio.Event()
@@ -93,6 +92,9 @@ class Console:
         device = self._head.device
         device.signals.frame_published.connect(self._frame_published)
         device.signals.mode_changed.connect(self._mode_changed)
+        device.signals.faults_changed.connect(self._faults_changed)
+        self._faults_changed({})
+        self._record_mode(device.modes.mode)
         profile = self._head.profile
         path = str(profile.folder / profile.catalog.path) if profile.catalog.path else None
         self._stars = asyncio.create_task(asyncio.to_thread(load_bright_stars, path, profile.epoch))
@@ -154,8 +156,7 @@ class Console:
         """Send the description of the run to a page; return the history as rows of 64-bit floats."""
         stars = await self._stars if self._stars is not None else {}
         content = describe(self._run, self._head) | stars
-        content |= {"session_steps": self.obc.steps, "view_only": not viewer.commands}
-        viewer.send(json.dumps({"type": "hello", **content}))
+        viewer.send(json.dumps({"type": "hello", "view_only": not viewer.commands, **content}))
         viewer.send(json.dumps({"type": "reasons", "reasons": self.history.reasons}))
         for message in self.runs.messages():
             viewer.send(message)
@@ -173,10 +174,7 @@ class Console:
     # --- listeners ---
 
     def _frame_published(self, measurement: Measurement) -> None:
-        known = len(self.history.reasons)
-        row = self.history.add(measurement)
-        if len(self.history.reasons) != known:
-            self._broadcast({"type": "reasons", "reasons": self.history.reasons})
+        row = self._with_reasons(lambda: self.history.add(measurement))
         if measurement.result.preview is None and not any(viewer.frames for viewer in self.viewers):
             return
         data = frame_message(measurement, row)
@@ -186,10 +184,34 @@ class Console:
             if viewer.frames:
                 viewer.send_frame(data)
 
+    def _with_reasons(self, add: Callable[[], list[float]]) -> list[float]:
+        """Add a row to the history and return it; its reason, if new, is sent to the pages."""
+        known = len(self.history.reasons)
+        row = add()
+        if len(self.history.reasons) != known:
+            self._broadcast({"type": "reasons", "reasons": self.history.reasons})
+        return row
+
     def _mode_changed(self, transition: Transition) -> None:
-        now_s = self._run.clock.now_ns() / NANOSECONDS
-        text = f"{transition.before.value} → {transition.after.value} ({transition.cause.value})"
-        self._broadcast({"type": "event", "run_s": now_s, "what": "mode", "text": text})
+        self._record_mode(transition.after)
+
+    def _record_mode(self, mode: Mode) -> None:
+        """Add a mode without frames to the history; other modes come with their frames."""
+        if mode.makes_frames:
+            return
+        unix_s = self._head.device.time.unix_ns() / NANOSECONDS
+        row = self._with_reasons(lambda: self.history.add_mode(mode, self._now_s(), unix_s))
+        self._broadcast({"type": "row", "row": json_row(row)}, lambda viewer: viewer.frames)
+
+    def _faults_changed(self, _request: dict[str, Any]) -> None:
+        if not self._head.device.unresponsive:
+            self._unresponsive_since_s = None
+        elif self._unresponsive_since_s is None:
+            self._unresponsive_since_s = self._now_s()
+
+    def _now_s(self) -> float:
+        """Return the simulation time, seconds."""
+        return self._run.clock.now_ns() / NANOSECONDS
 
     async def _deliver_trace(self) -> None:
         await asyncio.sleep(TURN_S)
@@ -211,7 +233,7 @@ class Console:
                 "type": "status",
                 "status": status,
                 "truth": truth,
-                "viewers": len(self.viewers),
+                "unresponsive_since_s": self._unresponsive_since_s,
                 "stepping": self.stepping.speed,
                 "session_steps": self.obc.steps,
                 "heard": self._heard(),

@@ -9,7 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from starhil.emulator.console.history import COLUMNS, MODES
+from starhil.emulator.console.history import COLUMNS, KEPT_ROWS, MODES
+from starhil.emulator.console.pointing import DEFAULT_RATE_DEG_S
 from starhil.emulator.faults import NO_ERROR, DeviceFault
 from starhil.emulator.head import Head
 from starhil.emulator.links.wire_faults import WireFault
@@ -40,6 +41,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         "head": head.number,
         "heads": [f"{each.number}: {each.profile.name}" for each in run.heads],
         "columns": COLUMNS,
+        "kept_rows": KEPT_ROWS,
         "modes": MODES,
         "profile": head.profile.name,
         "seed": head.profile.run.seed,
@@ -55,6 +57,7 @@ def describe(run: Run, head: Head) -> dict[str, Any]:
         ],
         "faults": fault_controls(icd, [link.bus for link in head.links]),
         "scenarios": list(bundled("scenario")),
+        "slew_rate_deg_s": DEFAULT_RATE_DEG_S,
     }
 
 
@@ -63,10 +66,7 @@ def describe_row(row: Row, icd: InterfaceDefinition) -> dict[str, Any]:
     return {
         "id": row.id,
         "name": row.name,
-        "class": row.klass,
-        "size": row.size,
         "doc": row.doc,
-        "provenance": row.provenance,
         "fields": [_describe_field(field, icd) for field in row.named_fields.values()],
     }
 
@@ -75,7 +75,6 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
     values: dict[str, Any] = {
         "name": field.name,
         "kind": field.kind,
-        "type": field.type,
         "unit": field.unit,
         "doc": field.doc,
         "default": field.default if field.const is None else field.const,
@@ -85,8 +84,6 @@ def _describe_field(field: Field, icd: InterfaceDefinition) -> dict[str, Any]:
         bounded = field.kind != "float" or field.minimum is not None or field.maximum is not None
         if bounded and abs(low) < 1e38 and abs(high) < 1e38:
             values |= {"min": low, "max": high}
-        if field.kind != "float":
-            values["step"] = field.scale
     if field.enum is not None:
         values["values"] = list(field.enum.values)
     if field.name == "parameter" and icd.parameters:

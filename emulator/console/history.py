@@ -1,4 +1,4 @@
-"""The numbers of each published frame, and their history of an hour."""
+"""The numbers of each published frame, and of changes to a mode without frames, and their history of an hour."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ COLUMNS: Final = (
 )  # fmt: skip
 """Columns of a row, in `UNITS`.
 
-`mode` is an index into `MODES`, `reason` an index into the `reasons` of the history. NaN: unknown.
+`mode` is an index into `MODES`, `reason` an index into the `reasons` of the history. NaN: unknown. A row without a
+`frame` is a change to a mode without frames.
 """
 
 UNITS: Final = {
@@ -38,6 +39,9 @@ UNITS: Final = {
 """Unit of each column that has one."""
 
 MODES: Final = tuple(mode.value for mode in Mode)
+
+NO_FRAMES: Final = "no_images"
+"""Reason why the attitude is not valid in a mode without frames."""
 
 KEPT_ROWS: Final = 36_000
 """Number of rows in the history: an hour at 10 Hz."""
@@ -56,7 +60,15 @@ class History:
 
     def add(self, measurement: Measurement) -> list[float]:
         """Add a row for a measurement, and return it."""
-        row = self._row(measurement)
+        return self._keep(self._row(measurement))
+
+    def add_mode(self, mode: Mode, run_s: float, unix_s: float) -> list[float]:
+        """Add a row for a change to a mode without frames, and return it."""
+        known = {"run_s": run_s, "unix_s": unix_s, "mode": MODES.index(mode.value), "valid": 0.0}
+        known["reason"] = self._reason(NO_FRAMES)
+        return self._keep([known.get(name, math.nan) for name in COLUMNS])
+
+    def _keep(self, row: list[float]) -> list[float]:
         self._rows[self._count % len(self._rows)] = row
         self._count += 1
         return row
@@ -72,8 +84,6 @@ class History:
 
     def _row(self, measurement: Measurement) -> list[float]:
         result, truth = measurement.result, measurement.truth
-        if measurement.reason not in self.reasons:
-            self.reasons.append(measurement.reason)
         error = measured = [math.nan] * 3
         cross = sigma_cross = sigma_roll = math.nan
         quaternion = [math.nan] * 4
@@ -109,8 +119,14 @@ class History:
             truth.attitude.ra_deg,
             truth.attitude.dec_deg,
             truth.attitude.roll_deg,
-            self.reasons.index(measurement.reason),
+            self._reason(measurement.reason),
         ]
+
+    def _reason(self, reason: str) -> int:
+        """Return the index of a reason, which is added if it is new."""
+        if reason not in self.reasons:
+            self.reasons.append(reason)
+        return self.reasons.index(reason)
 
 
 def json_row(row: list[float]) -> list[float | None]:
@@ -127,7 +143,6 @@ def frame_message(measurement: Measurement, row: list[float]) -> bytes:
     numbers = json.dumps(
         {
             "row": json_row(row),
-            "reason": measurement.reason,
             "late": measurement.late,
             "rejected": measurement.result.refused,
             "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),

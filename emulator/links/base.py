@@ -103,7 +103,7 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
         self._pending: PendingAnswer[list[Reply]] | None = None
         self._executing = False
         self._caused: list[Reply] = []
-        """Unsolicited messages that the request being executed has caused; they follow its replies."""
+        """Unsolicited messages that the request being executed has caused so far; they follow its replies."""
         self._device.signals.unsolicited.connect(self._send_unsolicited)
         self._device.signals.restarted.connect(self._reset_receiver)
 
@@ -152,25 +152,30 @@ class DeviceLink(BusLink[Item], Generic[Item, Style]):
             answer = self._requests.handle(event, console=console)
         finally:
             self._executing = False
+        caused, self._caused = self._caused, []
         if isinstance(answer, PendingAnswer):
             self._pending = answer
-            answer.when_done(partial(self._answer_later, answer, style))
+            answer.when_done(partial(self._answer_later, answer, caused, style))
         else:
-            for reply in answer:
-                self._answer(reply, style)
-        caused, self._caused = self._caused, []
-        for reply in caused:
-            self._send_unsolicited(reply)
+            self._answer(answer, caused, style)
 
-    def _answer_later(self, answer: PendingAnswer[list[Reply]], style: Style, replies: list[Reply]) -> None:
-        for reply in replies:
-            self._answer(reply, style)
+    def _answer_later(
+        self, answer: PendingAnswer[list[Reply]], caused: list[Reply], style: Style, replies: list[Reply]
+    ) -> None:
+        self._answer(replies, caused, style)
         if self._pending is answer:
             self._pending = None
             self._dispatch_waiting()
 
-    def _answer(self, reply: Reply, style: Style) -> None:
-        """Send an answer, with the unit's code for an error."""
+    def _answer(self, replies: list[Reply], caused: list[Reply], style: Style) -> None:
+        """Send the replies to a request, and then the unsolicited messages that it has caused."""
+        for reply in replies:
+            self._send_reply(reply, style)
+        for reply in caused:
+            self._send_unsolicited(reply)
+
+    def _send_reply(self, reply: Reply, style: Style) -> None:
+        """Send a reply, with the unit's code for an error."""
         if isinstance(reply.code, ErrorCode):
             number = self._device.icd.error_number(reply.code)
             if number != reply.code:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection
 from enum import IntEnum
-from typing import Final
+from typing import Any, Final, TypeVar
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
@@ -15,16 +15,17 @@ from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
     EXPEDITED,
+    AbortedError,
+    BadResponseError,
     Entry,
     abort_code,
-    expedited_data,
-    expedited_download,
-    multiplexer,
-    segment_data,
-    segment_request,
+    download,
+    upload,
     upload_request,
 )
 from starhil.hil_tests.raw_traffic import format_frame
+
+T = TypeVar("T")
 
 NMT: Final = 0x000
 SYNC: Final = 0x080
@@ -298,23 +299,16 @@ class CanopenProbe:
 
     def try_read(self, index: int, subindex: int = 0) -> bytes | int:
         """Read an object; return its value, or the abort code as a number."""
-        answer = self.ask(upload_request(index, subindex))
-        if answer is None or len(answer) != 8:
-            raise CaseFailed(f"an answer to reading {index:04X}h:{subindex:02X}h", _seen(answer))
-        if answer[0] == ABORT:
-            return abort_code(answer)
-        if (found := expedited_data(answer)) is not None:
-            return found
-        data, toggle = b"", 0
-        while True:
-            part = self.ask(segment_request(toggle))
-            if part is None or len(part) != 8 or part[0] & 0xF0 != toggle:
-                raise CaseFailed(f"a segment of {index:04X}h:{subindex:02X}h", _seen(part))
-            chunk, last = segment_data(part)
-            data += chunk
-            if last:
-                return data
-            toggle ^= 0x10
+        return self._transfer(upload, index, subindex)
+
+    def _transfer(self, transfer: Callable[..., T], *details: Any) -> T | int:
+        """Run a transfer; return its result, or the abort code as a number."""
+        try:
+            return transfer(self.ask, *details)
+        except AbortedError as abort:
+            return abort.code
+        except BadResponseError as error:
+            raise CaseFailed(error.expected, _seen(error.seen)) from None
 
     def number(self, index: int, subindex: int = 0) -> int:
         """Read an unsigned number."""
@@ -323,12 +317,7 @@ class CanopenProbe:
     def write(self, index: int, subindex: int, value: int | bytes, size: int = 4) -> int:
         """Write up to 4 bytes; return 0 or the abort code."""
         data = value if isinstance(value, bytes) else value.to_bytes(size, "little")
-        answer = self.ask(expedited_download(index, subindex, data))
-        if answer is None or len(answer) != 8 or answer[0] not in {0x60, ABORT}:
-            raise CaseFailed(f"an answer to writing {index:04X}h:{subindex:02X}h", _seen(answer))
-        if answer[1:4] != multiplexer(index, subindex):
-            raise CaseFailed(f"an answer for {index:04X}h:{subindex:02X}h", answer.hex(" "))
-        return 0 if answer[0] == 0x60 else abort_code(answer)
+        return self._transfer(download, index, subindex, data) or 0
 
     def put(self, item: ODVariable | Entry, data: bytes) -> None:
         """Write an object of the EDS or of the definition; fail if it is refused."""

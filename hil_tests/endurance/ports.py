@@ -6,7 +6,6 @@ Requests are encoded and answers decoded by the judge, not by the product's code
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import count
 from typing import Any, Final, Protocol
 
 from starhil.hil_tests.judge import can, canopen
@@ -18,12 +17,6 @@ from starhil.protocol.can_framing import CanFrame
 
 HOST: Final = 1
 """CAN address of the OBC."""
-SDO_RECEIVE, SDO_TRANSMIT = 0x600, 0x580
-"""Bases of the CAN IDs of SDO requests and responses (CiA 301 7.3.5)."""
-
-SDO_SIZE: Final = 8
-"""Bytes of each SDO request and response."""
-
 Heard = tuple[float, Answer]
 Deliver = Callable[[Any], None]
 Take = Callable[[], Sequence[tuple[float, Any]]]
@@ -115,14 +108,6 @@ class CanPort:
         return found
 
 
-class _TransferEndedError(Exception):
-    """A transfer that ended early, with what is then heard: an abort or a malformed response; None for no response."""
-
-    def __init__(self, answer: Answer | None) -> None:
-        super().__init__(answer)
-        self.answer = answer
-
-
 Objects = dict[tuple[str, str], list[canopen.Entry]]
 """The entries through which each row is read or executed, by kind and name of the row."""
 
@@ -148,11 +133,14 @@ class CanopenPort:
                 answer = Answer("telemetry", data=self._read(row)) if row.is_telemetry else Answer("ack")
                 if not row.is_telemetry:
                     (entry,) = self._objects[row.kind, row.name]
-                    self._download(entry, canopen.written(entry, row, request.data))
-            except _TransferEndedError as ended:
-                if ended.answer is None:
+                    data = canopen.written(entry, row, request.data)
+                    canopen.download(self._exchange, entry.index, entry.subindex, data)
+            except canopen.AbortedError as abort:
+                answer = Answer("nack", abort.code)
+            except canopen.BadResponseError as error:
+                if error.seen is None:
                     continue
-                answer = ended.answer
+                answer = Answer("malformed", data=error.seen)
             self._answers.append((self._at_s, answer))
 
     def cut(self, request: Request, share: float) -> None:
@@ -161,7 +149,7 @@ class CanopenPort:
     def _read(self, row: Row) -> bytes:
         data = bytearray(row.size)
         for entry in self._objects[row.kind, row.name]:
-            value = self._upload(entry)
+            value = canopen.upload(self._exchange, entry.index, entry.subindex)
             if entry.slot is None:  # the whole row
                 return value
             slot = entry.slot
@@ -171,43 +159,18 @@ class CanopenPort:
             data[slot.offset : slot.offset + slot.size] = piece
         return bytes(data)
 
-    def _upload(self, entry: canopen.Entry) -> bytes:
-        data = canopen.expedited_data(self._exchange(canopen.upload_request(entry.index, entry.subindex)))
-        if data is not None:
-            return data
-        data = b""
-        for number in count():
-            piece, is_last = canopen.segment_data(
-                self._exchange(canopen.segment_request(0x10 * (number % 2)))
-            )
-            data += piece
-            if is_last:
-                break
-        return data
-
-    def _download(self, entry: canopen.Entry, data: bytes) -> None:
-        if len(data) <= canopen.EXPEDITED:
-            self._exchange(canopen.expedited_download(entry.index, entry.subindex, data))
-            return
-        for request in canopen.segmented_download(entry.index, entry.subindex, data):
-            self._exchange(request)
-
-    def _exchange(self, data: bytes) -> bytes:
-        self._deliver(CanFrame(SDO_RECEIVE + self.node, data.ljust(SDO_SIZE, b"\0"), extended=False))
+    def _exchange(self, request: bytes) -> bytes | None:
+        """Send a request; return the response, several as one that is too long, None for none."""
+        data = request.ljust(canopen.SDO_SIZE, b"\0")
+        self._deliver(CanFrame(canopen.SDO_REQUEST + self.node, data, extended=False))
         responses = self._sort()
-        if not responses:
-            raise _TransferEndedError(None)
-        if len(responses) > 1 or len(responses[0]) != SDO_SIZE:
-            raise _TransferEndedError(Answer("malformed", data=b"".join(responses)))
-        if responses[0][0] == canopen.ABORT:
-            raise _TransferEndedError(Answer("nack", canopen.abort_code(responses[0])))
-        return responses[0]
+        return b"".join(responses) if responses else None
 
     def _sort(self) -> list[bytes]:
         """Return the data of the SDO responses that have arrived, and keep all other frames."""
         responses = []
         for at_s, frame in self._take():
-            if not frame.extended and frame.id == SDO_TRANSMIT + self.node:
+            if not frame.extended and frame.id == canopen.SDO_RESPONSE + self.node:
                 self._at_s = at_s
                 responses.append(frame.data)
             else:
@@ -227,7 +190,7 @@ class CanopenPort:
 
     def set_state(self, command: int) -> None:
         """Send an NMT command to the node."""
-        self._deliver(CanFrame(0x000, bytes((command, self.node)), extended=False))
+        self._deliver(CanFrame(canopen.NMT, bytes((command, self.node)), extended=False))
 
 
 def objects_of(unit: Unit) -> Objects:

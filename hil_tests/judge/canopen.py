@@ -11,7 +11,7 @@ big-endian on its other links is converted.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -20,10 +20,18 @@ from starhil.hil_tests.judge.rows import Field, Row
 
 PREDEFINED: Final = {0x1400: (0x200, 0x300, 0x400, 0x500), 0x1800: (0x180, 0x280, 0x380, 0x480)}
 """CAN IDs of the first four RPDOs and TPDOs, to which the node ID is added (CiA 301 7.3.5)."""
-EXPEDITED: Final = 4
-"""Maximum number of bytes in an expedited SDO."""
+NMT, SYNC, EMERGENCY, TIME = 0x000, 0x080, 0x080, 0x100
+SDO_RESPONSE, SDO_REQUEST, HEARTBEAT = 0x580, 0x600, 0x700
+"""CAN IDs; to those of EMCY, SDO and heartbeat, the node ID is added (CiA 301 7.3.5)."""
+SDO_SIZE: Final = 8
+"""Bytes of each SDO request and response."""
+EXPEDITED, SEGMENT = 4, 7
+"""Maximum number of bytes in an expedited SDO, and in a segment."""
 ABORT: Final = 0x80
 """Command of an abort."""
+
+Exchange = Callable[[bytes], bytes | None]
+"""Sends an SDO request, and returns the response, None without one; it fills the request up to 8 bytes."""
 
 
 # --- SDO ---
@@ -39,38 +47,79 @@ def upload_request(index: int, subindex: int) -> bytes:
     return bytes([0x40]) + multiplexer(index, subindex)
 
 
-def expedited_download(index: int, subindex: int, data: bytes) -> bytes:
-    """Return the request that writes an object of up to 4 bytes, with its size."""
-    return bytes([0x23 | (EXPEDITED - len(data)) << 2]) + multiplexer(index, subindex) + data
-
-
-def segmented_download(index: int, subindex: int, data: bytes) -> Iterator[bytes]:
-    """Yield the requests that write an object of more than 4 bytes: its size, then 7 bytes at a time."""
-    yield bytes([0x21]) + multiplexer(index, subindex) + len(data).to_bytes(4, "little")
-    pieces = [data[start : start + 7] for start in range(0, len(data), 7)]
-    for number, piece in enumerate(pieces):
-        last = number == len(pieces) - 1
-        yield bytes([0x10 * (number % 2) | 7 - len(piece) << 1 | last]) + piece
-
-
-def expedited_data(answer: bytes) -> bytes | None:
-    """Return the data in the answer to a read, or None if segments follow."""
-    return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & 0x02 else None
-
-
-def segment_request(toggle: int) -> bytes:
-    """Return the request for the next segment; `toggle` is 0 and 10h in turn."""
-    return bytes([0x60 | toggle])
-
-
-def segment_data(answer: bytes) -> tuple[bytes, bool]:
-    """Return the data in a segment, and whether it is the last."""
-    return answer[1 : 8 - (answer[0] >> 1 & 7)], bool(answer[0] & 1)
-
-
-def abort_code(answer: bytes) -> int:
+def abort_code(response: bytes) -> int:
     """Return the code of an abort."""
-    return int.from_bytes(answer[4:], "little")
+    return int.from_bytes(response[4:], "little")
+
+
+class AbortedError(Exception):
+    """The node has refused a transfer, with the code of its abort."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"abort 0x{code:08X}")
+        self.code = code
+
+
+class BadResponseError(Exception):
+    """What was expected, and the response that was seen instead, None for none."""
+
+    def __init__(self, expected: str, seen: bytes | None) -> None:
+        super().__init__(expected)
+        self.expected, self.seen = expected, seen
+
+
+def upload(exchange: Exchange, index: int, subindex: int) -> bytes:
+    """Read an object, expedited or in segments.
+
+    Raises AbortedError, and BadResponseError for a response that a server must not send.
+    """
+    name, mux = f"{index:04X}h:{subindex:02X}h", multiplexer(index, subindex)
+    seen = exchange(upload_request(index, subindex))
+    begun = _checked(seen, f"an answer to reading {name}", 0xE0, 0x40, mux)
+    if begun[0] & 0x02:
+        return begun[4 : SDO_SIZE - (begun[0] >> 2 & 3)]
+    data, toggle, is_last = b"", 0, False
+    while not is_last:
+        segment = _checked(exchange(bytes([0x60 | toggle])), f"a segment of {name}", 0xF0, toggle)
+        data += segment[1 : SDO_SIZE - (segment[0] >> 1 & 7)]
+        toggle, is_last = toggle ^ 0x10, bool(segment[0] & 1)
+    if begun[0] & 1 and len(data) != int.from_bytes(begun[4:], "little"):
+        raise BadResponseError(f"as many bytes of {name} as announced", data)
+    return data
+
+
+def download(exchange: Exchange, index: int, subindex: int, data: bytes) -> None:
+    """Write an object, expedited or in segments; raises as `upload`."""
+    name, mux = f"{index:04X}h:{subindex:02X}h", multiplexer(index, subindex)
+    command, first, pieces = 0x23 | (EXPEDITED - len(data)) << 2, data, []
+    if len(data) > EXPEDITED:
+        command, first = 0x21, len(data).to_bytes(4, "little")
+        pieces = [data[start : start + SEGMENT] for start in range(0, len(data), SEGMENT)]
+    seen = exchange(bytes([command]) + mux + first)
+    _checked(seen, f"an answer to writing {name}", 0xFF, 0x60, mux)
+    for number, piece in enumerate(pieces, 1):
+        toggle = 0 if number % 2 else 0x10
+        seen = exchange(bytes([toggle | SEGMENT - len(piece) << 1 | (number == len(pieces))]) + piece)
+        _checked(seen, f"a confirmed segment of {name}", 0xFF, 0x20 | toggle, mux, named=False)
+
+
+def _checked(
+    seen: bytes | None,
+    expected: str,
+    mask: int,
+    command: int,
+    mux: bytes | None = None,
+    *,
+    named: bool = True,
+) -> bytes:
+    """Return a response with this command, `named` with its object; it may be an abort if an object is given."""
+    if seen is not None and len(seen) == SDO_SIZE:
+        names = mux is None or seen[1:4] == mux
+        if seen[0] == ABORT and mux is not None and names and abort_code(seen):
+            raise AbortedError(abort_code(seen))
+        if seen[0] & mask == command and (names or not named):
+            return seen
+    raise BadResponseError(expected, seen)
 
 
 # --- the object dictionary of a unit ---

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -16,25 +15,15 @@ TOOLS = Path(__file__).parents[2] / "tools"
 sys.path.insert(0, str(TOOLS))
 import obc_in_qemu  # noqa: E402
 
-MISSING = [package for program, package in obc_in_qemu.PACKAGES.items() if shutil.which(program) is None]
+LISTING = [TOOLS / "install_test_packages", "--list", "obc"]
+MISSING = subprocess.run(LISTING, stdout=subprocess.PIPE, text=True, check=True).stdout.strip()
 if MISSING:
-    pytest.skip(f"Debian packages missing: {' '.join(MISSING)}", allow_module_level=True)
+    pytest.skip(f"Debian packages missing: {MISSING}", allow_module_level=True)
 
 
 @pytest.fixture(scope="module")
 def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    try:
-        return obc_in_qemu.build(tmp_path_factory.mktemp("obc"))
-    except subprocess.CalledProcessError:
-        if shutil.which(obc_in_qemu.COMPILER) and not Path(libc()).is_absolute():
-            pytest.skip("Debian package missing: libnewlib-arm-none-eabi")
-        raise
-
-
-def libc() -> str:
-    """Return the path of newlib, or only its name if it is not installed."""
-    command = [obc_in_qemu.COMPILER, "-print-file-name=libc.a"]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    return obc_in_qemu.build(tmp_path_factory.mktemp("obc"))
 
 
 @pytest.mark.parametrize("link", ["pty", "theirs"])

@@ -1,10 +1,7 @@
 """What the soak makes of its samples: what grows fails, what wanders or ends high once does not."""
 
 import importlib.util
-import json
-import socket
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -77,30 +74,3 @@ def test_a_latency_that_was_not_measured_fails():
 def test_too_few_rounds_are_no_verdict(count):
     with pytest.raises(ValueError, match=f"{count} rounds are too few"):
         soak.compare(series()[:count])
-
-
-def test_the_control_client_takes_both_forms_of_address(tmp_path):
-    def serve(listener):
-        peer, _ = listener.accept()
-        with peer, peer.makefile("rw") as lines:
-            for line in lines:
-                request = json.loads(line)
-                answer = {"ok": request["do"] == "status", "error": "no such thing"}
-                lines.write(json.dumps(answer) + "\n")
-                lines.flush()
-
-    path = str(tmp_path / "control")
-    local = socket.socket(socket.AF_UNIX)
-    local.bind(path)
-    local.listen()
-    remote = socket.create_server(("127.0.0.1", 0))
-    for listener, address in ((local, f"unix:{path}"), (remote, f"127.0.0.1:{remote.getsockname()[1]}")):
-        thread = threading.Thread(target=serve, args=(listener,), daemon=True)
-        thread.start()
-        control = soak.Control(address)
-        assert control.do("status")["ok"]
-        with pytest.raises(soak.BenchError, match="control channel: dance: no such thing"):
-            control.do("dance")
-        control.close()
-        thread.join(10)
-        listener.close()

@@ -1,10 +1,14 @@
-/* A flight computer of 200 lines for the board MPS2 with a Cortex-M3 (QEMU: -machine mps2-an385), without an operating system.
+/* A flight computer for the board MPS2 with a Cortex-M3 (QEMU: -machine mps2-an385), without an operating system.
  *
  * UART 0 is connected to the star tracker, UART 1 to the ground. The program sets the star tracker's clock, lets it find the
  * attitude, reads it five times per second, and checks length and progress. It reports each reading, and ends the machine: with
  * status 0 after 25 readings that are valid, with 1 if something was wrong. The codec is `starhil icd export c`.
  */
 #include "cubestar_like.h"
+
+#include <stdarg.h>
+#include <stdio.h>
+#include <stdlib.h>
 
 #define CYCLE_MS 200u   /* five readings per second */
 #define DEADLINE_MS 50u /* a later reply is late */
@@ -26,38 +30,24 @@ typedef struct {
 static volatile uint32_t *const systick = (volatile uint32_t *)0xE000E010u; /* control, reload, value */
 
 static volatile uint32_t now_ms;
-int main(void);
 
 static void tick(void) { ++now_ms; }
 
-static void leave(int failed) /* semihosting: SYS_EXIT, with ADP_Stopped_ApplicationExit or an error */
-{
-    register uint32_t operation __asm__("r0") = 0x18u;
-    register uint32_t reason __asm__("r1") = failed ? 0x20023u : 0x20026u;
-    __asm__ volatile("bkpt 0xab" : : "r"(operation), "r"(reason) : "memory");
-    for (;;) {
-    }
-}
+static void fault(void) { _Exit(1); }
 
-static void fault(void) { leave(1); }
+extern uint32_t stack_top;
+void _start(void); /* of newlib: clears memory, calls main, and ends the machine with its result, by semihosting */
+__attribute__((section(".vectors"), used)) static void (*const vectors[16])(void) = {
+    (void (*)(void))(&stack_top), _start, fault, fault, fault, fault, fault, 0, 0, 0, 0, fault, fault, 0, fault, tick};
 
-void reset(void)
+static void start_board(void)
 {
-    extern uint32_t bss_begin, bss_end;
-    for (uint32_t *word = &bss_begin; word < &bss_end; ++word) {
-        *word = 0u;
-    }
     TRACKER->divider = GROUND->divider = CLOCK_HZ / 115200u;
     TRACKER->control = GROUND->control = 3u; /* send and receive */
     systick[1] = CLOCK_HZ / 1000u - 1u;
     systick[2] = 0u;
     systick[0] = 7u; /* core clock, interrupt, on */
-    leave(main());
 }
-
-extern uint32_t stack_top;
-__attribute__((section(".vectors"), used)) static void (*const vectors[16])(void) = {
-    (void (*)(void))(&stack_top), reset, fault, fault, fault, fault, fault, 0, 0, 0, 0, fault, fault, 0, fault, tick};
 
 static void send(uart_t *uart, const uint8_t *bytes, size_t size)
 {
@@ -68,27 +58,14 @@ static void send(uart_t *uart, const uint8_t *bytes, size_t size)
     }
 }
 
-/* --- reports to the ground --- */
-
-static void say(const char *text)
+static void say(const char *format, ...)
 {
-    for (; *text != '\0'; ++text) {
-        send(GROUND, (const uint8_t *)text, 1u);
-    }
-}
-
-static void say_number(const char *name, int32_t number)
-{
-    char digits[12], *begin = &digits[11];
-    uint32_t rest = number < 0 ? 0u - (uint32_t)number : (uint32_t)number;
-    *begin = '\0';
-    do {
-        *--begin = (char)('0' + rest % 10u);
-        rest /= 10u;
-    } while (rest > 0u);
-    say(name);
-    say(number < 0 ? "-" : "");
-    say(begin);
+    char line[128];
+    va_list arguments;
+    va_start(arguments, format);
+    const int size = vsnprintf(line, sizeof line, format, arguments);
+    va_end(arguments);
+    send(GROUND, (const uint8_t *)line, (size_t)size);
 }
 
 /* --- the star tracker --- */
@@ -166,6 +143,7 @@ int main(void)
 {
     cubestar_like_tlm_precise_attitude_t attitude;
     uint32_t valid = 0u, wrong = 0u, due_ms = 0u, frame = 0u;
+    start_board();
     cubestar_like_receiver_init(&link, CUBESTAR_LIKE_DIALECT_B);
     say("boot\n");
     while (!(set_time(UNIX_S) && find_attitude()) && now_ms < LIMIT_MS) { /* the star tracker may boot later */
@@ -186,19 +164,9 @@ int main(void)
         wrong += length2 < 0.9999f || length2 > 1.0001f || attitude.frame_counter < frame ? 1u : 0u;
         frame = (uint32_t)attitude.frame_counter;
         ++valid;
-        say_number("frame ", (int32_t)frame);
-        say_number(" q ", (int32_t)(1e6f * attitude.q_x));
-        say_number(" ", (int32_t)(1e6f * attitude.q_y));
-        say_number(" ", (int32_t)(1e6f * attitude.q_z));
-        say_number(" ", (int32_t)(1e6f * attitude.q_w));
-        say("\n");
+        say("frame %lu q %ld %ld %ld %ld\n", frame, (long)(1e6f * attitude.q_x), (long)(1e6f * attitude.q_y),
+            (long)(1e6f * attitude.q_z), (long)(1e6f * attitude.q_w));
     }
-    say_number("valid ", (int32_t)valid);
-    say_number(" wrong ", (int32_t)wrong);
-    say_number(" late ", (int32_t)late);
-    say_number(" missing ", (int32_t)missing);
-    say_number(" slowest_ms ", (int32_t)slowest_ms);
-    say_number(" elapsed_ms ", (int32_t)now_ms);
-    say("\n");
+    say("valid %lu wrong %lu late %lu missing %lu slowest_ms %lu elapsed_ms %lu\n", valid, wrong, late, missing, slowest_ms, now_ms);
     return valid == WANTED && wrong == 0u ? 0 : 1;
 }

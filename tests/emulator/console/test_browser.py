@@ -161,12 +161,12 @@ def test_a_wrong_parameter_shows_the_refusal(page):
 def test_the_present_value_of_a_parameter_is_shown_with_its_unit_and_follows_the_telecommand(page):
     send(page, "set_parameter", parameter=1, value=200)
     note = "#telecommand-form [data-note=value]"
-    wait_for_text(page, note, "ms  1 … 5000  now 200")
+    wait_for_text(page, note, "now 200 ms\n1 … 5000")
     send(page, "set_parameter", parameter=1, value=100)
-    wait_for_text(page, note, "ms  1 … 5000  now 100")
+    wait_for_text(page, note, "now 100 ms\n1 … 5000")
     page.select_option("#telecommand-form [name=parameter]", "13")
     page.wait_for_function(
-        "selector => document.querySelector(selector).textContent.startsWith('px ')", arg=note
+        "selector => document.querySelector(selector).textContent.includes(' px\\n')", arg=note
     )
 
 
@@ -179,6 +179,14 @@ def test_a_page_for_viewing_only_has_no_control_that_commands(browser, emulator)
         opened.click(f"[data-tab={tab}]")
         for button in opened.locator(f"#{tab} button:visible").all():
             assert button.text_content() == "save as session", tab
+    opened.click("[data-tab=telecommands]")
+    opened.select_option("#telecommand", "set_update_rate")
+    opened.wait_for_function("() => document.getElementById('bytes').textContent.includes('cansend')")
+    for tab in ("telecommands", "faults", "truth"):
+        opened.click(f"[data-tab={tab}]")
+        fields = opened.locator(f"#{tab} .commands :is(input, select:not(#telecommand), textarea)")
+        assert fields.count() > 0
+        assert all(field.is_disabled() for field in fields.all()), tab
     opened.close()
 
 
@@ -205,7 +213,7 @@ def test_what_was_sent_is_saved_and_run_as_a_session(page, emulator, tmp_path):
     page.goto(emulator.ready["view"].replace("/?", "/runs?"))
     page.wait_for_function("() => document.querySelectorAll('#results tr.passed').length >= 3")
     assert page.locator("#title").text_content() == "Recorded in the console"
-    assert page.locator("#list li").first.get_attribute("data-state") == "good"
+    assert page.locator("#list button").first.get_attribute("data-state") == "good"
 
 
 def test_the_page_can_be_paused_scrubbed_and_set_live_again_by_keys(page):
@@ -298,6 +306,24 @@ def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page)
     assert not page.locator("#no-frame").is_visible()
 
 
+def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    *attitude, image = page.evaluate(
+        """async () => {
+            const { store, sky } = starhil;
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            store.frame = () => {};
+            store.message(store.hello);
+            store.history(new Float64Array(0));
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            return ["ra", "dec", "roll", "validity"].map((id) => document.getElementById(id).textContent).concat([sky.shown]);
+        }"""
+    )
+    assert attitude == ["–", "–", "–", "–"]
+    assert image is None
+
+
 def test_a_wrong_token_and_another_origin_get_403(emulator):
     address = emulator.ready["view"]
     for url, headers in (
@@ -332,7 +358,10 @@ def test_a_page_whose_emulator_ended_is_grey_and_asks_for_the_address_of_the_nex
             min(page.evaluate("starhil.charts.plots.map((plot) => plot.scale)")) >= 0.01
         )  # nothing is plotted yet
     page.wait_for_selector("body.past #past:not([hidden])")
-    assert "No connection to the emulator for " in page.locator("#past").text_content()
+    assert "No connection to the emulator since " in page.locator("#past").text_content()
+    assert page.locator("#active").evaluate("element => getComputedStyle(element).filter") == "grayscale(1)"
+    page.click("[data-tab=faults]")
+    assert page.locator("#cover").is_disabled()
     with EmulatorProcess(command):
         page.wait_for_selector("#link[data-state=restarted]")
         assert "open its new address" in page.locator("#past").text_content()

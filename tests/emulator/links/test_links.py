@@ -6,6 +6,7 @@ import random
 import pytest
 
 from starhil.emulator.clock import SteppedClock
+from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.device.scheduler import Scheduler
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
@@ -22,7 +23,7 @@ from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Re
 from starhil.protocol.serial_interface import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
-from tests.protocol.composed_links import CUBESPACE
+from tests.protocol.composed_links import CUBESPACE, CUBESTAR
 
 SEED = 20260101
 JUNK = 10_000
@@ -45,9 +46,8 @@ class Linked:
 
     def over_serial(self, identifier, data=b"", dialect=None) -> list[Reply | LinkFault]:
         request = Request.of(identifier, data)
-        row = self.bench.icd.row_by_id(identifier)
-        host = CUBESPACE.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
-        host.expect(request, row.size if row and identifier >= 128 else 0)
+        host = CUBESTAR.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
+        host.expect(request)
         self.uart.take()
         self.uart.arrive(CUBESPACE.encode_request(request))
         return host.feed(b"".join(self.uart.take()), 0.0)
@@ -62,6 +62,25 @@ class Linked:
 
 def in_loop(scenario):
     asyncio.run(scenario)
+
+
+def test_what_a_request_causes_follows_its_answer_also_when_the_answer_takes_time(bench, monkeypatch):
+    async def scenario():
+        linked = await Linked(bench).start()
+        saved = PendingAnswer()
+
+        def save():
+            bench.device.signals.unsolicited.emit(Reply(ReplyKind.UNSOLICITED, 230, bytes(16), destination=1))
+            return saved
+
+        monkeypatch.setattr(bench.device, "save_parameters", save)
+        assert linked.over_can(bench.icd.telecommands["save_parameters"].id) == []
+        saved.end(None)
+        host = CanHostReceiver(1, 4)
+        events = [event for frame in linked.bus.take() for event in host.feed(frame, 0.0)]
+        assert [event.kind for event in events] == [ReplyKind.ACK, ReplyKind.UNSOLICITED]
+
+    in_loop(scenario())
 
 
 @pytest.mark.parametrize("fails", [False, True])

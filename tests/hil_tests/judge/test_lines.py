@@ -199,17 +199,90 @@ def test_classes_and_ids_name_the_kind_of_an_unknown_id():
     assert not read_unit("cubestar").request(31).telemetry
 
 
-def test_sdo_transfers_have_the_bytes_of_cia_301():
-    """7.2.4.3: initiate upload 40h, its answers 43h and 4Fh, segment 60h and 70h, initiate download 23h and 2Fh."""
-    assert canopen.upload_request(0x1018, 4).hex() == "40181004"
-    assert canopen.expedited_data(bytes.fromhex("4300100092010200")) == bytes.fromhex("92010200")
-    assert canopen.expedited_data(bytes.fromhex("4f01100005000000")) == b"\x05"
-    assert canopen.expedited_data(bytes.fromhex("410810001a000000")) is None
-    assert canopen.segment_request(0x10) == b"\x70"
-    assert canopen.segment_data(bytes.fromhex("0041424344454647")) == (b"ABCDEFG", False)
-    assert canopen.segment_data(bytes.fromhex("1b41420000000000")) == (b"AB", True)
-    assert canopen.expedited_download(0x1017, 0, b"\xe8\x03").hex() == "2b171000e803"
-    assert canopen.abort_code(bytes.fromhex("8000100011000906")) == 0x06090011
+TEXT = "410810001a000000", "0041424344454647", "1048494a4b4c4d4e", "004f505152535455", "15565758595a0000"
+"""1008h in segments, 26 bytes."""
+WRITTEN = "6008100000000000", "2000000000000000", "3000000000000000"
+
+
+def run_transfer(transfer, *details, responses):
+    """Run a transfer with these responses; return what it returns, and its requests."""
+    requests, waiting = [], iter(responses)
+
+    def exchange(request):
+        requests.append(request.hex())
+        return bytes.fromhex(next(waiting))
+
+    return transfer(exchange, *details), requests
+
+
+@pytest.mark.parametrize(
+    ("responses", "data", "requests"),
+    [
+        (["4318100492010200"], "92010200", ["40181004"]),
+        (["4f18100405000000"], "05", ["40181004"]),
+        (["4118100402000000", "0b41420000000000"], "4142", ["40181004", "60"]),
+    ],
+)
+def test_an_upload_has_the_bytes_of_cia_301(responses, data, requests):
+    assert run_transfer(canopen.upload, 0x1018, 4, responses=responses) == (bytes.fromhex(data), requests)
+
+
+def test_the_segments_of_an_upload_are_joined():
+    data, requests = run_transfer(canopen.upload, 0x1008, 0, responses=TEXT)
+    assert data == b"ABCDEFGHIJKLMNOPQRSTUVWXYZ"
+    assert requests == ["40081000", "60", "70", "60", "70"]
+
+
+@pytest.mark.parametrize(
+    ("data", "requests"),
+    [
+        ("e803", ["2b081000e803"]),
+        ("00112233445566778899", ["210810000a000000", "0000112233445566", "19778899"]),
+    ],
+)
+def test_a_download_has_the_bytes_of_cia_301(data, requests):
+    found = run_transfer(canopen.download, 0x1008, 0, bytes.fromhex(data), responses=WRITTEN)
+    assert found == (None, requests)
+
+
+def test_an_abort_of_a_transfer_has_its_code():
+    with pytest.raises(canopen.AbortedError) as caught:
+        run_transfer(canopen.upload, 0x1000, 1, responses=["8000100111000906"])
+    assert caught.value.code == 0x06090011
+    with pytest.raises(canopen.AbortedError):
+        run_transfer(canopen.download, 0x1008, 0, bytes(9), responses=[WRITTEN[0], "8008100030000906"])
+
+
+@pytest.mark.parametrize(
+    ("responses", "expected"),
+    [
+        (["43081000"], "an answer to reading 1008h:00h"),
+        (["6008100000000000"], "an answer to reading 1008h:00h"),
+        (["4309100000000000"], "an answer to reading 1008h:00h"),
+        (["8008100000000000"], "an answer to reading 1008h:00h"),
+        ([TEXT[0], TEXT[2]], "a segment of 1008h:00h"),
+        ([TEXT[0], "8008100000000008"], "a segment of 1008h:00h"),
+        ([*TEXT[:3], TEXT[4].replace("15", "01")], "as many bytes of 1008h:00h as announced"),
+    ],
+    ids=["short", "command", "object", "abort without code", "toggle", "abort of a segment", "size"],
+)
+def test_what_a_server_must_not_send_in_an_upload(responses, expected):
+    with pytest.raises(canopen.BadResponseError, match=expected):
+        run_transfer(canopen.upload, 0x1008, 0, responses=responses)
+
+
+@pytest.mark.parametrize(
+    ("responses", "expected"),
+    [
+        (["4008100000000000"], "an answer to writing 1008h:00h"),
+        (["6009100000000000"], "an answer to writing 1008h:00h"),
+        ([WRITTEN[0], WRITTEN[2]], "a confirmed segment of 1008h:00h"),
+    ],
+    ids=["command", "object", "toggle"],
+)
+def test_what_a_server_must_not_send_in_a_download(responses, expected):
+    with pytest.raises(canopen.BadResponseError, match=expected):
+        run_transfer(canopen.download, 0x1008, 0, bytes(9), responses=responses)
 
 
 def test_entries_of_a_dictionary_follow_from_the_definition():

@@ -1,12 +1,13 @@
 // Plots of error and health over time, with a cursor to look back.
 
 import uPlot from "/static/vendor/uPlot.esm.js";
-import { fixed, make } from "./format.js";
+import { fixed, make, press } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
 const WINDOWS = [[60, "1 min"], [300, "5 min"], [900, "15 min"], [3600, "1 h"]];
 const MAX_POINTS = 900;
 const REDRAW_MS = 200;
+const GAP_S = 20; // frames that are farther apart are not joined
 const NICE = [1, 1.5, 2, 3, 5, 7, 10];
 
 // Each plot: its series by column, and whether its range is symmetric about zero.
@@ -55,8 +56,7 @@ export class Charts {
       choice.append(make("button", { type: "button", text, "data-window": String(seconds), onclick: () => this.setWindow(seconds) }));
     }
     this.setWindow(60);
-    for (const event of ["rows", "cursor", "hello"]) store.on(event, () => this.schedule());
-    store.on("reasons", () => this.schedule());
+    for (const event of ["rows", "cursor", "hello", "status"]) store.on(event, () => this.schedule());
     onTheme(() => this.build());
     new ResizeObserver(() => this.build()).observe(this.host);
     this.listen(this.modes, () => [0, this.modes.clientWidth]);
@@ -64,7 +64,7 @@ export class Charts {
 
   setWindow(seconds) {
     this.window = seconds;
-    for (const button of document.querySelectorAll("[data-window]")) button.classList.toggle("on", Number(button.dataset.window) === seconds);
+    for (const button of document.querySelectorAll("[data-window]")) press(button, Number(button.dataset.window) === seconds);
     this.schedule();
   }
 
@@ -78,7 +78,6 @@ export class Charts {
     };
     element.addEventListener("pointerdown", (event) => {
       held = true;
-      this.frozen = this.to;
       element.setPointerCapture(event.pointerId);
       move(event);
     });
@@ -168,7 +167,7 @@ export class Charts {
   // While paused, the window is kept, unless the cursor leaves it.
   setSpan() {
     const { store } = this;
-    if (store.cursor === null) this.to = store.now;
+    if (store.cursor === null) this.to = store.imageless ? store.time : store.now;
     else {
       this.to = Math.min(this.to ?? store.now, store.now);
       if (store.cursor > this.to) this.to = store.cursor;
@@ -184,19 +183,15 @@ export class Charts {
     if (!rows) return;
     if (rows.length) this.setSpan();
     else [this.from, this.to] = [-this.window, 0];
-    if (this.store.cursor !== null) document.body.classList.add("paused");
-    else document.body.classList.remove("paused");
     const picked = pick(rows, this.from, this.to);
-    const times = picked.map((group) => group[1]);
     const position = this.store.position;
-    for (const plot of this.plots) this.fill(plot, rows, picked, times, position);
+    for (const plot of this.plots) this.fill(plot, rows, picked, position);
     this.drawModes(rows, position);
   }
 
-  fill(plot, rows, picked, times, position) {
+  fill(plot, rows, picked, position) {
     const { plan, outputs } = plot;
-    const x = times.map((at) => rows.at(at, "run_s"));
-    const data = [x];
+    const data = [picked.map((group, number) => rows.at((group || picked[number - 1])[1], "run_s"))];
     let highest = plan.least || 0;
     for (const series of plan.series) {
       const column = rows.column(series.column);
@@ -243,15 +238,16 @@ export class Charts {
     const modes = rows.column("mode");
     const valid = rows.column("valid");
     const times = rows.column("run_s");
+    const reach = (at) => (rows.isFrame(at) ? times[at] + GAP_S : Infinity);
     let begin = rows.find(this.from);
     const end = rows.length ? rows.find(this.to) : -1;
     context.font = `${Math.max(10, height * 0.62)}px system-ui, sans-serif`;
     context.textBaseline = "middle";
     while (begin <= end && rows.length) {
       let stop = begin;
-      while (stop < end && modes[stop + 1] === modes[begin] && valid[stop + 1] === valid[begin] && times[stop + 1] - times[stop] < 20) stop += 1;
+      while (stop < end && modes[stop + 1] === modes[begin] && valid[stop + 1] === valid[begin] && times[stop + 1] < reach(stop)) stop += 1;
       const left = Math.max(0, place(times[begin]));
-      const right = stop < end ? place(Math.min(times[stop + 1], times[stop] + 20)) : place(times[stop]) + 2;
+      const right = Math.max(place(Math.min(stop < end ? times[stop + 1] : this.to, reach(stop))), left + 2);
       const name = this.store.hello.modes[modes[begin]];
       context.fillStyle = colour(`mode-${name}`);
       context.fillRect(left, 0, right - left, height);
@@ -269,19 +265,27 @@ export class Charts {
   }
 }
 
-// Rows of the window in groups [first, last], at most MAX_POINTS of them.
+// Rows of the window in groups [first, last], about MAX_POINTS of them, and null for a gap.
 function pick(rows, from, to) {
   if (!rows.length) return [];
   const first = rows.find(from);
   const last = rows.find(to);
   const size = Math.max(1, Math.ceil((last - first + 1) / MAX_POINTS));
   const groups = [];
-  for (let begin = first - (first % size); begin <= last; begin += size) groups.push([Math.max(begin, rows.start), Math.min(begin + size - 1, last)]);
-  return groups.filter((group) => group[1] >= group[0]);
+  const times = rows.column("run_s");
+  for (let begin = first - (first % size); begin <= last; begin += size) {
+    const group = [Math.max(begin, rows.start), Math.min(begin + size - 1, last)];
+    if (group[1] < group[0]) continue;
+    if (groups.length && times[group[0]] - times[groups.at(-1)[1]] > GAP_S) groups.push(null);
+    groups.push(group);
+  }
+  return groups;
 }
 
-// The value of a group that is farthest from zero; null if a value is missing.
-function extreme(column, [first, last], times) {
+// The value of a group that is farthest from zero; null in a gap and if a value is missing.
+function extreme(column, group, times) {
+  if (!group) return null;
+  const [first, last] = group;
   let best = 0;
   for (let at = first; at <= last; at++) {
     const item = column[at];

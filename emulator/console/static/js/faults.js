@@ -20,13 +20,14 @@ export class Faults {
     this.now = document.getElementById("active-faults");
     this.outcome = make("p", { class: "problem", id: "fault-outcome" });
     const scenario = make("select", { "aria-label": "scenario" }, ...hello.scenarios.map((name) => make("option", { value: name, text: name })));
-    const run = make("button", { type: "button", class: "command", text: "run from now", onclick: () => this.request({ do: "scenario", name: scenario.value }) });
+    const run = make("button", { type: "button", text: "run from now", onclick: () => this.request({ do: "scenario", name: scenario.value }) });
     const levels = hello.faults.map((level) => this.level(level));
-    this.host.replaceChildren(
+    this.host.replaceChildren(make(
+      "fieldset", { class: "commands" },
       make("div", { class: "bar" }, this.cover, clear),
       this.outcome,
       make("div", { class: "scroll" }, ...levels, make("fieldset", {}, make("legend", { text: "scenario" }), make("div", { class: "bar" }, scenario, run))),
-    );
+    ));
     this.update(this.active, true);
   }
 
@@ -121,7 +122,6 @@ export class Faults {
         if (!idle) chips.push(make("li", { text: `${LEVELS[level] || level}: ${name} ${shown(item)}` }));
       }
     }
-    this.count = chips.length;
     this.now.replaceChildren(...chips);
     this.store.emit("faults", chips.map((chip) => chip.textContent));
   }

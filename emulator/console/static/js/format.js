@@ -9,6 +9,17 @@ export function fixed(value, digits, width = 0) {
   return (sign + text).padStart(width);
 }
 
+// An angle; right ascensions that are rounded to a full turn are zero.
+export function degrees(value, digits) {
+  if (!Number.isFinite(value)) return "–";
+  return `${fixed(Math.abs(360 - value) < 0.5 * 10 ** -digits ? 0 : value, digits, digits + 5)}°`;
+}
+
+// A roll between −180° and 180°: near zero it does not jump to 360°.
+export function signed(angle) {
+  return angle > 180 ? angle - 360 : angle;
+}
+
 export function duration(seconds) {
   const whole = Math.floor(Math.abs(seconds));
   const part = (n) => String(n).padStart(2, "0");
@@ -17,9 +28,9 @@ export function duration(seconds) {
 }
 
 // The age of something, rounded.
-export function ago(seconds) {
-  if (seconds < 100) return `${Math.max(0, Math.round(seconds))} s ago`;
-  return seconds < 6000 ? `${Math.round(seconds / 60)} min ago` : `${Math.round(seconds / 3600)} h ago`;
+export function age(seconds) {
+  if (seconds < 100) return `${Math.max(0, Math.round(seconds))} s`;
+  return seconds < 6000 ? `${Math.round(seconds / 60)} min` : `${Math.round(seconds / 3600)} h`;
 }
 
 export function utc(seconds) {
@@ -68,6 +79,12 @@ export function make(tag, attributes = {}, ...children) {
   }
   element.append(...children);
   return element;
+}
+
+// Show whether a button is on.
+export function press(button, on) {
+  button.classList.toggle("on", on);
+  button.setAttribute("aria-pressed", String(on));
 }
 
 export function setText(element, text) {

@@ -2,7 +2,7 @@
 
 import { Charts } from "./charts.js";
 import { Faults } from "./faults.js";
-import { ago, duration, fixed, make, setText, utc } from "./format.js";
+import { age, degrees, duration, fixed, make, press, setText, signed, utc, wall } from "./format.js";
 import { Link, address } from "./link.js";
 import { SkyMap } from "./map.js";
 import { Runs } from "./runs.js";
@@ -23,8 +23,8 @@ const store = new Store();
 
 // --- what is shown is of the past while the emulator is not connected, or the device is unresponsive ---
 
-let lost = null;
-let unresponsive = false;
+let lost = null; // time at which the connection was lost, ms
+let unresponsiveSince = null; // simulation time, s
 
 function showLink(state) {
   if (state === "connected") lost = null;
@@ -32,22 +32,26 @@ function showLink(state) {
   if (state === "connecting" && lost !== null) return;
   setText($("link"), state === "connected" && store.hello && store.hello.view_only ? "view only" : state);
   $("link").dataset.state = state;
-  showAge();
+  showPast();
 }
 
-function showAge() {
-  document.body.classList.toggle("past", lost !== null || unresponsive);
-  const restarted = $("link").dataset.state === "restarted";
-  $("past").hidden = lost === null && !unresponsive;
+function showPast() {
+  let text = "";
   if (lost !== null) {
-    const age = Math.round((Date.now() - lost) / 1000);
-    setText($("past"), restarted ? "The emulator was restarted: open its new address, on its ready line." : `No connection to the emulator for ${age} s; everything shown is from before.`);
-  } else if (unresponsive) {
-    setText($("past"), "The device is unresponsive (fault: device stuck); it answers no request.");
+    const since = wall(lost / 1000).slice(0, 8);
+    text = $("link").dataset.state === "restarted"
+      ? `The emulator was restarted: open its new address, on its ready line. Everything shown is from before ${since}.`
+      : `No connection to the emulator since ${since}; everything shown is from before.`;
+  } else if (unresponsiveSince !== null) {
+    text = `The device has been unresponsive since ${duration(unresponsiveSince)} of simulation time (fault: device stuck); it answers no request.`;
   }
+  setText($("past"), text);
+  $("past").hidden = !text;
+  document.body.classList.toggle("past", Boolean(text));
+  document.body.classList.toggle("disconnected", lost !== null);
+  for (const each of document.querySelectorAll(".commands")) each.disabled = lost !== null || store.hello.view_only;
+  showWhen();
 }
-
-setInterval(showAge, 1000);
 
 const link = new Link({
   message: (message) => store.message(message),
@@ -91,7 +95,7 @@ openPage();
 // --- tabs ---
 
 const tabs = Object.fromEntries(TABS.map((name, number) => {
-  const button = make("button", { type: "button", role: "tab", "data-tab": name, title: number < 4 ? `F${number + 1}` : "", text: name, onclick: () => openTab(name) });
+  const button = make("button", { type: "button", role: "tab", "data-tab": name, "aria-controls": name, title: number < 4 ? `F${number + 1}` : "", text: name, onclick: () => openTab(name) });
   $("tabs").append(button);
   return [name, button];
 }));
@@ -123,7 +127,7 @@ store.on("hello", (hello) => {
   document.body.classList.toggle("view-only", hello.view_only);
   $("link").title = hello.view_only ? "the token of this page may look, but not command" : "connection to the emulator";
   showLink("connected");
-  $("unit").title = Object.entries(hello.links).map(([name, where]) => `${name} ${where}`).join("\n");
+  $("unit").title = [$("unit").textContent, `unit ${hello.unit.name} ${hello.unit.version}`, ...Object.entries(hello.links).map(([name, where]) => `${name} ${where}`)].join("\n");
 });
 
 store.on("faults", (names) => {
@@ -135,77 +139,88 @@ store.on("faults", (names) => {
 
 // Which link the OBC uses, how many requests per second since the last report, and when it sent the last one.
 let asked = null;
+let lastRequest = null; // time of the last request, ms since the page was opened
 
 store.on("status", ({ heard, wall_s: now }) => {
   const spoken = heard.filter((each) => each.age_s !== null).sort((a, b) => a.age_s - b.age_s);
   const total = heard.reduce((sum, each) => sum + each.requests, 0);
+  lastRequest = spoken.length ? performance.now() - 1000 * spoken[0].age_s : null;
   if (asked && now - asked.now < 2) return;
   const rate = asked && total >= asked.total ? (total - asked.total) / (now - asked.now) : 0;
   asked = { total, now };
   setText($("obc"), spoken.length ? `${spoken[0].link} ${fixed(rate, 1)}/s` : "silent");
-  setText($("obc-last"), spoken.length ? ago(spoken[0].age_s) : "–");
-  $("obc").parentElement.parentElement.title = heard.map((each) => `${each.link}: ${each.requests} requests${each.age_s === null ? "" : `, the last ${ago(each.age_s)}`}`).join("\n");
+  $("requests").title = heard.map((each) => `${each.link}: ${each.requests} requests${each.age_s === null ? "" : `, the last ${age(each.age_s)} ago`}`).join("\n");
 });
 
-store.on("status", ({ status }) => {
-  unresponsive = Boolean(status.faults && status.faults.device && status.faults.device.stuck);
-  showAge();
+setInterval(() => setText($("obc-last"), lastRequest === null ? "–" : `${age((performance.now() - lastRequest) / 1000)} ago`), 500);
+
+store.on("status", ({ status, unresponsive_since_s: since }) => {
+  unresponsiveSince = since;
+  showPast();
+  showValidity();
   if (store.cursor !== null) return;
   setText($("mode"), status.mode.replaceAll("_", " ") + (status.error_cause ? `: ${status.error_cause}` : ""));
   $("mode").dataset.mode = status.mode;
   setText($("utc"), utc(status.unix_s));
   setText($("run"), duration(status.run_time_s));
-  const age = status.run_time_s - store.now;
-  if (status.mode !== "tracking" && status.mode !== "lost_in_space") showValidity(false, "no images");
-  else if (age > 10) showValidity(false, "no new image");
 });
 
-function showValidity(valid, reason) {
+// A number of the row that is shown; NaN if there is none.
+function shown(name) {
+  return store.position < 0 ? NaN : store.rows.at(store.position, name);
+}
+
+// The validity of the attitude, and its error or the age of the last valid one.
+function showValidity() {
+  const imageless = store.cursor === null && store.imageless;
+  const overdue = imageless && !Number.isNaN(shown("frame"));
+  const valid = !overdue && shown("valid") === 1;
+  const reason = overdue ? "no new image" : store.reasons[shown("reason")] || "–";
   setText($("validity"), valid ? "valid" : reason.replaceAll("_", " "));
   $("validity").dataset.state = valid ? "good" : "bad";
   const last = valid ? null : store.lastValid;
-  setText($("ra-label"), last === null ? "RA, measured" : `last valid ${ago((store.cursor ?? (store.status ? store.status.run_time_s : store.now)) - last)}`);
+  setText($("error-label"), last === null ? "cross / roll error ″" : "last valid");
+  setText($("error"), last === null ? `${fixed(shown("error_cross"), 2, 6)} / ${fixed(shown("error_roll"), 1, 6)}` : `${age((store.cursor ?? store.time) - last)} ago`);
+  document.body.classList.toggle("imageless", imageless);
+  showWhen();
 }
 
 store.on("shown", () => {
-  const position = store.position;
-  if (position < 0) return;
-  const item = (name) => store.rows.at(position, name);
-  const mode = store.hello.modes[item("mode")];
-  setText($("mode"), mode.replaceAll("_", " "));
-  $("mode").dataset.mode = mode;
-  showValidity(item("valid") === 1, store.reasons[item("reason")] || "invalid");
-  setText($("ra"), `${fixed(turn(item("ra")), 4, 9)}°`);
-  setText($("dec"), `${fixed(item("dec"), 4, 9)}°`);
-  setText($("roll"), `${fixed(signed(item("roll")), 4, 9)}°`);
-  for (const name of ["qx", "qy", "qz", "qw"]) $("ra").dataset[name] = String(item(name));
-  setText($("error"), `${fixed(item("error_cross"), 2, 6)} / ${fixed(item("error_roll"), 1, 6)}`);
-  setText($("stars"), `${fixed(item("matched"), 0, 3)} of ${fixed(item("detected"), 0, 3)}`);
-  if (store.cursor !== null) {
-    setText($("utc"), utc(item("unix_s")));
-    setText($("run"), duration(item("run_s")));
+  const mode = store.hello.modes[shown("mode")];
+  if (mode) {
+    setText($("mode"), mode.replaceAll("_", " "));
+    $("mode").dataset.mode = mode;
   }
-  showMoment(item);
+  showValidity();
+  setText($("ra"), degrees(shown("ra"), 4));
+  setText($("dec"), degrees(shown("dec"), 4));
+  setText($("roll"), degrees(signed(shown("roll")), 4));
+  for (const name of ["qx", "qy", "qz", "qw"]) $("ra").dataset[name] = String(shown(name));
+  setText($("stars"), `${fixed(shown("matched"), 0, 3)} of ${fixed(shown("detected"), 0, 3)}`);
+  if (store.cursor !== null) {
+    setText($("utc"), utc(shown("unix_s")));
+    setText($("run"), duration(shown("run_s")));
+  }
+  showImageInfo();
 });
 
-// An angle that is rounded to a full turn with four digits is shown as zero.
-function turn(degrees) {
-  return degrees >= 359.99995 ? 0 : degrees;
+// The moment that is shown.
+function showWhen() {
+  if (store.cursor !== null) setText($("when"), `${duration(store.cursor)}  (−${fixed(store.now - store.cursor, 1)} s)`);
+  else if (lost !== null) setText($("when"), "not live");
+  else if (!store.imageless) setText($("when"), "live");
+  else setText($("when"), store.image ? `image of ${age(store.time - store.image.time)} ago` : "");
 }
 
-// A roll near zero does not jump between 0° and 360°.
-function signed(degrees) {
-  return degrees > 180 ? degrees - 360 : degrees;
-}
-
-function showMoment(item) {
+function showImageInfo() {
   const image = store.image;
-  const behind = store.cursor === null ? 0 : store.now - store.cursor;
-  setText($("when"), store.cursor === null ? "live" : `${duration(item("run_s"))}  (−${fixed(behind, 1)} s)`);
-  if (!image) return;
+  if (!image) {
+    setText($("frame-info"), "–");
+    return;
+  }
   const head = image.head;
-  const apart = image.time - item("run_s");
-  const note = Math.abs(apart) > 0.5 ? ` (image ${fixed(apart, 1)} s apart)` : "";
+  const apart = image.time - shown("run_s");
+  const note = store.cursor !== null && Math.abs(apart) > 0.5 ? ` (image ${fixed(apart, 1)} s apart)` : "";
   const late = head.late ? " late" : "";
   setText($("frame-info"), `frame ${fixed(head.row[store.rows.index.frame], 0)}${late}  rejected ${head.rejected}${note}`);
 }
@@ -213,7 +228,7 @@ function showMoment(item) {
 store.on("cursor", () => {
   const live = store.cursor === null;
   setText($("live"), live ? "❚❚ pause" : "▶ live");
-  $("live").classList.toggle("on", !live);
+  press($("live"), !live);
   document.body.classList.toggle("paused", !live);
 });
 
@@ -229,8 +244,8 @@ const KEYS = [
   [" ", "space", "pause, or back to live", toggleLive],
   ["ArrowLeft", "←", "one frame back; with Shift ten", (event) => store.step(event.shiftKey ? -10 : -1)],
   ["ArrowRight", "→", "one frame on; with Shift ten", (event) => store.step(event.shiftKey ? 10 : 1)],
-  ["1", "1 … 4", "layers over the sky", () => sky.toggle("detections")],
-  ["2", "", "", () => sky.toggle("identified")],
+  ["1", "1 … 4", "layers over the sky", () => sky.toggle("matched")],
+  ["2", "", "", () => sky.toggle("unmatched")],
   ["3", "", "", () => sky.toggle("missing")],
   ["4", "", "", () => sky.toggle("bodies")],
   ["+", "+ −", "zoom the sky", () => sky.zoomCentre(1.4)],
@@ -248,7 +263,10 @@ const KEYS = [
 for (const [, label, what] of KEYS) if (label) $("keys").querySelector("dl").append(make("dt", { text: label }), make("dd", { text: what }));
 $("keys").querySelector("dl").append(make("dt", { text: "F1 … F4" }), make("dd", { text: "telemetry, telecommands, wire, faults" }));
 $("keys").querySelector("dl").append(make("dt", { text: "Ctrl+Enter" }), make("dd", { text: "send the telecommand" }));
-$("help").addEventListener("click", () => $("keys").showModal());
+$("help").addEventListener("click", (event) => {
+  if (event.detail > 0) $("help").blur(); // otherwise the focus returns when the dialog is closed, and space opens it again
+  $("keys").showModal();
+});
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey && event.key === "Enter") {

@@ -93,7 +93,8 @@ export class SkyMap {
     const { rows } = store;
     const trail = [];
     const step = Math.max(1, Math.floor((position - rows.start) / TRAIL_POINTS));
-    for (let i = position; i >= rows.start && trail.length < TRAIL_POINTS; i -= step) trail.push([rows.at(i, "true_ra"), rows.at(i, "true_dec")]);
+    for (let i = position; i >= rows.start && trail.length < TRAIL_POINTS; i -= step) if (rows.isFrame(i)) trail.push([rows.at(i, "true_ra"), rows.at(i, "true_dec")]);
+    if (!trail.length) return;
     context.lineWidth = 2 * pen();
     context.font = `${Math.max(10, this.radius / 11)}px system-ui, sans-serif`;
     context.strokeStyle = colour("b");
@@ -101,10 +102,9 @@ export class SkyMap {
     const head = store.image && store.image.head;
     for (const body of (head && head.bodies) || []) this.drawBody(context, body);
     if (head && head.true_q && store.hello.camera) this.drawField(context, head);
-    const here = this.place(rows.at(position, "true_ra"), rows.at(position, "true_dec"));
     context.fillStyle = colour("b");
     context.beginPath();
-    context.arc(...here, 3 * pen(), 0, 2 * Math.PI);
+    context.arc(...this.place(...trail[0]), 3 * pen(), 0, 2 * Math.PI);
     context.fill();
   }
 

@@ -1,6 +1,6 @@
 // Session and conformance runs: the list, the selected run, and its results as they arrive.
 
-import { duration, make, setText } from "./format.js";
+import { duration, make, setText, wall } from "./format.js";
 
 const MARKS = { passed: "✓", failed: "✗", skipped: "–", "not run": "·" };
 const $ = (id) => document.getElementById(id);
@@ -52,10 +52,12 @@ function state(run) {
 
 function list() {
   $("list").replaceChildren(...[...runs.values()].reverse().map((run) => make(
-    "li", { class: run.run === chosen ? "on" : "", "data-state": state(run), onclick: () => { chosen = run.run; follow = run === [...runs.values()].at(-1); list(); show(); } },
-    make("b", { text: run.title }),
-    make("span", { class: "dim", text: `${run.kind}, ${new Date(run.begin_s * 1000).toTimeString().slice(0, 8)}` }),
-    make("span", { class: "num", text: `${done(run)} of ${run.planned}, ${run.counts.failed ? `${run.counts.failed} failed` : run.end_s === null ? "running" : "passed"}` }),
+    "li", {}, make(
+      "button", { type: "button", class: run.run === chosen ? "on" : "", "data-state": state(run), onclick: () => { chosen = run.run; follow = run === [...runs.values()].at(-1); list(); show(); } },
+      make("b", { text: run.title }),
+      make("span", { class: "dim", text: `${run.kind}, ${wall(run.begin_s).slice(0, 8)}` }),
+      make("span", { class: "num", text: `${done(run)} of ${run.planned}, ${run.counts.failed ? `${run.counts.failed} failed` : run.end_s === null ? "running" : "passed"}` }),
+    ),
   )));
 }
 

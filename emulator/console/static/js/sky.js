@@ -1,6 +1,6 @@
-// The sensor image with detected, identified and missing stars.
+// The sensor image with matched, unmatched and missing stars.
 
-import { fixed, setText } from "./format.js";
+import { fixed, press, setText } from "./format.js";
 import { colour, onTheme, pen } from "./theme.js";
 
 const HOVER_PX = 14;
@@ -14,7 +14,7 @@ export class Sky {
     this.stage = this.image.parentElement;
     this.hover = document.getElementById("hover");
     this.notice = document.getElementById("no-frame");
-    this.layers = { detections: true, identified: true, missing: true, bodies: true };
+    this.layers = { matched: true, unmatched: true, missing: true, bodies: true };
     this.zoom = 1;
     this.offset = [0, 0]; // image pixels at the top left
     this.bitmap = null;
@@ -65,7 +65,7 @@ export class Sky {
 
   toggle(layer) {
     this.layers[layer] = !this.layers[layer];
-    document.querySelector(`[data-layer="${layer}"]`).classList.toggle("on", this.layers[layer]);
+    press(document.querySelector(`[data-layer="${layer}"]`), this.layers[layer]);
     this.draw();
   }
 
@@ -109,15 +109,15 @@ export class Sky {
     if (this.decoding) return;
     const { image, hello, stepping } = this.store;
     if (!image) this.say(hello && hello.clock === "stepped" && !stepping ? "no image: the clock is stopped, step it to take one" : "no image");
-    if (!image || image === this.shown) return;
+    if (image === this.shown) return;
     this.decoding = true;
-    const bitmap = await createImageBitmap(image.blob).catch(() => null);
+    const bitmap = image && await createImageBitmap(image.blob).catch(() => null);
     this.decoding = false;
     if (this.bitmap) this.bitmap.close();
     this.bitmap = bitmap;
     this.shown = image;
     this.painted += bitmap ? 1 : 0;
-    this.say(bitmap ? "" : "this image cannot be decoded");
+    if (image) this.say(bitmap ? "" : "this image cannot be decoded");
     this.draw();
     if (this.store.image !== image) this.show();
   }
@@ -235,27 +235,24 @@ export class Sky {
     context.font = this.font();
     context.lineWidth = 1.4 * pen();
     const labels = [];
-    const unmatched = colour("on-sky-detected");
-    const matched = colour("on-sky-identified");
+    const inks = { matched: colour("on-sky-matched"), unmatched: colour("on-sky-unmatched") };
+    const half = Math.max(2, size * 0.4);
     (head.detections || []).forEach(([x, y, magnitude], number) => {
       const hip = head.hips[number];
+      const layer = hip ? "matched" : "unmatched";
+      if (!this.layers[layer]) return;
       const name = names[hip || head.unused[number]];
       const [px, py] = this.place(x, y);
-      if (name && this.layers.identified && (magnitude < 2.6 || this.zoom > 2)) labels.push([name, px, py]);
-      if (hip && this.layers.identified) {
-        context.strokeStyle = matched;
-        context.beginPath();
-        context.arc(px, py, size, 0, 2 * Math.PI);
-        context.stroke();
-      } else if (this.layers.detections) {
-        context.strokeStyle = unmatched;
-        context.globalAlpha = hip ? 1 : 0.7;
-        const half = hip ? size * 0.62 : Math.max(2, size * 0.36);
-        context.strokeRect(px - half, py - half, 2 * half, 2 * half);
-        context.globalAlpha = 1;
-      }
+      if (name && (magnitude < 2.6 || this.zoom > 2)) labels.push([name, px, py, inks[layer]]);
+      context.strokeStyle = inks[layer];
+      context.globalAlpha = hip ? 1 : 0.75;
+      context.beginPath();
+      if (hip) context.arc(px, py, size, 0, 2 * Math.PI);
+      else context.rect(px - half, py - half, 2 * half, 2 * half);
+      context.stroke();
     });
-    this.drawLabels(context, labels, size, matched);
+    context.globalAlpha = 1;
+    this.drawLabels(context, labels, size);
     if (!this.layers.missing || !head.catalogue) return;
     context.strokeStyle = colour("on-sky-missing");
     context.setLineDash([2, 3]);
@@ -269,10 +266,10 @@ export class Sky {
   }
 
   // Names beside the stars, brightest first; names without enough space are omitted.
-  drawLabels(context, labels, size, ink) {
+  drawLabels(context, labels, size) {
     const height = parseFloat(context.font);
     const taken = [];
-    for (const [text, x, y] of labels) {
+    for (const [text, x, y, ink] of labels) {
       const width = context.measureText(text).width;
       const places = [[x + size + 3, y + height / 3], [x - size - 3 - width, y + height / 3], [x - width / 2, y - size - 4], [x - width / 2, y + size + height]];
       for (const [left, base] of places) {
@@ -324,7 +321,7 @@ export class Sky {
       context.stroke();
     }
     if (speed > 1e-3 || Math.abs(z) > 1e-3) {
-      this.label(context, `${fixed(Math.hypot(speed, z), 3)} °/s`, centre[0] + 12 * size, centre[1] + 20 * size, ink);
+      this.label(context, `true ${fixed(Math.hypot(speed, z), 3)} °/s`, centre[0] + 12 * size, centre[1] + 20 * size, ink);
     }
   }
 

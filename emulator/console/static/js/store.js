@@ -1,24 +1,25 @@
 // Data of the page: the description of the run, and numbers and images of the last hour.
 
-const KEPT_ROWS = 36000;
 const RECENT_S = 60; // every image of the last minute is kept …
 const SPARSE_S = 5; // … and one in five seconds of the last hour
 const KEPT_S = 3600;
+const OVERDUE_S = 10; // age at which the newest frame is of the past
 
 // Rows of numbers by column, in arrays with the latest rows at the end.
 class Rows {
-  constructor(columns) {
+  constructor(columns, kept) {
+    this.kept = kept;
     this.index = Object.fromEntries(columns.map((name, number) => [name, number]));
     this.width = columns.length;
-    this.data = columns.map(() => new Float64Array(2 * KEPT_ROWS));
+    this.data = columns.map(() => new Float64Array(2 * kept));
     this.start = 0;
     this.end = 0;
   }
 
   push(row) {
-    if (this.end === 2 * KEPT_ROWS) {
-      for (const column of this.data) column.copyWithin(0, KEPT_ROWS, 2 * KEPT_ROWS);
-      this.end = KEPT_ROWS;
+    if (this.end === 2 * this.kept) {
+      for (const column of this.data) column.copyWithin(0, this.kept, 2 * this.kept);
+      this.end = this.kept;
       this.start = 0;
     }
     for (let number = 0; number < this.width; number++) {
@@ -26,7 +27,7 @@ class Rows {
       this.data[number][this.end] = item === null ? NaN : item;
     }
     this.end += 1;
-    if (this.end - this.start > KEPT_ROWS) this.start += 1;
+    if (this.end - this.start > this.kept) this.start += 1;
   }
 
   get length() {
@@ -39,6 +40,11 @@ class Rows {
 
   at(position, name) {
     return this.data[this.index[name]][position];
+  }
+
+  // Whether a row is of a frame; the others are changes to a mode without frames.
+  isFrame(position) {
+    return !Number.isNaN(this.at(position, "frame"));
   }
 
   // Position of the last row at or before a time.
@@ -64,7 +70,6 @@ export class Store {
     this.status = null;
     this.truth = null;
     this.stepping = 0;
-    this.events = [];
     this.cursor = null; // simulation time shown; null: live
     this.listeners = new Map();
   }
@@ -81,8 +86,10 @@ export class Store {
   message(message) {
     switch (message.type) {
       case "hello":
+        if (this.cursor !== null) this.scrub(null);
+        this.status = null;
         this.hello = message;
-        this.rows = new Rows(message.columns);
+        this.rows = new Rows(message.columns, message.kept_rows);
         this.images = [];
         break;
       case "reasons":
@@ -93,9 +100,8 @@ export class Store {
         this.truth = message.truth;
         this.stepping = message.stepping; // speed of a stepped clock; 0: it is stopped
         break;
-      case "event":
-        this.events.push(message);
-        if (this.events.length > 500) this.events.shift();
+      case "row":
+        this.add(message.row);
         break;
     }
     this.emit(message.type, message);
@@ -107,17 +113,22 @@ export class Store {
       this.rows.push(numbers.subarray(start, start + width));
     }
     this.emit("rows");
+    this.emit("shown");
   }
 
   // A new page is sent the latest image, whose row is already in the history.
   frame(head, blob) {
     if (!this.rows) return;
     const time = head.row[this.rows.index.run_s];
-    if (!this.rows.length || time > this.now) this.rows.push(head.row);
     if (blob && !(this.images.length && time <= this.images.at(-1).time)) {
       this.images.push({ time, head, blob });
       this.thin(time);
     }
+    this.add(head.row);
+  }
+
+  add(row) {
+    if (!this.rows.length || row[this.rows.index.run_s] > this.now) this.rows.push(row);
     this.emit("rows");
     if (this.cursor === null) this.emit("shown");
   }
@@ -135,8 +146,19 @@ export class Store {
     this.images = kept;
   }
 
+  // Time of the newest row.
   get now() {
     return this.rows && this.rows.length ? this.rows.at(this.rows.end - 1, "run_s") : 0;
+  }
+
+  // Simulation time, as last reported.
+  get time() {
+    return this.status ? Math.max(this.status.run_time_s, this.now) : this.now;
+  }
+
+  // Whether no image has come for a while, or the device takes none.
+  get imageless() {
+    return !this.rows || !this.rows.length || !this.rows.isFrame(this.rows.end - 1) || this.time - this.now > OVERDUE_S;
   }
 
   // Position of the row that is shown.
@@ -147,9 +169,9 @@ export class Store {
 
   // Time of the last valid attitude up to the row that is shown; null if there is none.
   get lastValid() {
-    let position = this.position;
-    while (position >= this.rows.start && this.rows.at(position, "valid") !== 1) position -= 1;
-    return position >= this.rows.start ? this.rows.at(position, "run_s") : null;
+    let { position } = this;
+    while (this.rows && position >= this.rows.start && this.rows.at(position, "valid") !== 1) position -= 1;
+    return this.rows && position >= this.rows.start ? this.rows.at(position, "run_s") : null;
   }
 
   // The image nearest to the shown time.

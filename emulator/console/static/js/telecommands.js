@@ -26,7 +26,7 @@ export class Telecommands {
     this.steps = make("output", { class: "num dim", text: "0 sent" });
     const save = make("a", { class: "button", id: "save-session", href: address("/session.toml"), download: "session.toml", title: "what this console has sent, for `starhil session`", text: "save as session" });
     const clear = make("button", { type: "button", id: "clear-session", text: "clear", onclick: () => this.clear() });
-    this.host.replaceChildren(this.select, this.form, make("div", { class: "bar" }, make("h2", { text: "Sent" }), this.steps, make("span", { class: "spacer" }), save, clear), this.log);
+    this.host.replaceChildren(this.select, make("fieldset", { class: "commands" }, this.form), make("div", { class: "bar" }, make("h2", { text: "Sent" }), this.steps, make("span", { class: "spacer" }), save, clear), this.log);
     if (this.rows.has(this.chosen)) this.choose(this.chosen);
     else this.form.replaceChildren(make("p", { class: "dim doc", text: "Choose a telecommand." }));
   }
@@ -37,7 +37,7 @@ export class Telecommands {
     const row = this.rows.get(name);
     const fields = row.fields.map((field) => {
       const control = this.control(field);
-      const note = make("span", { class: "dim num", "data-note": field.name, text: [field.unit, limits(field)].filter(Boolean).join("  ") });
+      const note = make("span", { class: "dim num", "data-note": field.name, text: field.parameters ? "" : [field.unit, limits(field)].filter(Boolean).join("  ") });
       return make("label", { class: "field", title: field.doc }, make("span", { text: field.name }), control, note);
     });
     this.problem = make("p", { class: "problem" });
@@ -56,7 +56,8 @@ export class Telecommands {
     if (!select || !note) return;
     const { values } = await this.link.request({ do: "parameters" });
     const { name, unit, min, max } = this.parameters.find((item) => String(item.id) === select.value);
-    setText(note, `${unit}  ${short(min)} … ${short(max)}  now ${values ? short(values[name]) : "–"}`);
+    const present = values ? [short(values[name]), unit].filter(Boolean).join(" ") : "–";
+    setText(note, `now ${present}\n${short(min)} … ${short(max)}`);
   }
 
   control(field) {
@@ -71,7 +72,7 @@ export class Telecommands {
   }
 
   values() {
-    return Object.fromEntries(new FormData(this.form));
+    return Object.fromEntries([...this.form.elements].filter((each) => each.name).map((each) => [each.name, each.value]));
   }
 
   async preview() {

@@ -1,6 +1,6 @@
 // The true attitude: fixed, rate, slew to a direction or a star, a file or a feed; and the stepped clock.
 
-import { duration, fixed, make, setText } from "./format.js";
+import { degrees, duration, fixed, make, setText, signed } from "./format.js";
 
 export class Truth {
   constructor(store, link) {
@@ -15,7 +15,7 @@ export class Truth {
     this.now = make("table", { class: "facts" });
     this.outcome = make("p", { class: "problem" });
     const stars = make("datalist", { id: "star-names" }, ...Object.values(hello.star_names).sort().map((name) => make("option", { value: name })));
-    const slew = this.form("slew", "slew", [["star", "", "or a direction:", "star-names"], ["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "° (as now if empty)"], ["max_rate_deg_s", "0.5", "°/s"]], (values) => {
+    const slew = this.form("slew", "slew", [["star", "", "or a direction:", "star-names"], ["ra_deg", "", "°"], ["dec_deg", "", "°"], ["roll_deg", "", "° (as now if empty)"], ["max_rate_deg_s", String(hello.slew_rate_deg_s), "°/s"]], (values) => {
       const { max_rate_deg_s: rate, ...to } = values;
       return this.link.request({ do: "point", kind: "slew", to, max_rate_deg_s: rate });
     });
@@ -25,7 +25,7 @@ export class Truth {
     const json = make("textarea", { rows: "3", spellcheck: "false", "aria-label": "truth as JSON" });
     json.value = '{"kind": "live", "protocol": "udp", "port": 0}';
     const other = make("fieldset", {}, make("legend", { text: "file, feed or sequence: the keys of [truth], as JSON" }), json, make("button", {
-      type: "button", class: "command", text: "use", onclick: () => {
+      type: "button", text: "use", onclick: () => {
         try {
           this.answer(this.set(JSON.parse(json.value)));
         } catch (error) {
@@ -33,25 +33,26 @@ export class Truth {
         }
       },
     }));
-    this.host.replaceChildren(stars, this.now, this.outcome, make("div", { class: "scroll" }, ...this.clock(hello), slew, rate, still, other));
+    this.host.replaceChildren(stars, this.now, this.outcome, make("fieldset", { class: "commands" }, make("div", { class: "scroll" }, ...this.clock(hello), slew, rate, still, other)));
   }
 
   // Controls for the stepped clock.
   clock(hello) {
     this.speed = null;
+    this.seconds = this.speed = null;
     if (hello.clock !== "stepped") return [];
-    const seconds = make("input", { value: "0.2", inputmode: "decimal", name: "step" });
-    this.speed = make("input", { value: "1", inputmode: "decimal", name: "speed" });
+    this.seconds = make("input", { value: "0.2", inputmode: "decimal", name: "step", "aria-label": "seconds of a step" });
+    this.speed = make("input", { value: "1", inputmode: "decimal", name: "speed", "aria-label": "speed, times real time" });
     this.running = make("button", { type: "button", id: "run-clock", text: "run", onclick: () => this.toggleClock() });
     return [
       make("fieldset", {}, make("legend", { text: "stepped clock" }), make("div", { class: "bar" },
-        make("button", { type: "button", id: "step", text: "step", title: "s", onclick: () => this.step(Number(seconds.value)) }), seconds, make("span", { class: "dim", text: "s" }),
+        make("button", { type: "button", id: "step", text: "step", title: "s", onclick: () => this.step() }), this.seconds, make("span", { class: "dim", text: "s" }),
         make("span", { class: "spacer" }), this.running, this.speed, make("span", { class: "dim", text: "× real time" }))),
     ];
   }
 
-  step(seconds = 0.2) {
-    return this.answer(this.link.control({ do: "step", seconds }));
+  step() {
+    return this.seconds ? this.answer(this.link.control({ do: "step", seconds: Number(this.seconds.value) })) : null;
   }
 
   toggleClock() {
@@ -92,9 +93,9 @@ export class Truth {
     const feed = status.feed;
     const facts = [
       ["source", `${status.truth_kind}, ${truth.status}`],
-      ["true right ascension", `${fixed(truth.ra_deg, 5, 10)}°`],
-      ["true declination", `${fixed(truth.dec_deg, 5, 10)}°`],
-      ["true roll", `${fixed(truth.roll_deg, 5, 10)}°`],
+      ["true right ascension", degrees(truth.ra_deg, 5)],
+      ["true declination", degrees(truth.dec_deg, 5)],
+      ["true roll", degrees(signed(truth.roll_deg), 5)],
       ["true rate x, y, z", truth.rate_deg_s.map((item) => fixed(item, 4, 8)).join(" ") + " °/s"],
       ["simulation time", duration(truth.run_time_s)],
       ["feed", feed ? `${feed.address}: ${feed.accepted} accepted, ${feed.refused} refused ${feed.last_fault || ""}` : "none"],

@@ -1,7 +1,7 @@
 // The trace of serial line and CAN bus, decoded, with filters.
 
 import { address } from "./link.js";
-import { make, wall } from "./format.js";
+import { fixed, make, press, setText, wall } from "./format.js";
 
 const KEPT_LINES = 1000;
 const SHOWN_LINES = 400;
@@ -47,7 +47,7 @@ export class Wire {
 
   setHeld(held) {
     this.held = held;
-    this.hold.classList.toggle("on", held);
+    press(this.hold, held);
     if (!held) this.render();
   }
 
@@ -69,7 +69,12 @@ export class Wire {
   render() {
     const shown = this.lines.filter((line) => this.wanted(line)).slice(-SHOWN_LINES).reverse();
     const there = new Map([...this.list.children].map((item) => [item.dataset.n, item]));
-    this.list.replaceChildren(...shown.map((line) => there.get(String(line.n)) || this.item(line)));
+    this.list.replaceChildren(...shown.map((line, number) => {
+      const item = there.get(String(line.n)) || this.item(line);
+      const before = shown[number + 1];
+      setText(item.querySelector(".since"), before ? `+${fixed(line.t - before.t, 3)}` : "");
+      return item;
+    }));
   }
 
   item(line) {
@@ -77,8 +82,9 @@ export class Wire {
       "li",
       { class: line.kind, "data-n": String(line.n) },
       make("time", { class: "num dim", text: wall(line.t) }),
+      make("span", { class: "num dim since", title: "seconds since the line below" }),
       make("span", { class: "way", text: `${line.bus === "can" ? "CAN" : "ser"} ${line.out ? "◀" : "▶"}`, title: line.out ? "from the device" : "to the device, or between others" }),
-      make("span", { class: "text", text: line.text }),
+      make("span", { class: "text", text: line.text, title: line.text }),
       make("code", { text: line.raw }),
     );
   }
