@@ -7,7 +7,7 @@ is validated; an error names the file, the key and the remedy.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import permutations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
@@ -24,11 +24,16 @@ from starhil.emulator.truth.config import (
     TruthConfig,
     UserPath,
 )
-from starhil.emulator.validation_messages import explain
+from starhil.protocol.errors import ProtocolError
+from starhil.protocol.icd import load_unit
+from starhil.protocol.names import find, remedy
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
+from starhil.protocol.validation_messages import problems
+from starhil.protocol.values import IcdError
 from starid.earth import unix_time
 
 if TYPE_CHECKING:
+    from starhil.protocol.values import Parameter
     from starid.camera import Camera
 
 DEFAULT_PROFILE: Final = "cubestar"
@@ -259,6 +264,10 @@ class LinksConfig(Strict):
     """The CANopen node on the CAN bus."""
 
 
+Layer = tuple[str, Mapping[str, Any]]
+"""A source of keys, a profile's file or an option `--set`, and its tables."""
+
+
 class Profile(Strict):
     """A device profile."""
 
@@ -306,7 +315,7 @@ class Profile(Strict):
     """Defaults of device parameters, named as in the interface definition."""
 
     _source: Path | None = PrivateAttr(default=None)
-    _overrides: tuple[str, ...] = PrivateAttr(default=())
+    _layers: tuple[Layer, ...] = PrivateAttr(default=())
 
     @field_validator("sky")
     @classmethod
@@ -334,15 +343,16 @@ class Profile(Strict):
             return self.catalog.epoch
         return round(2000.0 + (self.start_unix_s - _J2000_UNIX_S) / _JULIAN_YEAR_S, 1)
 
-    def read_from(self, path: Path, overrides: Sequence[str] = ()) -> Self:
-        """Note the file of the profile, to whose folder its relative paths refer, and `--set`; return the profile."""
+    def read_from(self, path: Path, layers: Sequence[Layer] = ()) -> Self:
+        """Note the file of the profile, to whose folder its relative paths refer, and all its layers; return the profile."""
         self._source = path
-        self._overrides = tuple(overrides)
+        self._layers = tuple(layers)
         return self
 
     def source_of(self, error: object) -> str:
-        """Return the source of the key that an error names: an option `--set`, or the file of the profile."""
-        return _source_of_key(self.source, self._overrides, str(error))
+        """Return the source of the key with which an error begins: an option `--set`, or a file."""
+        location = str(error).partition(": ")[0].split(".")
+        return _source_of(self._layers, location) or f"profile {self.source}"
 
     @property
     def source(self) -> str:
@@ -387,24 +397,95 @@ LINK_PARAMETERS: Final[dict[str, str]] = {
 """Device parameters whose defaults are set under another key of a profile."""
 
 
+_A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
+OF_FAULTS: Final = dict.fromkeys(
+    ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
+     "delay_s", "split", "gap_s"),
+    _A_FAULT,
+)  # fmt: skip
+"""Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
+
+
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
-    """Read a profile and the profiles it extends, and apply `section.key=value` overrides."""
+    """Read a profile and the profiles it extends, and apply `section.key=value` overrides.
+
+    Raises EmulatorError: each problem names file or option, key and remedy.
+    """
     path = find_toml("profile", name_or_path)
-    values = _read_extended(path, 0)
+    layers = _read_extended(path, 0)
+    values: dict[str, Any] = {}
+    for _, table in layers:
+        if "camera" in table:
+            _drop_calibration(values)
+        values = merge(values, table)
     if any(override.startswith("camera.") for override in overrides):
         _drop_calibration(values)
-    for override in overrides:
-        _apply_override(values, override)
+    layers += [_apply_override(values, override) for override in overrides]
+    found: list[tuple[Sequence[object], str]] = []
+    profile = None
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        why = explain(error, Profile, also=("extends",))
-        raise EmulatorError(f"{_source_of_key(path, overrides, why)}: {why}") from None
-    for name in profile.parameters:
+        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS)
+        found += [(problem.location, str(problem)) for problem in listed]
+    for section, check in _checks(values, path.parent):
+        found += _problems_of_keys(section, values.get(section), check)
+    if found or profile is None:
+        named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in found)
+        raise EmulatorError(*(f"{source}: {text}" for source, text in named))
+    return profile.read_from(path, layers)
+
+
+def _checks(
+    values: Mapping[str, Any], folder: Path
+) -> Iterator[tuple[str, Callable[[dict[str, Any]], object]]]:
+    """Yield the sections whose keys are those of another class or of the unit, each with a check of its table."""
+    run, sky, unit = values.get("run"), values.get("sky"), values.get("unit", DEFAULT_UNIT)
+    if "sensor" in values:
+        from starhil.emulator.sensor.model import SensorModel
+
+        yield "sensor", lambda table: SensorModel().with_(**table)
+    if isinstance(sky, dict):
+        from starhil.emulator.sky.view import Sky
+
+        whole = {key: sky[key] for key in ("date", "bodies") if key in sky}
+        yield "sky", lambda table: Sky({**whole, **table})
+    if "identifier" in values:
+        from starhil.emulator.pipeline.star_identifiers import check_options
+        from starid.interface import ALGORITHMS
+
+        algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
+        if algorithm in ALGORITHMS:
+            yield "identifier", lambda table: check_options(algorithm, table)
+    if "parameters" in values and isinstance(unit, str):
+        try:
+            known = load_unit(folder / find("unit", unit)).device_parameters
+        except IcdError:
+            return  # reported when the unit is loaded
+        yield "parameters", lambda table: _check_parameters(known, table)
+
+
+def _problems_of_keys(
+    section: str, table: object, check: Callable[[dict[str, Any]], object]
+) -> Iterator[tuple[Sequence[object], str]]:
+    """Yield location and text of the problems of a table, each key of which is checked alone."""
+    for key, value in table.items() if isinstance(table, dict) else ():
+        try:
+            check({key: value})
+        except (EmulatorError, ProtocolError) as error:
+            yield from (((section, key), str(text)) for text in error.args)
+
+
+def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
+    for name, value in table.items():
         if name in LINK_PARAMETERS:
-            why = f"parameters.{name}: set {LINK_PARAMETERS[name]} instead"
-            raise EmulatorError(f"{_source_of_key(path, overrides, why)}: {why}")
-    return profile.read_from(path, overrides)
+            raise EmulatorError(f"parameters.{name}: set {LINK_PARAMETERS[name]} instead")
+        if name not in known:
+            raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
+        try:
+            known[name].check(value)
+        except ProtocolError as error:
+            raise EmulatorError(f"parameters.{error}") from None
 
 
 def camera_of(name_or_path: str) -> Camera:
@@ -414,22 +495,27 @@ def camera_of(name_or_path: str) -> Camera:
     return Camera.from_dict(load_profile(name_or_path).camera.values())
 
 
-def _source_of_key(path: Path | str, overrides: Sequence[str], why: str) -> str:
-    """Return the source of the key with which `why` begins, or that it quotes: an override, or else the file."""
-    wrong = why.partition(": ")[0]
-    for override in reversed(overrides):
-        key = override.partition("=")[0].strip()
-        section, _, name = key.rpartition(".")
-        if f"{wrong}.".startswith(f"{key}.") or (wrong == section and f"'{name}'" in why):
-            return f"--set {override}"
-    return f"profile {path}"
+def _source_of(layers: Sequence[Layer], location: Sequence[object]) -> str:
+    """Return the last source that has the key at a location, or else the table that would hold it; empty if none has."""
+    for length in range(len(location), 0, -1):
+        for source, values in reversed(layers):
+            here: Any = values
+            for key in location[:length]:
+                try:
+                    here = here[key]
+                except (KeyError, IndexError, TypeError):
+                    break
+            else:
+                return source
+    return ""
 
 
-def _read_extended(path: Path, depth: int) -> dict[str, Any]:
+def _read_extended(path: Path, depth: int) -> list[Layer]:
+    """Return the files of a profile and of those that it extends, the profile's last."""
     values = read_toml(path, "profile")
     base = values.pop("extends", None)
     if base is None:
-        return values
+        return [(f"profile {path}", values)]
     if not isinstance(base, str):
         raise EmulatorError(f"profile {path}: extends: must be a name or a path, in quotes")
     if depth >= MAX_EXTENDS_DEPTH:
@@ -440,10 +526,7 @@ def _read_extended(path: Path, depth: int) -> dict[str, Any]:
         extended = find_toml("profile", base, path.parent)
     except EmulatorError as error:
         raise EmulatorError(f"profile {path}: extends: {error}") from None
-    below = _read_extended(extended, depth + 1)
-    if "camera" in values:
-        _drop_calibration(below)
-    return merge(below, values)
+    return [*_read_extended(extended, depth + 1), (f"profile {path}", values)]
 
 
 def _drop_calibration(values: dict[str, Any]) -> None:
@@ -483,8 +566,8 @@ def merge(base: dict[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _apply_override(values: dict[str, Any], override: str) -> None:
-    """Apply one `section.key=value`; a value that is not TOML is text."""
+def _apply_override(values: dict[str, Any], override: str) -> Layer:
+    """Apply one `section.key=value`, and return it as a layer; a value that is not TOML is text."""
     key, equals, text = override.partition("=")
     names = [name.strip() for name in key.split(".")]
     if not equals or not all(names):
@@ -509,3 +592,7 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
     for excluded in _replaced_by(names[-1:]) & table.keys():
         del table[excluded]
     table[names[-1]] = value
+    layer: Any = value
+    for name in reversed(names):
+        layer = {name: layer}
+    return f"--set {override}", layer

@@ -42,12 +42,12 @@ from starhil.emulator.tape import (
 )
 from starhil.emulator.truth.config import FileConfig, Strict, TruthConfig
 from starhil.emulator.truth_log import WALL_TIMES, TruthLog
-from starhil.emulator.validation_messages import explain
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Reply, ReplyKind
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
+from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 from starid.files import open_regular, read_text
 
@@ -317,18 +317,24 @@ def _validated(model: type[Model], text: str | bytes, where: object) -> Model:
     try:
         return model.model_validate_json(text)
     except ValidationError as error:
-        raise EmulatorError(f"replay {where}: {explain(error, model)}") from None
+        raise EmulatorError(*(f"replay {where}: {problem}" for problem in problems(error, model))) from None
 
 
 def read_events(folder: Path) -> Iterator[tuple[str, Entry]]:
-    """Yield the entries of a tape, each with file and line."""
+    """Yield the entries of a tape, whose times do not decrease, each with file and line."""
     path = folder / EVENTS_FILE
+    last_ns = 0
     with explained(f"replay {path}: cannot be read"), open_regular(path) as file:
         for number, line in enumerate(file, start=1):
             if not line.endswith(b"\n"):
                 return  # the run was killed while it wrote
             where = f"{path}: line {number}"
-            yield where, _validated(_Line, line, where).root
+            entry = _validated(_Line, line, where).root
+            if entry.ns < last_ns:
+                why = f"time {entry.ns} ns is before that of the entry above, {last_ns} ns; the recording is damaged"
+                raise EmulatorError(f"replay {where}: {why}")
+            last_ns = entry.ns
+            yield where, entry
 
 
 async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
@@ -397,7 +403,7 @@ class _Playing:
             if isinstance(entry, _Plain) and entry.do == "end":
                 ended = True
                 continue
-            stepped.set_ns(max(entry.ns, stepped.now_ns()))
+            stepped.set_ns(entry.ns)
             try:
                 await self.entry(entry)
             except _DeviationError as deviation:

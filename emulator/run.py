@@ -151,6 +151,6 @@ def _unit_of(profile: Profile) -> InterfaceDefinition:
     icd = load_unit(profile.unit_source)
     missing = unbound(icd)
     if missing:
-        raise EmulatorError(missing[0])
+        raise EmulatorError(*missing)
     check_links(profile, icd)
     return icd

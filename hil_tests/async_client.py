@@ -14,7 +14,7 @@ from starhil.hil_tests.images import Image, download_by_bursts, download_by_fram
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition, Names
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import Value
@@ -75,9 +75,7 @@ class AsyncObcClient:
         """
         row = self.icd.telemetry[name]
         request = self.icd.request(row)
-        reply, latency = await self.transact(
-            request, row.name, row.size, timeout_s=timeout_s, retries=retries
-        )
+        reply, latency = await self.transact(request, row.name, timeout_s=timeout_s, retries=retries)
         return self._reading(reply, latency)
 
     async def telemetry(
@@ -116,9 +114,9 @@ class AsyncObcClient:
         row = self.icd.telecommands[name]
         request = self.icd.request(row, data)
         if not self.link.answers(row):
-            self.link.request(request, 0)
+            self.link.request(request)
             return Ack(row.name, 0.0)
-        _reply, latency = await self.transact(request, row.name, 0, timeout_s=timeout_s, retries=retries)
+        _reply, latency = await self.transact(request, row.name, timeout_s=timeout_s, retries=retries)
         return Ack(row.name, latency)
 
     async def set_parameter(
@@ -211,7 +209,6 @@ class AsyncObcClient:
         self,
         request: Request,
         name: str,
-        reply_size: int,
         *,
         timeout_s: float | None = None,
         retries: int | None = None,
@@ -224,19 +221,19 @@ class AsyncObcClient:
         attempts = 1 + (self.retries if retries is None else retries)
         async with self._turn:
             for _ in range(attempts):
-                answer = await self._attempt(request, reply_size, limit)
+                answer = await self._attempt(request, limit)
                 if answer is not None:
                     return self._checked_reply(name, *answer)
                 self.transactions.append(Transaction(name, "no_reply", float("inf")))
         self.link.check()
         raise NoReplyError(name, limit, attempts)
 
-    async def _attempt(self, request: Request, reply_size: int, limit: float) -> tuple[Reply, float] | None:
+    async def _attempt(self, request: Request, limit: float) -> tuple[Reply, float] | None:
         future: asyncio.Future[tuple[Reply, float]] = asyncio.get_running_loop().create_future()
         self._pending = (request, future)
         begin = time.perf_counter()
         try:
-            self.link.request(request, reply_size)
+            self.link.request(request)
             async with asyncio.timeout(limit):
                 reply, end = await future
             return reply, end - begin
@@ -298,7 +295,13 @@ class AsyncObcClient:
             values = row.decode(reply.data)
         except ProtocolError as error:
             raise BadReplyError(str(error)) from None
-        return Reading(row.name, values, latency, time.time(), time.monotonic())
+        return Reading(
+            row.name,
+            Names(f"field of {row.name}", values.items(), few=True),
+            latency,
+            time.time(),
+            time.monotonic(),
+        )
 
 
 _ANSWERS: Final = {

@@ -179,7 +179,7 @@ async def load_can(
         row = icd.telemetry[REQUESTED_ROWS[requests % len(REQUESTED_ROWS)]]
         requests += 1
         try:
-            reply, latency = await asker.transact(icd.request(row), row.name, row.size)
+            reply, latency = await asker.transact(icd.request(row), row.name)
             latencies.append(latency)
             wrong += not _is_right(row, reply)
         except NackError:
@@ -188,7 +188,7 @@ async def load_can(
             unanswered += 1
         await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
         with suppress(NoReplyError, LinkLostError):
-            echoes.append((await echo.transact(Request.of(ECHO_ROW), "echo", 0))[1])
+            echoes.append((await echo.transact(Request.of(ECHO_ROW), "echo"))[1])
         await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
     duration, sent, lost, disordered, refused = await asyncio.to_thread(traffic.stop)
     await asker.close()

@@ -34,7 +34,7 @@ class CanopenHostLink(HostLink[CanFrame]):
         self._under_way: tuple[Request, SdoTransfer] | None = None
         self._receiver = self
 
-    def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- an upload has its own length
+    def request(self, request: Request) -> None:
         """Start the transfers of a request.
 
         Raises BenchError: the object dictionary does not hold the row.

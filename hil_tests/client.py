@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
 from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
@@ -23,12 +22,10 @@ from starhil.hil_tests.transactions import Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import LinkFault, Reply, RequestKind
+from starhil.protocol.messages import LinkFault, Reply
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
-__tracebackhide__ = operator.methodcaller(
-    "errisinstance", BenchError
-)  # pytest shows the caller's line instead
+__tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 Parameters = ParamSpec("Parameters")
 T = TypeVar("T")
@@ -169,6 +166,4 @@ class ObcClient:
     ) -> Reply:
         """Send a request by row ID (and class, if the unit has classes), data as bytes; return the reply."""
         request = self.icd.request_of(identifier, klass, data)
-        row = self.icd.rows_by_key.get((request.klass, identifier))
-        size = row.size if row is not None and request.kind is RequestKind.TELEMETRY else 0
-        return self.run(self.core.transact(request, f"request {identifier}", size, timeout_s=timeout_s))[0]
+        return self.run(self.core.transact(request, f"request {identifier}", timeout_s=timeout_s))[0]

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import operator
 import socket
 import time
+from contextlib import ExitStack
 from typing import Any, Final, Self
 
 from starhil.hil_tests.attitude import (
@@ -15,12 +15,10 @@ from starhil.hil_tests.attitude import (
     from_reported,
     unit,
 )
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
 from starhil.protocol.conventions import Conventions
 
-__tracebackhide__ = operator.methodcaller(
-    "errisinstance", BenchError
-)  # pytest shows the caller's line instead
+__tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 ANSWER_WITHIN_S: Final = 60.0
 """A step of the stepped clock takes as long as its frames."""
@@ -35,20 +33,13 @@ class ControlClient:
     """
 
     def __init__(self, address: str) -> None:
-        path = address.removeprefix("unix:")
         try:
-            if path != address:
-                self._socket = socket.socket(socket.AF_UNIX)
-                self._socket.settimeout(ANSWER_WITHIN_S)
-                self._socket.connect(path)
-            else:
-                host, _, port = address.rpartition(":")
-                self._socket = socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+            self._socket = _connected(address)
         except OSError as error:
             raise BenchError(f"control channel {address}: {error.strerror or error}") from None
         self._lines = self._socket.makefile("rw", encoding="utf-8")
 
-    def do(self, action: str, **keys: Any) -> dict[str, Any]:
+    def do(self, action: str, /, **keys: Any) -> dict[str, Any]:
         """Send a request and return the answer.
 
         Raises BenchError: the request was rejected, or the channel does not answer.
@@ -97,6 +88,19 @@ class ControlClient:
 
     def __exit__(self, *_error: object) -> None:
         self.close()
+
+
+def _connected(address: str) -> socket.socket:
+    path = address.removeprefix("unix:")
+    if path == address:
+        host, _, port = address.rpartition(":")
+        return socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+    with ExitStack() as stack:
+        found = stack.enter_context(socket.socket(socket.AF_UNIX))
+        found.settimeout(ANSWER_WITHIN_S)
+        found.connect(path)
+        stack.pop_all()
+    return found
 
 
 class Truth:

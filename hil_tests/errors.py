@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from starhil.protocol.errors import OneLineError, escape_controls
+import operator
+from typing import Final
+
+from starhil.protocol.errors import OneLineError
+
+HIDDEN_BEHIND_ONE_LINE: Final = operator.methodcaller("errisinstance", OneLineError)
+"""Value of `__tracebackhide__` in a module whose frames pytest leaves out of the traceback of such an error, so that it ends
+at the line of the test."""
 
 
 class BenchError(OneLineError):
@@ -10,11 +17,7 @@ class BenchError(OneLineError):
 
 
 class ScriptError(BenchError):
-    """An invalid session script; the arguments are its problems, each of which names file, step and key."""
-
-    def __str__(self) -> str:
-        """Return a line for each problem."""
-        return "\n".join(escape_controls(str(problem)) for problem in self.args)
+    """An invalid session script; each problem names file, step and key."""
 
 
 class DeviceError(BenchError):

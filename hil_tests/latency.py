@@ -114,7 +114,7 @@ class SerialRequester(_Port):
         """Request a row; return the time until the last byte of the reply in s, or None without a reply."""
         row = self._icd.telemetry[name]
         request = self._icd.request(row)
-        self._host.expect(request, row.size)
+        self._host.expect(request)
         data = self._stack.encode_request(request)
         begin = time.perf_counter()
         os.write(self._fd, data)

@@ -15,7 +15,7 @@ from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, Request
 from starhil.protocol.serial_interface import Receiver
-from starhil.protocol.serial_stack import HostReceiver, build_serial_stack, chosen_dialect, serial_answers
+from starhil.protocol.serial_stack import HostReceiver, build_serial_stack, chosen_dialect
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -51,8 +51,8 @@ class HostLink(ABC, Generic[Item]):
         self._flusher: asyncio.Task[None] | None = None
 
     @abstractmethod
-    def request(self, request: Request, reply_size: int) -> None:
-        """Send a request whose telemetry has `reply_size` bytes (0 for a telecommand)."""
+    def request(self, request: Request) -> None:
+        """Send a request."""
 
     @abstractmethod
     def reset_receiver(self) -> None:
@@ -132,19 +132,18 @@ class SerialHostLink(HostLink[bytes]):
         log: WireLog | None = None,
     ) -> None:
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
-        self._icd = icd
         self._stack = build_serial_stack(icd)
         self._dialect = chosen_dialect(icd, dialect)
         self._receiver = self._stack.host(self._dialect)
 
-    def request(self, request: Request, reply_size: int) -> None:
+    def request(self, request: Request) -> None:
         """Frame and send a request."""
-        self._receiver.expect(request, reply_size)
+        self._receiver.expect(request)
         self.send(self._stack.encode_request(request))
 
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on the serial line."""
-        return serial_answers(self._icd, row)
+        return self._stack.answers(row)
 
     def reset_receiver(self) -> None:
         """Discard an incomplete reply."""
@@ -172,7 +171,7 @@ class CanHostLink(HostLink[CanFrame]):
         self.device_address = device_address
         self._receiver = CanHostReceiver(host_address, device_address)
 
-    def request(self, request: Request, reply_size: int) -> None:  # noqa: ARG002 -- CAN replies name their type
+    def request(self, request: Request) -> None:
         """Send a request as frames."""
         for frame in encode_request_frames(request, self.host_address, self.device_address):
             self.send(frame)

@@ -32,7 +32,7 @@ interface definition. All errors of a file are reported, one a line, with file, 
 
 from __future__ import annotations
 
-import re
+import json
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -65,14 +65,13 @@ from starhil.hil_tests.expect import (
 from starhil.hil_tests.raw_traffic import parse_frame, pattern
 from starhil.protocol.codec import Field as RowField
 from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition, UnknownNameError
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import did_you_mean, remedy
 from starhil.protocol.user_file import read_user_text
-from starhil.protocol.values import Parameter, Value
+from starhil.protocol.validation_messages import wording
+from starhil.protocol.values import FLAGS, Parameter
 
-LISTED: Final = "; `starhil icd list` lists all"
-"""Hint if no known name is similar."""
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 
 
@@ -98,16 +97,17 @@ def _texts(value: Any) -> tuple[str, ...]:
     return tuple(values)
 
 
-def _known(kind: str, table: str, others: str = "", remedy: str = "") -> PlainValidator:
-    """Return a reader of names in a table of the definition; `remedy` for a name that is in another one."""
+def _known(table: str, others: str = "", instead: str = "") -> PlainValidator:
+    """Return a reader of names in a table of the definition; `instead`: what a name in the table `others` is."""
 
     def read(value: Any, info: ValidationInfo) -> Any:
-        known = getattr(_icd(info), table)
-        if _text(value) not in known:
-            elsewhere = others and value in getattr(_icd(info), others)
-            hint = f"; it is {remedy}" if elsewhere else did_you_mean(value, known) or LISTED
-            raise ValueError(f"unknown {kind} '{value}'{hint}")
-        return known[value]
+        icd = _icd(info)
+        if others and _text(value) in getattr(icd, others):
+            raise ValueError(f"{value!r} is {instead}")
+        try:
+            return getattr(icd, table)[_text(value)]
+        except UnknownNameError as error:
+            raise ValueError(str(error)) from None
 
     return PlainValidator(read)
 
@@ -131,6 +131,14 @@ def _hex_bytes(value: Any) -> bytes:
         raise ValueError(f'must be bytes in hexadecimal, such as "1F 7F 80 1F FF", not {value!r}') from None
 
 
+def _as_json(table: dict[str, Any]) -> dict[str, Any]:
+    try:
+        json.dumps(table)
+    except TypeError:
+        raise ValueError("must be numbers, texts, lists and tables; put a date in quotes") from None
+    return table
+
+
 def _file_name(name: str) -> str:
     if name in {"", ".."} or Path(name).name != name or "\0" in name:
         raise ValueError("must be a plain file name; the file is written to the log folder")
@@ -143,9 +151,9 @@ def _fraction(value: float) -> float:
     return value
 
 
-Telemetry = Annotated[Row, _known("telemetry row", "telemetry", "telecommands", "a telecommand: use command")]
-Telecommand = Annotated[Row, _known("telecommand", "telecommands", "telemetry", "telemetry: use read")]
-ParameterName = Annotated[Parameter, _known("parameter", "parameters")]
+Telemetry = Annotated[Row, _known("telemetry", "telecommands", "a telecommand: use command")]
+Telecommand = Annotated[Row, _known("telecommands", "telemetry", "telemetry: use read")]
+ParameterName = Annotated[Parameter, _known("parameters")]
 Refusal = Annotated[str, _member("error_code")]
 ImageSize = Annotated[str, _member("image_size")]
 HexBytes = Annotated[bytes, PlainValidator(_hex_bytes)]
@@ -236,17 +244,16 @@ class Command(Step):
         yield from super()._problems(info)
         if self.values and self.raw is not None:
             yield "give the parameters as a table 'with' or as bytes 'with_hex', not both"
-        unknown = [*_unknown_fields("with", self.row, self.values)]
-        yield from unknown
-        if (
-            self.raw is None
-            and not unknown
-            and not any(isinstance(v, Variable) for v in self.values.values())
-        ):
-            try:
-                self.row.encode(static_values(self.values), check=self.refused is None)
-            except ProtocolError as error:
-                yield str(error)
+        yield from _unknown_fields("with", self.row, self.values)
+        for name, item in self.row.named_fields.items() if self.raw is None else ():
+            value = self.values.get(name)
+            if value is None and item.required and "with" not in (info.context or {})["broken"]:
+                yield f"with: row '{self.row.name}' needs the field '{name}', which is missing"
+            elif value is not None and not isinstance(value, Variable):
+                try:
+                    item.to_raw(value, f"with: {self.row.name}.{name}", check=self.refused is None)
+                except ProtocolError as error:
+                    yield str(error)
 
 
 class ReadingStep(Step):
@@ -292,7 +299,7 @@ class Sample(ReadingStep):
     @classmethod
     def _from_table(cls, table: dict[str, Any]) -> dict[str, Any]:
         """Take the keys from a table `sample` too."""
-        inner = table["sample"]
+        inner = table.get("sample")
         if not isinstance(inner, dict):
             return table
         return {**table, **{"sample" if key == "telemetry" else key: value for key, value in inner.items()}}
@@ -396,6 +403,14 @@ class Restart(Step):
     signal: Literal["term", "kill"] = Field(alias="restart")
 
 
+class Control(Step):
+    """Send a request on the control channel of the emulator that the session started."""
+
+    default_name = "control channel: {self.action}"
+    action: Literal["fault", "clear_faults", "set_truth", "scenario", "step"] = Field(alias="control")
+    keys: Annotated[dict[str, Any], AfterValidator(_as_json)] = Field({}, alias="with")
+
+
 ACTIONS: Final[Mapping[str, type[Step]]] = {
     "command": Command,
     "read": Read,
@@ -407,6 +422,7 @@ ACTIONS: Final[Mapping[str, type[Step]]] = {
     "send": Send,
     "wait_s": Wait,
     "restart": Restart,
+    "control": Control,
 }
 """Key of an action → its class."""
 
@@ -518,20 +534,22 @@ TABLES: Final[Mapping[str, type[Keys]]] = {
 def _checked(
     model: type[Table], table: dict[str, Any], location: str, context: dict[str, Any] | None = None
 ) -> tuple[Table | None, list[str]]:
-    """Validate a table; return the result, or the problems: unknown keys, and those of the others without them."""
+    """Validate a table; return the result, or the problems: of its keys, and of the whole without the wrong ones.
+
+    The context `broken` has the keys that were left out.
+    """
     try:
-        return model.model_validate(table, context=context), []
+        return model.model_validate(table, context={**(context or {}), "broken": set()}), []
     except ValidationError as error:
         found = error.errors()
-    unknown = {
-        item["loc"][0] for item in found if item["type"] == "extra_forbidden" and len(item["loc"]) == 1
-    }
-    if unknown and len(unknown) == len(found):
+    broken = {item["loc"][0] for item in found if item["loc"]}
+    if broken:
+        rest = {key: table[key] for key in table if key not in broken}
         try:
-            model.model_validate({key: table[key] for key in table if key not in unknown}, context=context)
+            model.model_validate(rest, context={**(context or {}), "broken": broken})
         except ValidationError as error:
-            found += error.errors()
-    return None, [text for item in found for text in _texts_of(item, location, model)]
+            found += [item for item in error.errors() if item["type"] != "missing"]
+    return None, list(dict.fromkeys(text for item in found for text in _texts_of(item, location, model)))
 
 
 def _texts_of(error: ErrorDetails, location: str, model: type[Keys]) -> Iterator[str]:
@@ -549,34 +567,13 @@ def _texts_of(error: ErrorDetails, location: str, model: type[Keys]) -> Iterator
 
 
 def _explanation(error: ErrorDetails, key: str, known: list[str]) -> str:
-    given, context = error["input"], error.get("ctx", {})
     match error["type"]:
         case "extra_forbidden":
-            return (
-                f"unknown key '{key}'{did_you_mean(key, known) or ' (known here: ' + ', '.join(known) + ')'}"
-            )
+            return f"unknown key '{key}'{remedy(key, known)}"
         case "missing":
             return "must be given, but is missing"
-        case "greater_than_equal":
-            return f"must be at least {context['ge']:g}, not {given!r}"
-        case "literal_error":
-            allowed = [word for word in re.findall(r"\w+", context["expected"]) if word != "or"]
-            return f"must be one of {', '.join(allowed)}, not {given!r}{did_you_mean(str(given), allowed)}"
-        case kind:
-            return f"must be {NEEDED.get(kind, error['msg'])}, not {given!r}"
-
-
-NEEDED: Final = {
-    "float_type": "a number",
-    "finite_number": "a number",
-    "int_type": "a whole number",
-    "bool_type": "true or false",
-    "string_type": "a text",
-    "list_type": "a list",
-    "dict_type": "a table, such as { name = value }",
-    "model_type": "a table, such as { name = value }",
-}
-"""What is needed where pydantic reports a wrong type."""
+        case _:
+            return wording(error)
 
 
 def _keys_of(model: type[Keys]) -> list[str]:
@@ -591,31 +588,35 @@ def _unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
     known = row.named_fields
     for name in names:
         if name not in known:
-            hint = did_you_mean(name, known) or (
-                f"; its fields: {', '.join(known)}" if known else "; it has none"
-            )
-            yield f"{key}: row '{row.name}' has no field '{name}'{hint}"
+            yield f"{key}: row '{row.name}' has no field '{name}'{remedy(name, known)}"
 
 
 def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:
     """Yield why conditions can never hold: wrong type, or unknown name of an enumeration.
 
-    For a field of bytes, hexadecimal text is converted in place.
+    For a field of bytes, hexadecimal text is converted in place, and so are the names `true` and `false` of a flag's `map`.
     """
     if item.kind == "bytes":
         yield from _in_bytes(item, wanted)
         return
+    if item.is_flag and item.enum is not None:
+        wanted.value, wanted.differs_from = _as_flag(wanted.value), _as_flag(wanted.differs_from)
+        wanted.one_of = [_as_flag(value) for value in wanted.one_of]
     for value in (wanted.equals, wanted.differs_from, *wanted.one_of):
         if value is None or isinstance(value, Variable):
             continue
-        if item.enum is not None:
+        if item.enum is not None and not item.is_flag:
             if value not in item.enum.values and (isinstance(value, bool) or not isinstance(value, int)):
                 known = f"; one of: {', '.join(item.enum.values)}"
                 yield f"'{item.name}' is never '{show(value)}'{did_you_mean(show(value), item.enum.values) or known}"
-        elif (item.kind == "flag") != isinstance(value, bool):
-            yield f"'{item.name}' is {'true or false' if item.kind == 'flag' else 'not true or false'}, not {value!r}"
+        elif item.is_flag != isinstance(value, bool):
+            yield f"'{item.name}' is {'true or false' if item.is_flag else 'not true or false'}, not {value!r}"
         elif item.kind in ("integer", "float", "bits") and isinstance(value, str):
             yield f"'{item.name}' is a number, not {value!r}"
+
+
+def _as_flag(value: Any) -> Any:
+    return FLAGS.get(value, value) if isinstance(value, str) else value
 
 
 def _in_bytes(item: RowField, wanted: Conditions) -> Iterator[str]:
@@ -641,8 +642,3 @@ def _in_bytes(item: RowField, wanted: Conditions) -> Iterator[str]:
     wanted.value = None if wanted.value is None else convert(wanted.value)
     wanted.differs_from = None if wanted.differs_from is None else convert(wanted.differs_from)
     yield from wrong
-
-
-def static_values(values: Mapping[str, Operand]) -> dict[str, Value]:
-    """Return the literal values, without variables."""
-    return {name: value for name, value in values.items() if not isinstance(value, Variable)}

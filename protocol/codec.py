@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
+from starhil.protocol.names import remedy
 from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
@@ -117,6 +118,11 @@ class Field(FieldKeys):
         return self.offset + (byte if self.slot.order == "little" else self.size - 1 - byte), position
 
     @property
+    def is_flag(self) -> bool:
+        """Whether the values are true and false: a bit, or numbers that a `map` assigns to them."""
+        return self.kind == "flag" or (self.enum is not None and self.enum.is_flag)
+
+    @property
     def scaled(self) -> bool:
         """Whether the physical value is a scaled integer, and therefore a float."""
         return self.scale != 1.0 or self.bias != 0.0
@@ -211,8 +217,13 @@ class Field(FieldKeys):
         margin = abs(self.scale) / 2.0 if self.kind == "integer" else 0.0
         return not low - margin <= value <= high + margin
 
+    @property
+    def required(self) -> bool:
+        """Whether a telecommand must give a value."""
+        return self.default is None and self.const is None
+
     def to_raw(
-        self, value: Value, where: str, *, check: bool, saturate: bool, index: int = 0
+        self, value: Value, where: str, *, check: bool = True, saturate: bool = False, index: int = 0
     ) -> int | float | bytes:
         """Convert a physical value to the raw value of its slot or bits.
 
@@ -239,13 +250,13 @@ class Field(FieldKeys):
     def to_physical(self, raw: Any) -> Value:
         """Convert a raw value to the physical one.
 
-        A number that is not in the enumeration stays a number.
+        A number that is not in the enumeration stays a number; `true` and `false` are flags.
         """
         match self.kind:
             case "flag":
                 return bool(raw)
             case "enum":
-                return self.enum.names.get(raw, int(raw)) if self.enum is not None else int(raw)
+                return self.enum.value_of(int(raw)) if self.enum is not None else int(raw)
             case "bytes":
                 return bytes(raw)
             case "text":
@@ -311,7 +322,7 @@ class Field(FieldKeys):
             if isinstance(value, bool) or value in (0, 1):
                 return int(value)
             raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
-        if not check and isinstance(value, int) and low <= value <= high:
+        if not check and type(value) is int and low <= value <= high:
             return int(value)
         return self.enum.number(value, where, index=index)
 
@@ -368,6 +379,16 @@ class Row(RowKeys):
     """Whether fields without a binding are sent as zeros."""
     request: str = ""
     """Text that requests the row on the serial line; empty: its header does."""
+
+    @property
+    def request_size(self) -> int:
+        """Bytes of data in its request."""
+        return self.size if self.kind == "telecommand" else 0
+
+    @property
+    def reply_size(self) -> int:
+        """Bytes of data in its reply."""
+        return self.size if self.kind == "telemetry" else 0
 
     def __repr__(self) -> str:
         """Return kind, ID and name."""
@@ -430,14 +451,14 @@ class Row(RowKeys):
         given = {} if values is None else values
         unknown = given.keys() - self.named_fields.keys()
         if unknown:
-            known = ", ".join(self.named_fields) or "none"
-            raise FieldError(f"{self.name}.{min(unknown)}: no such field (fields: {known})")
+            name = min(unknown)
+            raise FieldError(f"{self.name}.{name}: no such field{remedy(name, self.named_fields)}")
         raw: list[Any] = [0] * len(self._sent)
         for index, (name, item, position) in enumerate(self._values):
             where = f"{self.name}.{name}"
             value = given.get(name)
             if value is None:
-                if self.kind == "telecommand" and item.default is None and item.const is None:
+                if self.kind == "telecommand" and item.required:
                     raise FieldError(f"{where}: missing value", index=index)
                 value = item.empty
             packed: Any = item.to_raw(value, where, check=check, saturate=saturate, index=index)

@@ -6,10 +6,13 @@ import os
 
 
 class OneLineError(Exception):
-    """An error whose text is one line that names what and where; controls in what it quotes are escaped."""
+    """An error whose arguments are its problems, each one line that names what and where.
+
+    The text is one line, too, with the problems one after the other; controls in what they quote are escaped.
+    """
 
     def __str__(self) -> str:
-        return escape_controls(super().__str__())
+        return escape_controls("; ".join(map(str, self.args)))
 
 
 class ProtocolError(OneLineError):

@@ -14,10 +14,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from pydantic import BaseModel, ValidationError
-from pydantic_core import ErrorDetails
+from pydantic import ValidationError
 
-from starhil.protocol import canopen_schema
 from starhil.protocol import icd_schema as schema
 from starhil.protocol.codec import Row, RowKind
 from starhil.protocol.conventions import Conventions
@@ -38,6 +36,7 @@ from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.text_messages import words
 from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
 from starhil.protocol.user_file import read_user_text
+from starhil.protocol.validation_messages import Problem, problems
 from starhil.protocol.values import (
     EnumDefinition,
     FieldError,
@@ -59,27 +58,6 @@ CLASS: Final = "class"
 UNKNOWN_UNIT: Final = {"name": "", "version": "", "doc": "", "provenance": "ours"}
 """Stands for a table [unit] with errors."""
 
-_MODELS: Final[dict[str, type[BaseModel]]] = {
-    "unit": schema.UnitModel,
-    "conventions": Conventions,
-    "class": MessageClass,
-    "enum": EnumDefinition,
-    "telecommand": schema.RowModel,
-    "telemetry": schema.RowModel,
-    "fields": schema.FieldModel,
-    "repeat": schema.RepeatModel,
-    "bits": schema.BitModel,
-    "parameter": schema.ParameterModel,
-    "section": Section,
-    "canopen": canopen_schema.CanopenModel,
-    "object": canopen_schema.PlacedObject,
-    "members": canopen_schema.PlacedMember,
-    "packed": canopen_schema.PackedField,
-    "tpdo": canopen_schema.PdoModel,
-    "rpdo": canopen_schema.PdoModel,
-}
-"""Table → its schema, to suggest keys."""
-
 
 def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
     """Read the interface definition of a unit: a bundled unit by name, a folder of TOML files, or one file.
@@ -98,8 +76,7 @@ def _load_bundled(path: Path) -> InterfaceDefinition:
 def _load(path: Path) -> InterfaceDefinition:
     definition, errors = read_definition(path)
     if errors:
-        more = f" ({len(errors) - 1} more: starhil unit check {path})" if len(errors) > 1 else ""
-        raise IcdError(f"{errors[0]}{more}")
+        raise IcdError(*errors)
     return definition
 
 
@@ -115,32 +92,10 @@ def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDe
     return definition, [escape_controls(error) for error in errors]
 
 
-def _location(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
-    """Return the keys that lead to an error; pydantic also names the kinds of unions, such as `crc` of a check."""
-    steps: list[int | str] = []
-    for step in error["loc"][:-1]:
-        try:
-            document = document[step]
-        except (KeyError, IndexError, TypeError):
-            continue
-        steps.append(step)
-    return (*steps, *error["loc"][-1:])
-
-
-def _texts(file: Path, document: Any, error: ValidationError) -> Iterator[str]:
-    for item in error.errors():
-        location = _location(document, item)
-        where = f"{file}: {_key_path(document, location)}"
-        if item["type"] == "extra_forbidden":
-            yield f"{where}: unknown key{did_you_mean(str(location[-1]), _known_keys(location))}"
-        else:
-            yield f"{where}: {item['msg']}"
-
-
-def _place(document: Any, error: ErrorDetails) -> tuple[int | str, ...]:
+def _place(problem: Problem) -> tuple[int | str, ...]:
     """Return the place of what cannot be used because of an error: a key, a field, a table."""
-    location = _location(document, error)
-    if error["type"] == "extra_forbidden":
+    location = problem.location
+    if problem.unknown:
         return location
     if len(location) > 3 and location[2] == "fields":
         return location[:4]
@@ -158,27 +113,6 @@ def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
     except (IndexError, KeyError, TypeError):
         return None
     return name if isinstance(name, str) else None
-
-
-def _key_path(document: object, location: tuple[int | str, ...]) -> str:
-    """Return the dotted path of a key, with names of rows and fields instead of indices."""
-    steps: list[str] = []
-    here = document
-    for step in location:
-        try:
-            here = here[step]  # type: ignore[index]
-        except (KeyError, IndexError, TypeError):
-            here = None
-        named = here.get("name", here.get("heading")) if isinstance(here, dict) else None
-        steps.append(str(named if named is not None and isinstance(step, int) else step))
-    return ".".join(steps)
-
-
-def _known_keys(location: tuple[int | str, ...]) -> list[str]:
-    """Return the known keys of the table that has an unknown one."""
-    tables = [step for step in location[:-1] if isinstance(step, str)]
-    model = _MODELS.get(tables[-1], schema.FileModel) if tables else schema.FileModel
-    return [item.alias or name for name, item in model.model_fields.items()]
 
 
 class _Reader:
@@ -204,6 +138,7 @@ class _Reader:
         self._link = LinkModel()
         self._plugin = Plugin()
         self._rows: dict[str, Row] = {}
+        self._row_files: dict[str, Path] = {}
         self._ids: dict[tuple[int | None, int], str] = {}
         """Code of the class and ID → name of the row."""
         self.byte_order = Conventions().byte_order
@@ -227,12 +162,11 @@ class _Reader:
             try:
                 self._files.append((file, schema.FileModel.model_validate(document)))
             except ValidationError as error:
+                found = list(problems(error, schema.FileModel, document))
                 if not said:  # later ones may be caused by what was removed
-                    self.errors += _texts(file, document, error)
+                    self.errors += [f"{file}: {problem}" for problem in found]
                 said = True
-                for place in sorted(
-                    {_place(document, item) for item in error.errors()}, key=_order, reverse=True
-                ):
+                for place in sorted({_place(problem) for problem in found}, key=_order, reverse=True):
                     self._remove(document, place)
             else:
                 return
@@ -307,7 +241,7 @@ class _Reader:
             version=self._unit.version,
             doc=self._unit.doc,
             telecommands=Names("telecommand", ((row.name, row) for row in telecommands)),
-            telemetry=Names("telemetry", ((row.name, row) for row in telemetry)),
+            telemetry=Names("telemetry row", ((row.name, row) for row in telemetry)),
             enums=Names(
                 "enumeration",
                 {
@@ -325,6 +259,7 @@ class _Reader:
             errors=errors,
             first_telemetry_id=self._unit.first_telemetry_id,
             plugin=self._plugin,
+            files=self._row_files,
         )
         self._attempt(self._check_link, link_file, definition)
         return definition
@@ -495,6 +430,7 @@ class _Reader:
             self.errors += check_row(row, self._model, self._plugin, where, complete=whole)
             if self._attempt(self._check_unique, row, where):
                 self._rows[row.name] = row
+                self._row_files[row.name] = file
                 done.append(row)
 
     def _class_of(self, kind: RowKind, model: schema.RowModel, where: str) -> str:

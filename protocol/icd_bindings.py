@@ -14,6 +14,8 @@ from starhil.protocol.units_of_measure import convertible, factor
 from starhil.protocol.values import IcdError
 
 ANY_UNIT = "*"
+SET_PARAMETERS = "set_parameters"
+"""The action whose fields are bound to parameters instead of arguments."""
 
 
 def check_row(
@@ -49,17 +51,25 @@ def _check_field(
         _check_value(field, row, model, plugin, where)
     if field.argument is not None:
         _check_argument(field, row, action, model, where)
+    if (
+        action is not None
+        and action.name == SET_PARAMETERS
+        and (field.parameter, field.const) == (None, None)
+    ):
+        raise IcdError(
+            f"{where}: sets nothing; bind it to a parameter with `parameter`, or leave out its name"
+        )
 
 
 def unbound(icd: InterfaceDefinition) -> list[str]:
     """Return an error message for each row or field that the device cannot serve, because it has no binding."""
     missing = [
-        f"unit {icd.name}: telecommand {row.name}: no `action`; use `nothing` to accept the telecommand without effect"
+        f"{icd.files[row.name]}: telecommand {row.name}: no `action`; use `nothing` to accept the telecommand without effect"
         for row in icd.telecommands.values()
         if row.action is None
     ]
     missing += [
-        f"unit {icd.name}: telemetry {row.name}: field {field.name}: no `value`, `const`, `parameter` or `default`; "
+        f"{icd.files[row.name]}: telemetry {row.name}: field {field.name}: no `value`, `const`, `parameter` or `default`; "
         "a field without a name is sent as zeros"
         for row in icd.telemetry.values()
         if not row.zeros

@@ -20,6 +20,7 @@ from pydantic import ValidationError
 from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance, RepeatModel
+from starhil.protocol.validation_messages import wording
 from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError, Scalar
 
 NUMBER: Final = "[n]"
@@ -299,9 +300,12 @@ def _numbered(name: str | None, number: int | None, where: str) -> str | None:
 
 
 def _default(value: Scalar | None, enum: EnumDefinition | None, where: str) -> Scalar | None:
-    if enum is not None and value is not None and value not in enum.values:
+    if enum is None or value is None:
+        return value
+    name = text_of(value)
+    if name not in enum.values:
         raise IcdError(f"{where}: default {value!r} is not in enumeration {enum.name}")
-    return value
+    return name
 
 
 def fields_of(text: str) -> list[FieldModel]:
@@ -317,7 +321,7 @@ def fields_of(text: str) -> list[FieldModel]:
         return [FieldModel.model_validate(table) for table in tables]
     except ValidationError as error:
         first = error.errors()[0]
-        raise IcdError(f"{first['loc'][-1]}: {first['msg']}") from None
+        raise IcdError(f"{first['loc'][-1]}: {wording(first)}") from None
 
 
 def _scalars(type_: str, name: str, *words: str) -> list[dict[str, Any]]:

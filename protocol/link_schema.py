@@ -50,6 +50,16 @@ class MessageClass(DefinitionModel):
     answer: list[str] | None = None
     """Answers of its rows, in order: `echo`, `reply`, `row:NAME`; default: `["reply"]`."""
 
+    @property
+    def reply_code(self) -> int | None:
+        """Code in a reply."""
+        return self.code if self.reply is None else self.reply
+
+    @property
+    def unsolicited_code(self) -> int | None:
+        """Code in unsolicited telemetry."""
+        return self.reply_code if self.unsolicited is None else self.unsolicited
+
 
 class CubeSpaceFraming(DefinitionModel):
     """The CubeSpace family's framing with its three reply dialects, without header and checksum."""

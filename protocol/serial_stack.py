@@ -6,33 +6,25 @@
             └──────────────── body ─────────────────────────┘
 
 A link is composed of a framing, which marks where a body begins and ends (`framings`), a check (`checks`), a header of
-requests and one or several of replies (`envelope`). In most units all replies have one header, whose roles give what
-they are. In the dialects of CubeSpace each kind of reply has its own (`cubespace`), and the kind follows from the
-start byte, the row, and the size.
+requests and one of replies (`envelope`), whose roles give the kind of a reply. Only the replies of CubeSpace have another
+header for each kind, and dialects (`cubespace`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from collections.abc import Sequence
+from functools import partial
 from typing import Final
 
 from starhil.protocol import cubespace
-from starhil.protocol.checks import Check, CheckFunction, build_check
+from starhil.protocol.checks import Check, build_check
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Order
+from starhil.protocol.cubespace import DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.framings import (
-    CUBESPACE,
-    Deframer,
-    Escaped,
-    Framing,
-    Receiving,
-    build_framing,
-)
+from starhil.protocol.framings import Deframer, Framing, Receiving, build_framing
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
     FormatModel,
@@ -42,7 +34,6 @@ from starhil.protocol.link_schema import (
 )
 from starhil.protocol.message_format import Formats, MessageFormat
 from starhil.protocol.messages import (
-    BURST_ID,
     DEFAULT_MAX_SIZE,
     FIRST_TELEMETRY_ID,
     ErrorCode,
@@ -54,120 +45,41 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
+from starhil.protocol.plugin import Plugin
 from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
 
-
-@dataclass(frozen=True, slots=True)
-class RowShape:
-    """The properties of a row on which a link depends: kind, sizes and answers."""
-
-    klass: str
-    id: int
-    kind: RequestKind
-    request_size: int = 0
-    """Number of data bytes in the request."""
-    reply_size: int = 0
-    """Number of data bytes in the reply."""
-    answers: tuple[str, ...] = ("reply",)
-    """`echo` and `reply`, in the order in which the device sends them."""
-    request: str = ""
-    """Text that requests the row; empty: its header does."""
+NO_PLUGIN: Final = Plugin()
 
 
-@dataclass
 class _Classes:
     """The classes of a unit by code and by name."""
 
-    classes: Sequence[MessageClass]
-    by_name: dict[str, MessageClass] = field(init=False)
-    requests: dict[int, str] = field(init=False)
-    replies: dict[int, str] = field(init=False)
-    _unsolicited: set[int] = field(init=False)
+    def __init__(self, classes: Sequence[MessageClass]) -> None:
+        self.classes: Final = classes
+        self.by_name: Final = {item.name: item for item in classes}
+        coded = [item for item in classes if item.code is not None]
+        self.requests: Final = {item.code: item.name for item in coded if item.code is not None}
+        self.replies: Final = {
+            code: item.name
+            for item in coded
+            for code in (item.reply_code, item.unsolicited)
+            if code is not None
+        }
+        self.unsolicited: Final = {item.unsolicited for item in coded} - {None}
+        """Codes of unsolicited telemetry."""
 
-    def __post_init__(self) -> None:
-        self.by_name = {item.name: item for item in self.classes}
-        coded = [item for item in self.classes if item.code is not None]
-        self.requests = {item.code: item.name for item in coded if item.code is not None}
-        self.replies = {}
-        self._unsolicited = set()
-        for item in coded:
-            self.replies[self.reply_code(item.name, unsolicited=False)] = item.name
-            if item.unsolicited is not None:
-                self.replies[item.unsolicited] = item.name
-                self._unsolicited.add(item.unsolicited)
-
-    def unsolicited(self, code: int | None) -> bool:
-        return code in self._unsolicited
-
-    def request_code(self, name: str) -> int:
-        return self._coded(name).code or 0
-
-    def reply_code(self, name: str, *, unsolicited: bool) -> int:
-        item = self._coded(name)
-        reply = item.code if item.reply is None else item.reply
-        return (item.unsolicited if unsolicited and item.unsolicited is not None else reply) or 0
-
-    def _coded(self, name: str) -> MessageClass:
+    def coded(self, name: str) -> MessageClass:
+        """Return a class; raise ProtocolError if the link has no code for it."""
         item = self.by_name.get(name)
         if item is None or item.code is None:
             raise ProtocolError(f"class {name!r} has no code on this link")
         return item
 
 
-@dataclass
-class ReplyFormat:
-    """The framing of the replies of a link or of one of its dialects, and the header of each kind of reply.
-
-    In a dialect, all replies to a request with the same start byte have the ID in the same place.
-    """
-
-    framing: Framing
-    headers: Mapping[ReplyKind, Header]
-
-    @cached_property
-    def starts(self) -> Mapping[int | None, list[ReplyKind]]:
-        """First byte of a header, None if any → kinds of replies to a request."""
-        found: dict[int | None, list[ReplyKind]] = {}
-        for kind, header in self.headers.items():
-            if kind is not ReplyKind.BURST:
-                start = header.fields[0].const if header.fields else None
-                found.setdefault(start, []).append(kind)
-        return found
-
-    @cached_property
-    def ids(self) -> Mapping[ReplyKind, int]:
-        """Kind → place of the ID in the header, if it has one."""
-        roles = {kind: [item.role for item in header.fields] for kind, header in self.headers.items()}
-        return {kind: found.index("id") for kind, found in roles.items() if "id" in found}
-
-    @cached_property
-    def sizes(self) -> Mapping[ReplyKind, int]:
-        """Kind → size of the header."""
-        return {kind: header.size("") for kind, header in self.headers.items()}
-
-    @cached_property
-    def coded(self) -> frozenset[ReplyKind]:
-        """Kinds whose header has an error code."""
-        return frozenset(kind for kind, header in self.headers.items() if "status" in header.roles)
-
-
 class SerialStack:
-    """The serial link of a unit.
-
-    Parameters
-    ----------
-    link
-        `[link.serial]`.
-    classes
-        Classes of the rows.
-    rows
-        Kind, sizes and answers of the rows.
-    byte_order
-        Byte order of the unit.
-    framings, checks
-        Framings, as classes, and checks defined by the unit's plugin, by name.
+    """The serial link of a unit: `[link.serial]`, with the unit's classes, rows, byte order and plugin.
 
     Attributes
     ----------
@@ -180,24 +92,19 @@ class SerialStack:
         self,
         link: SerialLinkModel,
         classes: Sequence[MessageClass] = (),
-        rows: Sequence[RowShape] = (),
+        rows: Sequence[Row] = (),
         byte_order: Order = "little",
-        *,
-        framings: Mapping[str, Callable[[], object]] | None = None,
-        checks: Mapping[str, CheckFunction] | None = None,
+        plugin: Plugin = NO_PLUGIN,
     ) -> None:
-        self.baud: Final = link.baud
         self.link: Final = link
         self.classes: Final = _Classes(classes)
         self.rows: Final = tuple(rows)
         self.byte_order: Final = byte_order
         self.dialects: Final = dialects_of(link)
-        self._plugin = framings, checks
-        self._silent = {row.id for row in rows if not row.answers}
+        self._plugin = plugin
+        self._silent = {row.id for row in rows if not self.answers(row)}
         self._rows = {(row.klass, row.id): row for row in rows}
-        self._rows_by_id: dict[int, RowShape] = {}
-        for row in rows:
-            self._rows_by_id.setdefault(row.id, row)
+        self._rows_by_id = {row.id: row for row in reversed(self.rows)}
         self._by_text = {words(row.request): row for row in rows if row.request}
         self._unknown_id = max((row.id for row in rows), default=0) + 1
         """ID of a request with an unknown text."""
@@ -205,7 +112,7 @@ class SerialStack:
         self.request_formats: Final = self._formats_of(
             "request", cubespace.REQUEST_HEADER if self.dialects else link.request_header
         )
-        self.reply_formats: Final = self._formats_of("reply", link.reply_header)
+        self.reply_formats: Final = self._formats_of("reply", () if self.dialects else link.reply_header)
         self.text_formats: Final = [
             form
             for form in self.request_formats.all
@@ -216,14 +123,14 @@ class SerialStack:
         """Format of requests without a class."""
         self.replies: Final = self.reply_formats.other
         """Format of replies without a class, and of texts."""
-        self._formats: Final = {dialect: self._dialect(dialect) for dialect in self.dialects}
-        default = default_dialect(self.dialects)
-        self._default_format: Final = self._one_format() if default is None else self._formats[default]
+        self._in_dialect: Final = {dialect: DialectReplies(dialect) for dialect in self.dialects}
         self._check_headers()
-        longest = max((max(row.request_size, row.reply_size) for row in rows), default=0)
+        headers = [self.request_header, self.reply_header]
+        headers += [head for replies in self._in_dialect.values() for head in replies.headers.values()]
+        longest = max((row.size for row in rows), default=0)
         overhead = max(
             head.size(name) + form.check.size
-            for head in (self.request_header, self.reply_header)
+            for head in headers
             for name in ("", *self.classes.by_name)
             for form in (*self.request_formats.all, *self.reply_formats.all)
         )
@@ -254,14 +161,13 @@ class SerialStack:
     def _format(
         self, name: str, models: Sequence[HeaderFieldModel], item: FormatModel | None = None
     ) -> MessageFormat:
-        framings, checks = self._plugin
         framing, check, classes = self.link.framing, self.link.check, list[str]()
         if item is not None:
             framing, check, classes = item.framing or framing, item.check or check, item.classes or []
         return MessageFormat(
-            build_framing(framing, framings),
+            build_framing(framing, self._plugin.framings),
             framing,
-            build_check(check, self.byte_order, checks),
+            build_check(check, self.byte_order, self._plugin.checks),
             models,
             self.byte_order,
             self.classes.requests if name == "request_header" else self.classes.replies,
@@ -286,26 +192,19 @@ class SerialStack:
 
     @property
     def reply_header(self) -> Header:
-        """The header of replies; of those of a dialect, that of a refusal."""
-        return self.format().headers[ReplyKind.NACK]
+        """The header of replies, except in the dialects."""
+        return self.replies.header
 
-    def _one_format(self) -> ReplyFormat:
-        headers = dict.fromkeys(set(ReplyKind) - {ReplyKind.ECHO}, self.replies.header)
-        return ReplyFormat(self.replies.framing, headers)
+    def in_dialect(self, dialect: Dialect | None) -> DialectReplies | None:
+        """Return the replies in a dialect; None if the unit has no dialects."""
+        chosen = dialect if dialect in self.dialects else default_dialect(self.dialects)
+        return None if chosen is None else self._in_dialect[chosen]
 
-    def _dialect(self, dialect: Dialect) -> ReplyFormat:
-        headers = {
-            kind: self._format(kind.value, models).header
-            for kind, models in cubespace.REPLIES[dialect].items()
-        }
-        constants = (field.const for header in headers.values() for field in header.fields)
-        starts = frozenset(constant for constant in constants if constant is not None)
-        has_id = "id" in headers[ReplyKind.TELEMETRY].roles
-        return ReplyFormat(Escaped(CUBESPACE, starts, first_is_id=has_id), headers)
-
-    def format(self, dialect: Dialect | None = None) -> ReplyFormat:
-        """Return the format of the replies."""
-        return self._default_format if dialect is None else self._formats.get(dialect, self._default_format)
+    def answers(self, row: Row) -> tuple[str, ...]:
+        """Return the answers of a row on the line, of which there may be fewer than on other links."""
+        framing = self.link.framing
+        silent = isinstance(framing, CubeSpaceFraming) and row.name in framing.unanswered
+        return () if silent else row.answers
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
@@ -335,7 +234,7 @@ class SerialStack:
             if role in header.roles:
                 raise IcdError(f"link.serial.{other}_header: role {role} belongs to the other direction")
 
-    def row(self, klass: str, row_id: int) -> RowShape | None:
+    def row(self, klass: str, row_id: int) -> Row | None:
         """Return the row of a message; the class matters only if the link carries one."""
         if "class" in self.request_header.roles:
             return self._rows.get((klass, row_id))
@@ -343,7 +242,8 @@ class SerialStack:
 
     def supports_unsolicited(self, dialect: Dialect | None = None) -> bool:
         """Return whether this dialect has unsolicited telemetry."""
-        return ReplyKind.UNSOLICITED in self.format(dialect).headers
+        replies = self.in_dialect(dialect)
+        return replies is None or ReplyKind.UNSOLICITED in replies.headers
 
     def counts(self, kind: ReplyKind) -> bool:
         """Return whether the device numbers messages of this kind itself."""
@@ -361,7 +261,7 @@ class SerialStack:
 
     def host(self, dialect: Dialect | None = None) -> HostReceiver:
         """Return a receiver for the OBC's end."""
-        return HostReceiver(self, self.format(dialect))
+        return HostReceiver(self, self.in_dialect(dialect))
 
     def encode_request(self, request: Request) -> bytes:
         """Return a request as bytes on the line.
@@ -385,7 +285,7 @@ class SerialStack:
         if request.flags:
             values["flags"] = request.flags
         if "class" in self.request_header.roles:
-            values["class"] = self.classes.request_code(request.klass)
+            values["class"] = self.classes.coded(request.klass).code or 0
         return form.close(form.header.pack(values, request.klass, len(request.data)), request.data)
 
     def encode_reply(self, reply: Reply, dialect: Dialect | None = None) -> bytes:
@@ -393,12 +293,12 @@ class SerialStack:
 
         Raises ProtocolError for a kind of reply that the dialect does not have.
         """
-        form = self.format(dialect)
-        header = form.headers.get(reply.kind)
-        if header is None:
-            if self.dialects:
-                chosen = dialect if dialect in self.dialects else default_dialect(self.dialects)
-                raise ProtocolError(_no_such_reply(reply.kind, chosen))
+        refused = reply.kind is ReplyKind.NACK
+        in_dialect = self.in_dialect(dialect)
+        if in_dialect is not None:
+            silent = reply.id in self._silent and (refused or reply.kind is ReplyKind.ACK)
+            return b"" if silent else in_dialect.encode(reply)
+        if reply.kind is ReplyKind.ECHO:
             echo = Request(
                 RequestKind.TELECOMMAND, reply.id or 0, reply.data, reply.destination, reply.klass, reply.sequence,
                 reply.flags,
@@ -407,10 +307,7 @@ class SerialStack:
         text = self.texts.encode(reply)
         if text is not None:
             return self.replies.framing.encode(self.replies.close(b"", text))
-        refused = reply.kind is ReplyKind.NACK
-        accepted = reply.kind is ReplyKind.ACK
-        if self.dialects and (refused or accepted) and reply.id in self._silent:
-            return b""
+        header = self.reply_header
         if refused and not header.roles_in(reply.klass) & {"status", "ack"}:
             return b""
         values = {
@@ -428,14 +325,12 @@ class SerialStack:
         if "time" in header.roles:
             values["time"] = reply.time_ns // header.count_ns("time")
         if "class" in header.roles:
-            values["class"] = self.classes.reply_code(
-                reply.klass, unsolicited=reply.kind is ReplyKind.UNSOLICITED
-            )
-        data = b"" if refused or (self.dialects and accepted) else reply.data
-        if self.dialects:
-            return form.framing.encode(header.pack(values, reply.klass, len(data)) + data)
-        own = self.reply_formats.of(reply.klass)
-        return own.framing.encode(own.close(own.header.pack(values, reply.klass, len(data)), data))
+            item = self.classes.coded(reply.klass)
+            unsolicited = reply.kind is ReplyKind.UNSOLICITED
+            values["class"] = (item.unsolicited_code if unsolicited else item.reply_code) or 0
+        data = b"" if refused else reply.data
+        form = self.reply_formats.of(reply.klass)
+        return form.framing.encode(form.close(form.header.pack(values, reply.klass, len(data)), data))
 
     def _request_of(self, form: MessageFormat, body: bytes) -> Request | LinkFault:
         if form in self.text_formats:
@@ -445,7 +340,7 @@ class SerialStack:
             row = self._by_text.get(words(text.decode("latin-1")))
             if row is None:
                 return Request(RequestKind.TELECOMMAND, self._unknown_id)
-            return Request(row.kind, row.id, klass=row.klass)
+            return Request(RequestKind(row.kind), row.id, klass=row.klass)
         opened = form.open(body)
         if isinstance(opened, LinkFault):
             return opened
@@ -471,7 +366,7 @@ class SerialStack:
             return RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
         item = self.classes.by_name.get(klass)
         row = self.row(klass, row_id)
-        return item.kind if item is not None else row.kind if row is not None else None
+        return item.kind if item is not None else RequestKind(row.kind) if row is not None else None
 
     def _request_size(self, form: MessageFormat, body: bytes) -> int | None:
         """Return the size of a request that begins with these bytes, or None if more are needed."""
@@ -493,17 +388,20 @@ class HostReceiver:
     verified and consumed. For a telecommand without another answer it is reported as the ACK.
     """
 
-    def __init__(self, stack: SerialStack, replies: ReplyFormat) -> None:
+    def __init__(self, stack: SerialStack, in_dialect: DialectReplies | None) -> None:
         self._stack = stack
-        self._format = replies
+        self._in_dialect = in_dialect
         limits = stack.max_size, stack.link.timeout
         self._deframer: Deframer[Reply] = (
-            replies.framing.deframer(Receiving(self._reply_in_dialect, lambda _body: None, *limits))
-            if stack.dialects
-            else stack.reply_formats.deframer(self._reply_of, self._size, *limits)
+            stack.reply_formats.deframer(self._reply_of, self._size, *limits)
+            if in_dialect is None
+            else in_dialect.framing.deframer(
+                Receiving(partial(self._reply_in_dialect, in_dialect), lambda _body: None, *limits)
+            )
         )
         self._pending: Request | None = None
-        self._reply_size: int | None = None
+        self._reply_size = 0
+        """Bytes of data in the telemetry that answers the pending request."""
         self._echo: bytes | None = None
         self._only_echo = False
 
@@ -520,12 +418,12 @@ class HostReceiver:
         """Abandon an incomplete message after a silence of the timeout."""
         return self._deframer.flush(now)
 
-    def expect(self, request: Request, reply_size: int) -> None:
-        """Set the next request, and the data size of its telemetry in bytes (0 for a telecommand)."""
+    def expect(self, request: Request) -> None:
+        """Set the next request."""
         row = self._stack.row(request.klass, request.id)
-        answers = row.answers if row is not None else ("reply",)
+        answers = self._stack.answers(row) if row is not None else ("reply",)
         self._pending = request
-        self._reply_size = reply_size
+        self._reply_size = row.reply_size if row is not None else 0
         self._echo = self._stack.request_body(request) if "echo" in answers else None
         self._only_echo = "reply" not in answers
 
@@ -549,7 +447,7 @@ class HostReceiver:
         row = self._stack.row(envelope.klass, values["id"]) if "id" in values else None
         if row is not None:
             return row.reply_size
-        if self._awaited(form) is None or self._reply_size is None:
+        if self._awaited(form) is None:
             raise HeaderError("reply without a request")
         return self._reply_size
 
@@ -614,63 +512,16 @@ class HostReceiver:
         values, stack = envelope.values, self._stack
         if values.get("status", 0) or not values.get("ack", 1):
             return ReplyKind.NACK
-        if stack.classes.unsolicited(values.get("class")):
+        if values.get("class") in stack.classes.unsolicited:
             return ReplyKind.UNSOLICITED
         telecommand = stack.kind_of(row_id, klass) is RequestKind.TELECOMMAND
         return ReplyKind.ACK if telecommand else ReplyKind.TELEMETRY
 
-    def _reply_in_dialect(self, body: bytes) -> Reply | LinkFault:
-        """Return the reply in a body, whose kind follows from its start byte, row and size."""
-        form, pending = self._format, self._pending
-        if len(body) == form.sizes[ReplyKind.BURST] + cubespace.BURST_SIZE and self._is_burst(body):
-            return Reply(ReplyKind.BURST, BURST_ID, body[form.sizes[ReplyKind.BURST] :])
-        kinds = form.starts.get(body[0]) or form.starts.get(None)
-        if kinds is None:
-            text = f"message {body[1]} with the start byte of a request"
-            return LinkFault(FaultKind.UART_PROTOCOL, text)
-        known = pending is not None
-        if kinds[0] in form.ids:
-            row_id = body[form.ids[kinds[0]]]
-            known = pending is not None and pending.id == row_id
-        elif pending is not None:
-            row_id = pending.id
-        else:
-            return LinkFault(FaultKind.UART_PROTOCOL, f"reply of {len(body)} bytes without a request")
-        if ReplyKind.ACK not in kinds:
-            (kind,) = kinds  # given by the start byte
-        elif row_id < FIRST_TELEMETRY_ID:
-            kind = ReplyKind.ACK
-        else:
-            coded = ReplyKind.NACK in kinds and len(body) == form.sizes[ReplyKind.NACK]
-            kind = ReplyKind.NACK if coded and known and self._reply_size != 1 else ReplyKind.TELEMETRY
-        data = body[form.sizes[kind] :]
-        code: ErrorCode | int = ErrorCode.OK
-        if kind in form.coded:
-            codes = len(body) - form.sizes[kind] + 1
-            if codes != 1:
-                name = "ACK of telecommand" if kind is ReplyKind.ACK else "NACK of"
-                return LinkFault(FaultKind.UART_PROTOCOL, f"{name} {row_id} has {codes} bytes, must be 1")
-            code = error_code(body[-1])
-            kind = ReplyKind.NACK if code else kind
-        if kind not in (ReplyKind.UNSOLICITED, ReplyKind.EVENT):
+    def _reply_in_dialect(self, in_dialect: DialectReplies, body: bytes) -> Reply | LinkFault:
+        reply = in_dialect.decode(body, self._pending, self._reply_size)
+        if isinstance(reply, Reply) and reply.kind in (ReplyKind.ACK, ReplyKind.NACK, ReplyKind.TELEMETRY):
             self._pending = None
-        return Reply(kind, row_id, data, code, klass=pending.klass if known and pending is not None else "")
-
-    def _is_burst(self, body: bytes) -> bool:
-        """Return whether a body with the size of a burst packet is one."""
-        form, pending = self._format, self._pending
-        start = form.headers[ReplyKind.BURST].fields[0].const
-        if start not in (None, body[0]) or body[form.ids[ReplyKind.BURST]] != BURST_ID:
-            return False
-        if ReplyKind.TELEMETRY in form.ids or pending is None:
-            return True
-        return pending.kind is RequestKind.TELECOMMAND or self._reply_size != len(body)
-
-
-def _no_such_reply(kind: ReplyKind, dialect: Dialect | None) -> str:
-    others = [other for other, replies in cubespace.REPLIES.items() if kind in replies]
-    remedy = f"; use dialect {' or '.join(others)}" if others else ""
-    return f"serial dialect {dialect} has no {kind.value} messages{remedy}"
+        return reply
 
 
 def dialects_of(link: SerialLinkModel | None) -> tuple[Dialect, ...]:
@@ -705,13 +556,6 @@ def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | No
     return default_dialect(dialects) if wanted is None else Dialect(wanted)
 
 
-def serial_answers(icd: InterfaceDefinition, row: Row) -> tuple[str, ...]:
-    """Return the answers of a row on the serial line, of which there may be fewer than on other links."""
-    framing = None if icd.link.serial is None else icd.link.serial.framing
-    silent = isinstance(framing, CubeSpaceFraming) and row.name in framing.unanswered
-    return () if silent else row.answers
-
-
 def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
     """Return the serial link of a definition.
 
@@ -720,23 +564,4 @@ def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:
     link = icd.link.serial
     if link is None:
         raise IcdError(f"unit {icd.name}: has no serial link")
-    shapes = [
-        RowShape(
-            row.klass,
-            row.id,
-            RequestKind(row.kind),
-            row.size if row.kind == "telecommand" else 0,
-            row.size if row.kind == "telemetry" else 0,
-            serial_answers(icd, row),
-            row.request,
-        )
-        for row in icd.rows
-    ]
-    return SerialStack(
-        link,
-        icd.classes,
-        shapes,
-        icd.conventions.byte_order,
-        framings=icd.plugin.framings,
-        checks=icd.plugin.checks,
-    )
+    return SerialStack(link, icd.classes, tuple(icd.rows), icd.conventions.byte_order, icd.plugin)

@@ -16,7 +16,7 @@ from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
 from starhil.protocol.plugin import guarded
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect, serial_answers
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect
 from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
@@ -56,7 +56,7 @@ def exchanges(icd: InterfaceDefinition) -> Iterator[Exchange]:
 def _on_serial(
     icd: InterfaceDefinition, stack: SerialStack, row: Row, values: Mapping[str, Value]
 ) -> Exchange:
-    request, replies = _messages(icd, row, values, serial_answers(icd, row))
+    request, replies = _messages(icd, row, values, stack.answers(row))
     _check_framing(stack, row, request)
     dialect = chosen_dialect(icd, None)
     link = "serial" if dialect is None else f"serial, dialect {dialect}"
@@ -91,13 +91,14 @@ def examine(
     name_or_folder: str | Path, *, run_plugin: bool = True
 ) -> tuple[InterfaceDefinition, list[str], list[Exchange]]:
     """Return what is valid of a unit, all errors, and if there are none an exchange of each row on each link."""
-    definition, errors = read_definition(find_unit(name_or_folder), run_plugin=run_plugin)
+    path = find_unit(name_or_folder)
+    definition, errors = read_definition(path, run_plugin=run_plugin)
     errors += unbound(definition)
     for row in definition.rows:
         try:
             row.encode(row.example(), saturate=row.kind == "telemetry")
         except ProtocolError as error:
-            errors.append(f"unit {definition.name}: {row.kind} {row.name}: example: {error}")
+            errors.append(f"{definition.files[row.name]}: {row.kind} {row.name}: example: {error}")
     examples: list[Exchange] = []
     if not errors:
         try:
@@ -105,7 +106,7 @@ def examine(
                 build_dictionary(definition)
             examples += exchanges(definition)
         except ProtocolError as error:
-            errors.append(f"unit {definition.name}: {error}")
+            errors.append(f"{path}: {error}")
     return definition, errors, examples
 
 

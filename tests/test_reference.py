@@ -23,6 +23,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 WHOLE_ACTIONS = {
+    "control": "control = 'fault'",
     "command": 'command = "reset"',
     "read": 'read = "identification"',
     "listen": 'listen = "quaternion"',
@@ -83,7 +84,8 @@ def keys_accepted(folder: Path, script: str) -> set[str]:
     path.write_text(script, encoding="utf-8")
     with pytest.raises(ScriptError, match="unknown key 'no_such_key'") as rejection:
         load_script(path, load_unit())
-    return set(re.search(r"\(known here: (.*)\)", str(rejection.value))[1].split(", "))
+    (found,) = (text for text in rejection.value.args if "no_such_key" in text)
+    return set(found.partition("; known: ")[2].split(", "))
 
 
 def rows_under(heading: str) -> list[list[str]]:

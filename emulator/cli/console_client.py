@@ -57,9 +57,7 @@ class ConsoleClient:
         request = self._port.icd.request(row, data)
         begin = time.perf_counter()
         try:
-            reply, latency = await self._client.transact(
-                request, row.name, 0 if row.kind == "telecommand" else row.size
-            )
+            reply, latency = await self._client.transact(request, row.name)
         except NackError as error:
             return Exchange(error.code_name, str(error), time.perf_counter() - begin, refused=True)
         except NoReplyError as error:

@@ -40,7 +40,6 @@ def command(
     the exit status is 128 plus the signal's number.
     """
     from starhil.hil_tests.bench import LinkOptions
-    from starhil.hil_tests.errors import ScriptError
     from starhil.hil_tests.interruption import interruptible
     from starhil.hil_tests.session_run import SessionRequest, run_session
 
@@ -60,14 +59,8 @@ def command(
         quiet=as_json,
         view=bench.view,
     )
-    try:
-        with interruptible():
-            result = run_session(request)
-    except ScriptError as error:  # one line for each error of the script
-        *others, last = str(error).splitlines()
-        for line in others:
-            print(f"starhil: {line}", file=sys.stderr)
-        raise ScriptError(last) from None
+    with interruptible():
+        result = run_session(request)
     if as_json:
         json.dump(result.to_json(), sys.stdout)
         print()

@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.config import AttitudeConfig
-from starhil.emulator.validation_messages import explain
+from starhil.protocol.validation_messages import problems
 from starid.attitude import Attitude
 from starid.catalog import load_catalog
 from starid.star_names import STAR_NAMES
@@ -84,7 +84,7 @@ def _target(to: dict[str, Any], here: Attitude, catalog_path: str | None, epoch:
     try:
         return AttitudeConfig.model_validate(target).build()
     except ValidationError as error:
-        raise EmulatorError(explain(error, AttitudeConfig)) from None
+        raise EmulatorError(*map(str, problems(error, AttitudeConfig, target))) from None
 
 
 def find_star(text: str, catalog_path: str | None, epoch: float) -> tuple[float, float]:

@@ -40,9 +40,10 @@ from starhil.emulator.run import Run
 from starhil.emulator.truth.config import TruthConfig
 from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
-from starhil.emulator.validation_messages import explain
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
+from starhil.protocol.names import did_you_mean, remedy
+from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.control")
@@ -162,7 +163,8 @@ class ControlServer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
         wanted = str(request.pop("do", ""))
         if wanted not in self._actions:
-            return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+            near = did_you_mean(wanted, self._actions)
+            return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}{near}"}
         action, known = self._actions[wanted]
         try:
             head = self._head(request)
@@ -303,13 +305,13 @@ def _parse(model: type[Model], value: object) -> Model:
     try:
         return model.model_validate_json(json.dumps(value))
     except ValidationError as error:
-        raise EmulatorError(explain(error, model)) from None
+        raise EmulatorError(*map(str, problems(error, model, value))) from None
 
 
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:
     for key in request:
         if key not in known:
-            raise EmulatorError(f"unknown key {key!r}; known: {', '.join(known) or 'none'}")
+            raise EmulatorError(f"unknown key {key!r}{remedy(key, known)}")
 
 
 def _number(request: dict[str, Any], key: str, default: float | None = None) -> float:

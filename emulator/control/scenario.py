@@ -32,7 +32,7 @@ from starhil.emulator.head import Head
 from starhil.emulator.toml_file import find_toml, read_toml
 from starhil.emulator.truth.config import FeedConfig, Strict, TruthConfig
 from starhil.emulator.truth.truth import Truth
-from starhil.emulator.validation_messages import explain
+from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
 log = logging.getLogger("starhil.scenario")
@@ -108,4 +108,5 @@ def load_scenario(name_or_path: str) -> Scenario:
     try:
         return Scenario.model_validate(values)
     except ValidationError as error:
-        raise EmulatorError(f"scenario {path}: {explain(error, Scenario)}") from None
+        found = problems(error, Scenario, values)
+        raise EmulatorError(*(f"scenario {path}: {problem}" for problem in found)) from None

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal, get_args, get_origin, get_type_hints
@@ -18,6 +18,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import CatalogUpset
+from starhil.protocol.names import remedy
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -52,7 +53,7 @@ class StarIdentifierSetup:
     def make(self, catalog: StarCatalog) -> StarIdentifier:
         """Make the star identifier, which takes seconds if its index is not cached on disk."""
         options = dict(self.options)
-        self._check_options(options)
+        check_options(self.algorithm, options)
         if self.algorithm != "geometric":
             return make_identifier(self.algorithm, self.camera, catalog, **options)
         from starid.geometric.identifier import Effort, Identifier
@@ -64,20 +65,20 @@ class StarIdentifierSetup:
             identifier = _with_upset(identifier, upset)
         return identifier
 
-    def _check_options(self, options: dict[str, Any]) -> None:
-        """Reject an option that the algorithm does not have, or a value of the wrong type."""
-        module, name = ALGORITHMS[self.algorithm]
-        known = _known_options(getattr(importlib.import_module(module), name))
-        for option, value in options.items():
-            if option not in known:
-                raise EmulatorError(
-                    f"identifier.{option}: not an option of the algorithm {self.algorithm}; known: {', '.join(sorted(known))}"
-                )
-            allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
-            if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
-                raise EmulatorError(
-                    f"identifier.{option}: must be {known[option].removesuffix(' | None')}, not {value!r}"
-                )
+
+def check_options(algorithm: str, options: Mapping[str, Any]) -> None:
+    """Reject an option that an algorithm does not have, or a value of the wrong type."""
+    module, name = ALGORITHMS[algorithm]
+    known = _known_options(getattr(importlib.import_module(module), name))
+    for option, value in options.items():
+        if option not in known:
+            hint = remedy(option, known)
+            raise EmulatorError(f"identifier.{option}: not an option of the algorithm {algorithm}{hint}")
+        allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
+        if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):
+            raise EmulatorError(
+                f"identifier.{option}: must be {known[option].removesuffix(' | None')}, not {value!r}"
+            )
 
 
 def _with_upset(identifier: Identifier, upset: CatalogUpset) -> Identifier:

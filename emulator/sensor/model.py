@@ -10,6 +10,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.noise import Digitizer
+from starhil.protocol.names import remedy
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
@@ -104,21 +105,21 @@ class SensorModel:
 
     def __post_init__(self) -> None:
         if self.bits not in _BITS or isinstance(self.bits, bool):
-            raise EmulatorError(f"sensor bits: must be 8, 12 or 16, not {self.bits!r}")
+            raise EmulatorError(f"sensor.bits: must be 8, 12 or 16, not {self.bits!r}")
         for name, (low, high, unit) in _LIMITS.items():
             value = getattr(self, name)
             whole = isinstance(low, int)
             if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
                 kind = "a whole number" if whole else "a number"
-                raise EmulatorError(f"sensor {name}: must be {kind} ({unit}), not {value!r}")
+                raise EmulatorError(f"sensor.{name}: must be {kind} ({unit}), not {value!r}")
             if not low <= value <= high:
-                raise EmulatorError(f"sensor {name}: must be {low:g}…{high:g} ({unit}), not {value!r}")
+                raise EmulatorError(f"sensor.{name}: must be {low:g}…{high:g} ({unit}), not {value!r}")
 
     def with_(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; an unknown name is an error."""
-        unknown = sorted(changes.keys() - {each.name for each in fields(self)})
-        if unknown:
-            raise EmulatorError(f"sensor {unknown[0]}: no such field of the sensor model")
+        known = {each.name for each in fields(self)}
+        for unknown in sorted(changes.keys() - known):
+            raise EmulatorError(f"sensor.{unknown}: unknown key{remedy(unknown, known)}")
         return replace(self, **changes)
 
     @property

@@ -16,7 +16,7 @@ from starhil.hil_tests.endurance.node import Node
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort, objects_of
 from starhil.hil_tests.endurance.unit import Unit
-from starhil.hil_tests.endurance.violation import Violation, flag
+from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.messages import Answer, Request
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
@@ -368,7 +368,7 @@ class Obc:
         if not replies:
             raise Violation(f"{link}: {row.name}: no answer after all faults have ended")
         self._oracle.read(row, replies[-1].data)
-        if not flag(self._judged.telemetry[row.name].decode(replies[-1].data)[field]):
+        if not self._judged.telemetry[row.name].decode(replies[-1].data)[field]:
             raise Violation(f"{row.name}: no valid attitude {recovery_s:g} s after the last fault has ended")
 
 

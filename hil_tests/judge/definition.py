@@ -103,6 +103,22 @@ class Unit:
         """Return the answers of a row on the serial line."""
         return () if row.name in self.unanswered else row.answers
 
+    @cached_property
+    def reported_data(self) -> tuple[tuple[Row, Row, slice], ...]:
+        """Each telecommand whose last data telemetry reports, the row that does, and which of its bytes they are."""
+        found = []
+        for row in self.telemetry.values():
+            firsts = {
+                item.telecommand: item
+                for item in tuple(row.named.values())[::-1]
+                if item.telecommand is not None
+            }
+            for name, first in firsts.items():
+                command = self.telecommands[name]
+                start = first.offset - command.named[first.name].offset
+                found.append((command, row, slice(start, start + command.size)))
+        return tuple(found)
+
     def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""
         if isinstance(row, int):

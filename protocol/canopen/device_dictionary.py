@@ -427,8 +427,8 @@ def _narrowed(reading: Reading, packed: PackedField, slot: Slot, data: bytes) ->
         raw = int.from_bytes(data[span_of(slot)], slot.order)
     else:
         value = reading.row.decode(data)[field.name]
-        if isinstance(value, str) and field.enum is not None:
-            value = field.enum.values[value]
+        if isinstance(value, str | bool) and field.enum is not None:
+            value = field.enum.number(value, packed.source)
         if not isinstance(value, int | float):
             raise SdoAbortError(AbortCode.GENERAL, f"{packed.source}: {value!r} is not a number")
         raw = round(value / packed.scale)

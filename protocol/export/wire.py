@@ -23,7 +23,7 @@ from starhil.protocol.link_schema import (
 )
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
-from starhil.protocol.serial_stack import SerialStack, serial_answers
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import Section
 
 _TELEMETRY: Final = 0x80
@@ -104,11 +104,10 @@ def _classes(icd: InterfaceDefinition) -> Section:
     def code(number: int | None) -> str:
         return "" if number is None else f"{number:02X}h"
 
-    rows = []
-    for item in icd.classes:
-        reply = item.code if item.reply is None else item.reply
-        unsolicited = reply if item.unsolicited is None else item.unsolicited
-        rows.append((item.name, item.kind.value, code(item.code), code(reply), code(unsolicited)))
+    rows = (
+        (item.name, item.kind.value, code(item.code), code(item.reply_code), code(item.unsolicited_code))
+        for item in icd.classes
+    )
     return _section("classes", rows)
 
 
@@ -226,7 +225,7 @@ def _serial(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
     )
     request = _format_message(stack.encode_request(Request.of(_TELECOMMAND, data)))
     rows = sorted(icd.telecommands_by_id.values(), key=lambda row: row.id)
-    silent = " or ".join(f"`{row.name}` ({row.id})" for row in rows if not serial_answers(icd, row))
+    silent = " or ".join(f"`{row.name}` ({row.id})" for row in rows if not stack.answers(row))
     return _section(
         "cubespace",
         ((dialect.value, *(_reply(stack, reply, dialect) for reply in kinds)) for dialect in Dialect),
@@ -236,7 +235,8 @@ def _serial(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
 
 
 def _reply(stack: SerialStack, reply: Reply, dialect: Dialect) -> str:
-    if reply.kind not in stack.format(dialect).headers:
+    in_dialect = stack.in_dialect(dialect)
+    if in_dialect is None or reply.kind not in in_dialect.headers:
         return "none"
     return _format_message(stack.encode_reply(reply, dialect))
 

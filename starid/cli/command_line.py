@@ -196,7 +196,7 @@ def run(
     words
         Arguments of the program.
     errors
-        Errors whose text is already one line for the user.
+        Errors whose arguments are problems, each one line for the user.
     """
     show_every_character()
     try:
@@ -204,27 +204,28 @@ def run(
             args=list(words), prog_name=program, standalone_mode=False
         )
     except errors as error:
-        exit_for_bad_input(str(error), program)
+        exit_for_bad_input(program, *map(str, error.args))
     except ModuleNotFoundError as error:
         if error.name not in LAB_PACKAGES:
             raise
-        exit_for_bad_input(f"{error.name} is not installed; run: pip install 'starhil[lab]'", program)
+        exit_for_bad_input(program, f"{error.name} is not installed; run: pip install 'starhil[lab]'")
     except OSError as error:
-        exit_for_bad_input(describe_os_error(error), program)
+        exit_for_bad_input(program, describe_os_error(error))
     except MemoryError as error:
-        exit_for_bad_input(f"not enough memory: {error}" if str(error) else "not enough memory", program)
+        exit_for_bad_input(program, f"not enough memory: {error}" if str(error) else "not enough memory")
     except (KeyboardInterrupt, typer.Abort):
         raise SystemExit(EXIT_INTERRUPTED) from None
     except USAGE_ERROR as error:
         if type(error).__name__ == "NoArgsIsHelpError":  # the help has been printed already
             raise SystemExit(EXIT_BAD_INPUT) from None
-        exit_for_bad_input(describe_usage_error(error, program), program)
+        exit_for_bad_input(program, describe_usage_error(error, program))
     raise SystemExit(status if isinstance(status, int) else 0)
 
 
-def exit_for_bad_input(why: str, program: str) -> NoReturn:
-    """Print one line on stderr, with the characters escaped that could control a terminal, and exit."""
-    line = " ".join(why.split())
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
-    print(f"{program}: {shown}", file=sys.stderr)
+def exit_for_bad_input(program: str, *problems: str) -> NoReturn:
+    """Print a line for each problem on stderr, with the characters escaped that could control a terminal, and exit."""
+    for problem in problems:
+        line = " ".join(problem.split())
+        shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+        print(f"{program}: {shown}", file=sys.stderr)
     raise SystemExit(EXIT_BAD_INPUT) from None

@@ -5,14 +5,13 @@ import numpy as np
 import pytest
 
 from starhil.emulator.control.scenario import Scenario
-from starhil.emulator.device.device import profile_defaults
-from starhil.emulator.device.parameters import Parameters
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.faults import DeviceFault, FaultRequest
+from starhil.emulator.links.wire_faults import WireFault
 from starhil.emulator.pipeline_setup import pipeline_setup
-from starhil.emulator.profile import CALIBRATION, Profile, load_profile
+from starhil.emulator.profile import CALIBRATION, OF_FAULTS, Profile, load_profile
 from starhil.emulator.sky.view import Sky
 from starhil.emulator.truth.config import SlewConfig
-from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled
 from starid.camera import Camera
 
@@ -164,7 +163,7 @@ def test_overrides_are_toml_or_text():
         ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean seed?"),
         ("[rum]\nseed = 1\n", "rum: unknown key; did you mean run?"),
         ("[run]\nseed = -1\n", "run.seed: must be at least 0 (given: -1)"),
-        ("[run]\nseed = '1'\n", "run.seed: must be a valid integer (given: '1')"),
+        ("[run]\nseed = '1'\n", "run.seed: must be a whole number (given: '1')"),
         ("[links.can]\naddress = 255\n", "links.can.address"),
         ("[truth]\nkind = 'wobble'\n", "truth.kind: must be one of 'fixed', 'rate'"),
         ("[truth]\nrate_deg_s = [0, 0, 1]\n", "truth.kind: must be one of '42', 'file', 'fixed'"),
@@ -192,6 +191,48 @@ def test_a_bad_profile_is_named_with_file_key_and_remedy(tmp_path, text, said):
     message = refusal(path)
     assert said in message
     assert path in message
+
+
+def test_all_errors_of_a_profile_are_listed_each_with_its_source_key_and_remedy(tmp_path):
+    base = write(
+        tmp_path, "[sky]\nfals_stars = 4\nmon = 3\n[run]\nsede = 1\n[parameters]\nk11 = 1.0\n", "base.toml"
+    )
+    path = write(
+        tmp_path,
+        'extends = "base.toml"\n[camera]\nfov_deg = 400\nwidht = 5\n[sensor]\nread_nois = 4.0\nbits = 9\n'
+        '[identifier]\nfoo = 3\n[optical]\nblocked_share = 1.0\n[device]\nstuck = true\n[health]\nt = "x"\n',
+    )
+    with pytest.raises(EmulatorError) as caught:
+        load_profile(
+            path, ["run.clok=x", "parameters.exposure=0", "parameters.update_rat=5", "links.can.drop=1"]
+        )
+    fault = "unknown key; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
+    assert sorted(caught.value.args) == sorted(
+        [
+            f"profile {base}: run.sede: unknown key; did you mean seed?",
+            f"profile {base}: sky: unknown key 'fals_stars'; did you mean false_stars, fixed_false_stars, false_star_magnitudes?",
+            f"profile {base}: sky: unknown key 'mon'; did you mean moon?",
+            f"profile {path}: camera.fov_deg: must be at most 120 (given: 400)",
+            f"profile {path}: camera.widht: unknown key; did you mean width?",
+            f"profile {path}: sensor.read_nois: unknown key; did you mean read_noise_e, dead_pixels?",
+            f"profile {path}: sensor.bits: must be 8, 12 or 16, not 9",
+            f"profile {path}: identifier.foo: not an option of the algorithm geometric; known: blend_px, cache, fov_tolerance, limiting_magnitude",
+            f"profile {path}: optical: {fault}",
+            f"profile {path}: device.stuck: {fault}",
+            f"profile {path}: health.t: must be a number (given: 'x')",
+            "--set run.clok=x: run.clok: unknown key; did you mean clock?",
+            "--set parameters.exposure=0: parameters.exposure: 0 is outside 1 to 5000 ms",
+            "--set parameters.update_rat=5: parameters.update_rat: unknown key; did you mean update_rate, max_rate?",
+            f"--set links.can.drop=1: links.can.drop: {fault}",
+            f"profile {base}: parameters.k11: unknown key; did you mean k1?",
+        ]
+    )
+
+
+def test_the_hint_for_faults_is_given_for_every_key_of_a_fault_and_no_key_of_a_profile():
+    levels = FaultRequest.model_fields.keys()
+    keys = {*levels, *DeviceFault.model_fields, *WireFault.model_fields}
+    assert keys - {"device"} == OF_FAULTS.keys() - {"fault", "faults"}
 
 
 def test_a_profile_that_extends_itself_is_rejected(tmp_path):
@@ -245,16 +286,12 @@ def test_an_impossible_value_is_named_with_its_bound(override):
 @pytest.mark.parametrize(
     ("override", "why"),
     [
-        ("parameters.exposur=1", "parameters: no parameter named 'exposur'"),
+        ("parameters.exposur=1", "parameters.exposur: unknown key; did you mean exposure?"),
         ("parameters.exposure=99999", "parameters.exposure: 99999 is outside"),
     ],
 )
 def test_an_impossible_parameter_is_named_with_its_option(override, why):
-    """Parameters are compared with the definition of the unit, after the profile has been read."""
-    profile = load_profile("cubestar", ["parameters.update_rate=2", override])
-    with pytest.raises(EmulatorError) as caught:
-        Parameters(load_unit(), profile_defaults(profile, load_unit()), lambda _changes: None)
-    assert f"{profile.source_of(caught.value)}: {caught.value}".startswith(f"--set {override}: {why}")
+    assert refusal("cubestar", ["parameters.update_rate=2", override]).startswith(f"--set {override}: {why}")
     with pytest.raises(
         EmulatorError, match=r"^--set parameters.serial_baud=5: parameters.serial_baud: set links"
     ):

@@ -383,6 +383,15 @@ def test_a_damaged_line_is_named(recorded, line):
     assert "\n" not in str(caught.value)
 
 
+def test_a_time_before_that_of_the_entry_above_is_damage(recorded):
+    with_line(recorded, '{"ns": 999000000000, "do": "out", "link": "serial", "data": "00"}')
+    with pytest.raises(EmulatorError) as caught:
+        report_of(recorded)
+    where = f"replay {recorded / EVENTS_FILE}: line 5: time "
+    assert str(caught.value).startswith(where)
+    assert "ns is before that of the entry above, 999000000000 ns" in str(caught.value)
+
+
 DAMAGED_FILES = {
     "run: nested too deeply": (RUN_FILE, b"[" * 100_000),
     "run: no UTF-8": (RUN_FILE, b"\xff"),

@@ -20,7 +20,7 @@ from starhil.protocol.messages import Request
 from starhil.protocol.serial_interface import Dialect
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
-from tests.protocol.composed_links import CUBESPACE
+from tests.protocol.composed_links import CUBESPACE, CUBESTAR
 
 pytestmark = pytest.mark.process
 
@@ -68,8 +68,8 @@ class Emulator:
     def ask(self, identifier: int, data: bytes = b""):
         """Send a request in dialect a; return raw bytes and the reply."""
         request = Request.of(identifier, data)
-        host = CUBESPACE.host(Dialect.A)
-        host.expect(request, ICD.row_by_id(identifier).size if identifier >= 128 else 0)
+        host = CUBESTAR.host(Dialect.A)
+        host.expect(request)
         os.write(self.fd, CUBESPACE.encode_request(request))
         raw, replies = b"", []
         while not replies:

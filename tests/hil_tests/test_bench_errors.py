@@ -222,15 +222,15 @@ def test_only_the_response_of_its_node_continues_a_transfer_which_a_time_out_abo
     link.reset_receiver()
     assert sent == []
     with pytest.raises(BenchError, match=f"request {unknown} is not in the object dictionary"):
-        link.request(Request(RequestKind.TELEMETRY, unknown), 0)
-    link.request(Request(RequestKind.TELEMETRY, row.id), row.size)
+        link.request(Request(RequestKind.TELEMETRY, unknown))
+    link.request(Request(RequestKind.TELEMETRY, row.id))
     response = bytes.fromhex("4f0020") + bytes((row.id, 5, 0, 0, 0))
     for foreign in (CanFrame(0x581, response, extended=False), CanFrame(0x5AC, response, extended=True)):
         assert link.feed(foreign, 0.0) == []
     assert link.busy
     (reply,) = link.feed(CanFrame(0x5AC, response, extended=False), 0.0)
     assert (reply.kind, reply.data, link.busy) == (ReplyKind.TELEMETRY, b"\5", False)
-    link.request(Request(RequestKind.TELEMETRY, row.id), row.size)
+    link.request(Request(RequestKind.TELEMETRY, row.id))
     link.reset_receiver()
     assert sent[-1] == (0x62C, "8000000000000405")
     assert not link.busy

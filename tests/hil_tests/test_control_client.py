@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
-import socket
+import socketserver
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
@@ -17,56 +19,54 @@ from starhil.protocol.conventions import Conventions
 Answer = Callable[[dict], dict | None]
 
 
-class Channel:
-    """A control channel whose requests a function answers; None closes it."""
-
-    def __init__(self, server: socket.socket, answer: Answer) -> None:
-        self.asked: list[dict] = []
-        self._server, self._answer = server, answer
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def _serve(self) -> None:
-        peer, _ = self._server.accept()
-        with peer, peer.makefile("rw") as lines:
-            for line in lines:
-                self.asked.append(json.loads(line))
-                reply = self._answer(self.asked[-1])
-                if reply is None:
-                    return
-                lines.write(json.dumps(reply) + "\n")
-                lines.flush()
-
-
 @pytest.fixture
 def channel():
-    """Serve one client over TCP; return the channel and its address."""
-    servers = []
+    """Serve clients over TCP, or on a Unix socket; return the list of requests, which a function answers, and the address.
 
-    def serve(answer: Answer) -> tuple[Channel, str]:
-        server = socket.create_server(("127.0.0.1", 0))
-        servers.append(server)
-        return Channel(server, answer), f"127.0.0.1:{server.getsockname()[1]}"
+    The answer None closes the connection.
+    """
+    with ExitStack() as servers:
 
-    yield serve
-    for server in servers:
-        server.close()
+        def serve(answer: Answer, path: Path | None = None) -> tuple[list[dict], str]:
+            asked: list[dict] = []
+
+            class Handler(socketserver.StreamRequestHandler):
+                def handle(self) -> None:
+                    for line in self.rfile:
+                        asked.append(json.loads(line))
+                        if (reply := answer(asked[-1])) is None:
+                            return
+                        self.wfile.write(json.dumps(reply).encode() + b"\n")
+
+            server: socketserver.BaseServer
+            if path is None:
+                server = socketserver.TCPServer(("127.0.0.1", 0), Handler)
+                address = f"127.0.0.1:{server.server_address[1]}"
+            else:
+                server, address = socketserver.UnixStreamServer(str(path), Handler), f"unix:{path}"
+            servers.enter_context(server)
+            thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+            thread.start()
+            servers.callback(thread.join)
+            servers.callback(server.shutdown)
+            return asked, address
+
+        yield serve
 
 
 def test_a_request_is_a_line_and_its_answer_is_returned_without_its_flag(channel):
-    served, address = channel(lambda _request: {"ok": True, "mode": "standby"})
+    asked, address = channel(lambda _request: {"ok": True, "mode": "standby"})
     with ControlClient(address) as client:
         assert client.do("status", of=1) == {"mode": "standby"}
-    assert served.asked == [{"do": "status", "of": 1}]
+    assert asked == [{"do": "status", "of": 1}]
 
 
-def test_a_channel_on_a_socket_in_a_folder_is_used(tmp_path):
-    path = tmp_path / "control"
-    with socket.socket(socket.AF_UNIX) as server:
-        server.bind(str(path))
-        server.listen()
-        Channel(server, lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
-        with ControlClient(f"unix:{path}") as client:
-            assert Truth(client, Conventions()).attitude() == (0.0, 0.0, 0.0, 1.0)
+def test_a_channel_on_a_socket_in_a_folder_is_used(channel, tmp_path):
+    _, address = channel(
+        lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]}, tmp_path / "control"
+    )
+    with ControlClient(address) as client:
+        assert Truth(client, Conventions()).attitude() == (0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -97,16 +97,16 @@ def test_a_reset_ends_when_the_device_has_booted_which_takes_steps_of_a_stepped_
             {"ok": True, "clock": clock, "mode": next(modes)} if request["do"] == "status" else {"ok": True}
         )
 
-    served, address = channel(answer)
+    asked, address = channel(answer)
     with ControlClient(address) as client:
         client.reset()
-    assert [request["do"] for request in served.asked] == [
+    assert [request["do"] for request in asked] == [
         "clear_faults",
         "set_truth",
         "fault",
         *["status"] * polls,
     ]
-    assert served.asked[2]["device"] == {"reset": "power_on"}
+    assert asked[2]["device"] == {"reset": "power_on"}
 
 
 def test_a_device_that_does_not_boot_is_reported(channel, monkeypatch):
@@ -117,13 +117,13 @@ def test_a_device_that_does_not_boot_is_reported(channel, monkeypatch):
 
 
 def test_the_truth_is_set_and_read_at_a_time(channel):
-    served, address = channel(lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
+    asked, address = channel(lambda _request: {"ok": True, "quaternion_xyzw": [0.0, 0.0, 0.0, 1.0]})
     with ControlClient(address) as client:
         truth = Truth(client, Conventions())
         truth.point(83.8, -1.2, 30.0)
         assert truth.error([0.0, 0.0, 0.0, 1.0], 5.0).total_arcsec == 0.0
     attitude = {"ra_deg": 83.8, "dec_deg": -1.2, "roll_deg": 30.0}
-    assert served.asked == [
+    assert asked == [
         {"do": "set_truth", "truth": {"kind": "fixed", "attitude": attitude}},
         {"do": "truth", "unix_s": 5.0},
     ]

@@ -67,5 +67,5 @@ def test_title_and_steps_of_a_session_are_shown_with_their_control_characters_es
 
 def test_an_error_is_shown_with_its_control_characters_escaped(capsys):
     with pytest.raises(SystemExit):
-        exit_for_bad_input(HOSTILE[:-1], "starhil")
+        exit_for_bad_input("starhil", HOSTILE[:-1])
     assert capsys.readouterr().err == f"starhil: {SHOWN.removesuffix(chr(92) + 'ud800')}\n"

@@ -112,15 +112,15 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             "[[step]]\ncommand = 'set_mod'\nwith = { mode = 'standby' }",
             ["step 1", "set_mod", "did you mean set_mode?"],
         ),
-        ("[[step]]\nread = 'reset'", ["it is a telecommand: use command"]),
-        ("[[step]]\ncommand = 'identification'", ["it is telemetry: use read"]),
+        ("[[step]]\nread = 'reset'", ["'reset' is a telecommand: use command"]),
+        ("[[step]]\ncommand = 'identification'", ["'identification' is telemetry: use read"]),
         (
             "[[step]]\nwait_s = 1\n[[step]]\nread = 'rates'\nexpect = { rat_x = 1 }",
             ["step 2", "rat_x", "did you mean rate_x"],
         ),
         ("[[step]]\ncommand = 'set_mode'\nwith = { mod = 'standby' }", ["'mod'", "did you mean mode"]),
         ("[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }", ["tracing", "tracking"]),
-        ("[[step]]\ncommand = 'set_mode'", ["set_mode.mode", "missing value"]),
+        ("[[step]]\ncommand = 'set_mode'", ["step 1: with: row 'set_mode' needs the field 'mode'"]),
         ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["unknown key 'expct'", "did you mean expect"]),
         ("[[step]]\nreed = 'rates'", ["exactly one action", "'reed'", "did you mean read"]),
         ("[[step]]\nread = 'rates'\nwait_s = 1", ["has read and wait_s"]),
@@ -137,6 +137,7 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             ["trackin", "did you mean tracking"],
         ),
         ("[[step]]\nread = 'precise_attitude'\nexpect = { valid = 1 }", ["'valid' is true or false"]),
+        ("[[step]]\nread = 'precise_attitude'\nexpect = { valid = 'true' }", ["'valid' is true or false"]),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = 'fast' }", ["'rate_x' is a number"]),
         (
             "[[step]]\nread = 'rates'\nexpect = { rate_x = { vale = 1 } }",
@@ -175,10 +176,10 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             "[truth]\nquaternion_xyzw = [1, 'x']\n[[step]]\nwait_s = 1",
             ["'quaternion_xyzw' must be a list of 4"],
         ),
-        ("[[step]]\ncommand = 'xyzzy'", ["unknown telecommand 'xyzzy'", "`starhil icd list` lists all"]),
-        ("[[step]]\nread = 'xyzzy'", ["unknown telemetry row 'xyzzy'", "`starhil icd list` lists all"]),
+        ("[[step]]\ncommand = 'xyzzy'", ["no telecommand named 'xyzzy'; `starhil icd list` lists all"]),
+        ("[[step]]\nread = 'xyzzy'", ["no telemetry row named 'xyzzy'; `starhil icd list` lists all"]),
         ("[[step]]\nset_parameter = 'xyzzy'\nvalue = 1", ["'xyzzy'", "`starhil icd list` lists all"]),
-        ("[[step]]\nread = 'rates'\nexpect = { xyzzy = 1 }", ["'xyzzy'; its fields: rate_x, rate_y"]),
+        ("[[step]]\nread = 'rates'\nexpect = { xyzzy = 1 }", ["'xyzzy'; known: rate_x, rate_y"]),
         ("[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'xyzzy' }", ["; one of: boot, standby,"]),
         (
             "[[step]]\nread = 'image_frame'\nexpect = { data = 'hello' }",
@@ -234,7 +235,7 @@ def test_every_error_of_a_script_is_reported_with_its_place(load):
             "[[step]]\nread = 'rates'\nexpect = { rat_x = 1, rate_y = '$first' }\nwithin = 3\n"
             "[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }"
         )
-    lines = str(caught.value).splitlines()
+    lines = caught.value.args
     assert [line.split(": ")[1] for line in lines] == ["defaults", "step 1", "step 2", "step 2", "step 3"]
     for line, word in zip(lines, ("timeout_s", "quaternion", "within_s", "rate_x", "tracking"), strict=True):
         assert word in line
@@ -245,10 +246,46 @@ def test_every_wrong_field_of_a_step_is_reported(load):
         load(
             "[[step]]\nread = 'rates'\nexpect = { rat_x = 1, rate_y = 'fast' }\ncapture = { first = 'rate_zz' }"
         )
-    lines = str(caught.value).splitlines()
+    lines = caught.value.args
     assert len(lines) == 3
     for word in ("'rat_x'", "'rate_y' is a number", "'rate_zz'"):
         assert any(word in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("step", "said"),
+    [
+        (  # a value that is known only when the step runs hides nothing
+            "command = 'set_parameter'\nwith = { parameter = '$now_s' }",
+            ["with: row 'set_parameter' needs the field 'value', which is missing"],
+        ),
+        (
+            "command = 'set_parameter'\nwith = { parameter = '$now_s', valu = 5 }",
+            ["'set_parameter' has no field 'valu'; did you mean value", "needs the field 'value'"],
+        ),
+        (
+            "command = 'set_unix_time'\nwith = { seconds = 'x', milliseconds = 100000 }",
+            ["with: set_unix_time.seconds: 'x' is not a number", "milliseconds: 100000 is outside"],
+        ),
+        (
+            "command = 'set_mode'\nwith = { mode = '$mod' }\ntimeout_s = 'x'\nexpect = { a = 1 }\nrefusd = 'busy'",
+            ["with: mode: nothing was captured", "'timeout_s' must be a number", "'expect' needs a step", "'refusd'"],
+        ),
+        (
+            "read = 'rates'\nwithin_s = 'x'\nexpect = { rat_x = 1, rate_y = { mn = 1 } }\ncapture = { a = 'rate_q' }",
+            ["'within_s' must be a number", "unknown key 'mn'", "capture: row 'rates' has no field 'rate_q'"],
+        ),
+        ("sample = { telemetry = 'rates', every_s = -1, fr_s = 3 }", ["'every_s'", "'for_s'", "'fr_s'"]),
+        ("sample = 'ratse'\nevery_s = 1\nfor_s = 1\nfle = 'x'", ["no telemetry row named 'ratse'", "'fle'"]),
+        ("set_parameter = 'exposure'\nvalu = 5\nlink = 'cn'", ["'value' must be given", "'valu'", "'link'"]),
+    ],
+)  # fmt: skip
+def test_a_step_with_several_errors_reports_each_once(load, step, said):
+    with pytest.raises(ScriptError) as caught:
+        load(f"[[step]]\n{step}")
+    assert len(caught.value.args) == len(said)
+    for text in said:
+        assert any(text in problem for problem in caught.value.args)
 
 
 def test_a_captured_value_may_be_used_by_later_steps_only(load):
@@ -270,6 +307,21 @@ def test_bytes_are_written_in_hexadecimal_and_compared_as_bytes(load):
     assert (wanted.equals, wanted.one_of, wanted.differs_from) == (zeros, [zeros, Variable("map")], ones)
     assert wanted.mismatch("map", zeros, {"map": ones}) is None
     assert wanted.mismatch("map", ones, {"map": ones}) is not None
+
+
+@pytest.mark.parametrize("wanted", ["true", "'true'", "{ not = false }", "{ one_of = [true] }"])
+def test_a_flag_that_a_map_defines_is_true_or_false(wanted, tmp_path):
+    unit = load_unit("sagitta")
+    path = tmp_path / "script.toml"
+    path.write_text(f"[[step]]\nread = 'solution'\nexpect = {{ valid = {wanted} }}")
+    conditions = load_script(path, unit).steps[0].expect["valid"]
+    row = unit.telemetry["solution"]
+    seen = [row.decode(row.encode({"valid": valid}))["valid"] for valid in (True, False)]
+    assert conditions.mismatch("valid", seen[0], {}) is None
+    assert conditions.mismatch("valid", seen[1], {}).startswith("valid is false, expected")
+    path.write_text("[[step]]\nread = 'solution'\nexpect = { valid = 'yes' }")
+    with pytest.raises(ScriptError, match="'valid' is true or false, not 'yes'"):
+        load_script(path, unit)
 
 
 def test_values_that_a_correct_obc_never_sends_are_allowed_where_a_refusal_is_expected(load):

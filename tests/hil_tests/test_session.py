@@ -505,8 +505,8 @@ def test_the_command_prints_a_line_for_each_error_of_a_script(tmp_path):
     )
     outcome = run_command(script, "--start")
     assert isinstance(outcome.exception, BenchError)
-    lines = [*outcome.stderr.splitlines(), f"starhil: {outcome.exception}"]
-    assert [line.split(": ")[:3] for line in lines] == [["starhil", "s.toml", f"step {n}"] for n in (1, 2, 3)]
+    lines = outcome.exception.args
+    assert [line.split(": ")[:2] for line in lines] == [["s.toml", f"step {n}"] for n in (1, 2, 3)]
 
 
 @pytest.mark.parametrize(

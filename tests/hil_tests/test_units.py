@@ -58,7 +58,7 @@ class FakeLink:
     def answers(self, row):
         return row.answers
 
-    def request(self, request, _reply_size):
+    def request(self, request):
         self.requests.append(request)
         for reply in self.replies:
             self.on_reply(reply)

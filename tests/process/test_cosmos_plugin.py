@@ -14,7 +14,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.protocol.icd import load_unit
 from starhil.protocol.quoting import cosmos_state
-from starhil.protocol.serial_stack import serial_answers
+from tests.protocol.composed_links import CUBESTAR
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import same
 
@@ -130,7 +130,7 @@ def test_every_command_is_sent_and_answered(cosmos: Cosmos, can_obc: ObcClient) 
             for name, value in row.example().items()
         }
         cosmos.send(row.name.upper(), **values)
-        if not serial_answers(ICD, row):
+        if not CUBESTAR.answers(row):
             continue  # the next command does not wait for a reply
         name, packet = cosmos.receive()
         while name == "FILE_BURST":
@@ -150,7 +150,7 @@ def test_after_a_command_that_changes_the_dialect_cosmos_reconnects_with_the_new
     can_obc.set_parameter("serial_dialect", dialect)
     with connect(dialect) as before:
         before.send(name.upper())
-        if serial_answers(ICD, ICD.telecommands[name]):
+        if CUBESTAR.answers(ICD.telecommands[name]):
             answer, packet = before.receive()
             assert (answer, packet.read("COMMAND"), packet.read("CODE")) == ("ANSWER", name.upper(), "OK")
         else:

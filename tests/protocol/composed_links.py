@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
+from starhil.protocol.codec import Row
+from starhil.protocol.icd import load_unit
 from starhil.protocol.link_schema import MessageClass, SerialLinkModel
 from starhil.protocol.messages import (
     ErrorCode,
@@ -14,21 +17,43 @@ from starhil.protocol.messages import (
     Request,
     RequestKind,
 )
-from starhil.protocol.serial_stack import RowShape, SerialStack
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack
 
 TC, TLM = RequestKind.TELECOMMAND, RequestKind.TELEMETRY
+
+
+def shape(
+    klass: str,
+    identifier: int,
+    kind: RequestKind,
+    request_size: int = 0,
+    reply_size: int = 0,
+    answers: tuple[str, ...] = ("reply",),
+) -> Row:
+    """Return what a link needs of a row; the requests of telemetry may have data here."""
+    keys = {
+        "name": "",
+        "klass": klass,
+        "id": identifier,
+        "kind": kind.value,
+        "request": "",
+        "answers": answers,
+    }
+    sizes = {"request_size": request_size, "reply_size": reply_size, "size": max(request_size, reply_size)}
+    return cast("Row", SimpleNamespace(**keys, **sizes))
 
 
 def stack_of(
     link: dict[str, Any],
     classes: tuple[MessageClass, ...] = (),
-    rows: tuple[RowShape, ...] = (),
+    rows: tuple[Row, ...] = (),
     order: Any = "little",
 ) -> SerialStack:
     return SerialStack(SerialLinkModel.model_validate(link), classes, rows, order)
 
 
 CUBESPACE = stack_of({"framing": {"kind": "cubespace"}})
+CUBESTAR = build_serial_stack(load_unit("cubestar"))
 
 SAGITTA = stack_of(
     {
@@ -55,10 +80,10 @@ SAGITTA = stack_of(
         MessageClass(name="action", kind=TC, code=3, reply=131),
     ),
     (
-        RowShape("set", 6, TC, 16),
-        RowShape("get", 6, TLM, 0, 16),
-        RowShape("telemetry", 24, TLM, 0, 67),
-        RowShape("action", 14, TC, 8),
+        shape("set", 6, TC, 16),
+        shape("get", 6, TLM, 0, 16),
+        shape("telemetry", 24, TLM, 0, 67),
+        shape("action", 14, TC, 8),
     ),
 )
 
@@ -69,9 +94,9 @@ NOS3 = stack_of(
     },
     (MessageClass(name="command", kind=TC), MessageClass(name="telemetry", kind=TLM)),
     (
-        RowShape("command", 0, TC, 4, 0, ("echo",)),
-        RowShape("telemetry", 1, TLM, 4, 4, ("echo", "reply")),
-        RowShape("telemetry", 2, TLM, 4, 9, ("echo", "reply")),
+        shape("command", 0, TC, 4, 0, ("echo",)),
+        shape("telemetry", 1, TLM, 4, 4, ("echo", "reply")),
+        shape("telemetry", 2, TLM, 4, 9, ("echo", "reply")),
     ),
     "big",
 )
@@ -94,7 +119,7 @@ NSP = stack_of(
             },
         ],
     },
-    rows=(RowShape("", 0, TLM, 0, 8), RowShape("", 1, TC, 4), RowShape("", 18, TLM, 4, 20)),
+    rows=(shape("", 0, TLM, 0, 8), shape("", 1, TC, 4), shape("", 18, TLM, 4, 20)),
 )
 
 LENGTH = stack_of(
@@ -113,7 +138,7 @@ LENGTH = stack_of(
             {"role": "status", "type": "u8"},
         ],
     },
-    rows=(RowShape("", 3, TC, 2), RowShape("", 200, TLM, 0, 6)),
+    rows=(shape("", 3, TC, 2), shape("", 200, TLM, 0, 6)),
     order="big",
 )
 
@@ -124,7 +149,7 @@ DLE = stack_of(
         "request_header": [{"role": "id", "type": "u8"}],
         "reply_header": [{"role": "id", "type": "u8"}, {"role": "status", "type": "u8"}],
     },
-    rows=(RowShape("", 3, TC, 2), RowShape("", 16, TLM, 0, 6)),
+    rows=(shape("", 3, TC, 2), shape("", 16, TLM, 0, 6)),
 )
 
 HDLC = stack_of(
@@ -141,7 +166,7 @@ HDLC = stack_of(
         "request_header": [{"role": "id", "type": "u8"}],
         "reply_header": [{"role": "id", "type": "u8"}, {"role": "status", "type": "u8"}],
     },
-    rows=(RowShape("", 3, TC, 2), RowShape("", 126, TLM, 0, 6)),
+    rows=(shape("", 3, TC, 2), shape("", 126, TLM, 0, 6)),
 )
 
 TEXT = stack_of(
@@ -151,7 +176,7 @@ TEXT = stack_of(
         "request_header": [{"role": "id", "type": "u8"}],
         "reply_header": [{"role": "id", "type": "u8"}, {"role": "status", "type": "u8"}],
     },
-    rows=(RowShape("", 3, TC, 2), RowShape("", 200, TLM, 0, 6)),
+    rows=(shape("", 3, TC, 2), shape("", 200, TLM, 0, 6)),
 )
 
 
@@ -163,7 +188,7 @@ def _length_framed(check: dict[str, Any]) -> SerialStack:
         "request_header": header,
         "reply_header": [*header, {"role": "status", "type": "u8"}],
     }
-    return stack_of(link, rows=(RowShape("", 3, TC, 2), RowShape("", 200, TLM, 0, 6)))
+    return stack_of(link, rows=(shape("", 3, TC, 2), shape("", 200, TLM, 0, 6)))
 
 
 XOR16 = _length_framed({"kind": "xor", "type": "u16", "init": 0x1234})

@@ -149,5 +149,5 @@ def test_errors_speak_of_lists_as_toml_does(tmp_path):
         '[[section]]\nheading = "Frames"\ncolumns = "a"\nrows = []\n'
     )
     axes, columns = check_unit(tmp_path)
-    assert axes.endswith("conventions.axes: List should have at least 3 items after validation, not 2")
-    assert columns.endswith("section.Frames.columns: Input should be a valid list")
+    assert axes.endswith("conventions.axes: must have at least 3 items, not 2")
+    assert columns.endswith("section.Frames.columns: must be a list (given: 'a')")

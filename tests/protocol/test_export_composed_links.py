@@ -17,6 +17,7 @@ from starhil.protocol.export.packets import row_key
 from starhil.protocol.icd import load_unit
 from starhil.protocol.link_schema import CustomCheck, CustomFraming, SerialLinkModel
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
+from starhil.protocol.plugin import Plugin
 from starhil.protocol.serial_stack import SerialStack
 from tests.protocol.c_driver import CDriver, hex_or_none
 from tests.protocol.composed_links import REPLIES, REQUESTS, STACKS
@@ -194,7 +195,7 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
 def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     model = SerialLinkModel.model_validate({**link, "request_header": [{"role": "id", "type": "u8"}]})
     custom: Any = {"mine": lambda: STACKS["nsp"].framing}
-    stack = SerialStack(model, framings=custom, checks={"mine": lambda _data: b""})
+    stack = SerialStack(model, plugin=Plugin(framings=custom, checks={"mine": lambda _data: b""}))
     assert isinstance(model.framing, CustomFraming) or isinstance(model.check, CustomCheck)
     with pytest.raises(ProtocolError, match="'mine' is Python code in the unit's plugin"):
         link_text(stack)

@@ -12,8 +12,7 @@ from starhil.protocol.export.cosmos_plugin import answer_id
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
 from starhil.protocol.serial_interface import Dialect
-from starhil.protocol.serial_stack import serial_answers
-from tests.protocol.composed_links import CUBESPACE
+from tests.protocol.composed_links import CUBESPACE, CUBESTAR
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import packets
 
@@ -44,7 +43,7 @@ def test_every_row_goes_out_and_its_reply_becomes_its_packet(tmp_path: Path, dia
             payload = data if row.kind == "telecommand" else b""
             sent, _ = link.write_data(bytes((row.id,)) + payload)
             assert device.feed(sent, 0.0) == [Request.of(row.id, payload)]
-            if not serial_answers(ICD, row):
+            if not CUBESTAR.answers(row):
                 assert link.answered.is_set()
                 continue
             accepted = Reply(ReplyKind.ACK, row.id)

@@ -20,7 +20,6 @@ from starhil.protocol.link_schema import (
     XorCheck,
     XxHashCheck,
 )
-from starhil.protocol.messages import RequestKind
 from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import IcdError
 
@@ -106,7 +105,7 @@ def _rows(stack: SerialStack) -> dict[str, Any]:
     return {
         "tests": {
             "is_row": list(rows),
-            "is_telecommand": [key for key, row in rows.items() if row.kind is RequestKind.TELECOMMAND],
+            "is_telecommand": [key for key, row in rows.items() if row.kind == "telecommand"],
             "has_echo": [key for key, row in rows.items() if "echo" in row.answers],
             "has_reply": [key for key, row in rows.items() if "reply" in row.answers],
         },
@@ -142,7 +141,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
     replies = []
     for item in classes.values():
         if item.code is not None:
-            replies.append((item.code if item.reply is None else item.reply, item.code, False))
+            replies.append((item.reply_code, item.code, False))
             if item.unsolicited is not None:
                 replies.append((item.unsolicited, item.code, True))
     return {

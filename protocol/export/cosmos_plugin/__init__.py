@@ -17,7 +17,7 @@ from starhil.protocol.export.packets import key_bits, key_of
 from starhil.protocol.export.templates import fill, text_of
 from starhil.protocol.messages import BURST_ID
 from starhil.protocol.quoting import cosmos_name, cosmos_string, identifier, markdown, ruby_string
-from starhil.protocol.serial_stack import SerialStack, build_serial_stack, serial_answers
+from starhil.protocol.serial_stack import SerialStack, build_serial_stack
 
 TARGET: Final = "<%= target_name %>"
 """Name of the target, which COSMOS fills in when the plugin is installed."""
@@ -39,7 +39,7 @@ def render_folder(icd: InterfaceDefinition) -> Mapping[str, str]:
         "cmd_tlm/tlm.txt": "\n".join(_telemetry(icd, with_bursts=not composed)) + "\n",
         f"lib/{name}_protocol.py": _protocol(icd, stack, name),
     }
-    values = {"name": name, "target": name.upper(), "baud": stack.baud, "dialects": stack.dialects}
+    values = {"name": name, "target": name.upper(), "baud": stack.link.baud, "dialects": stack.dialects}
     return {
         "plugin.txt": head + fill("cosmos_plugin/plugin.txt.j2", **values),
         f"openc3-cosmos-{name}.gemspec": fill(
@@ -83,7 +83,7 @@ def _protocol(icd: InterfaceDefinition, stack: SerialStack, name: str) -> str:
         link = link_text(stack)
     else:
         sizes = ", ".join(f"{row.id}: {row.size}" for row in icd.telemetry.values())
-        silent = [row.id for row in icd.telecommands.values() if not serial_answers(icd, row)]
+        silent = [row.id for row in icd.telecommands.values() if not stack.answers(row)]
         link = (
             f"# Bytes of data of each telemetry row\nSIZES = {{{sizes}}}\n\n"
             f"# Telecommands without an answer\nUNANSWERED = {tuple(silent)}\n\n\n{text_of('cosmos_plugin/cubespace_link.py.in')}"

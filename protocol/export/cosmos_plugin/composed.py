@@ -23,7 +23,6 @@ from starhil.protocol.link_schema import (
     XorCheck,
     XxHashCheck,
 )
-from starhil.protocol.messages import RequestKind
 from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import IcdError
 
@@ -109,7 +108,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
     classes = stack.classes.classes
     codes = {item.name: item.code or 0 for item in classes}
     coded = [item for item in classes if item.code is not None]
-    reply = {(item.code if item.reply is None else item.reply): item.code for item in coded}
+    reply = {item.reply_code: item.code for item in coded}
     unsolicited = {item.unsolicited: item.code for item in coded if item.unsolicited is not None}
     length = [field for field in stack.reply_header.fields if field.role == "length"]
     return {
@@ -144,7 +143,7 @@ def _rows(stack: SerialStack) -> Iterator[tuple[int, dict[str, Any]]]:
         yield (
             row_key(stack.classes.classes, row.klass, row.id),
             {
-                "telemetry": row.kind is RequestKind.TELEMETRY,
+                "telemetry": row.kind == "telemetry",
                 "request_size": row.request_size,
                 "reply_size": row.reply_size,
                 "answers": [answer for answer in row.answers if answer in ("echo", "reply")],

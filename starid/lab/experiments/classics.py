@@ -123,7 +123,7 @@ def _solver(sky: ThesisSky, name: str) -> Any:
 
 def compute(context: Context, part: Part) -> Results:
     """ε_f and times of each case (n,), and size and build time of the database."""
-    sky, name = thesis_sky(part.values["sky"]), part.values["algorithm"]
+    sky, name = thesis_sky(part["sky"]), part["algorithm"]
     frames = centres(context.parameters["every"])
     solver = _solver(sky, name)
     first = _noise("none")
@@ -167,9 +167,9 @@ def _compare(e: Evaluation) -> None:
     skies = e.parameters["skies"]
     for sky, case in itertools.product(skies, e.parameters["cases"]):
         for part in e.parts:
-            if part.values["sky"] != sky:
+            if part["sky"] != sky:
                 continue
-            name, result = part.values["algorithm"], e.results[part.key]
+            name, result = part["algorithm"], e[part]
             wrong = _wrong(result, case)
             e.compare(
                 f"{SHORT[name]}, {_SKY_LABELS[sky]}, {_case_label(case)}: identified",
@@ -214,17 +214,16 @@ def _figures(e: Evaluation, lines: list[dict[str, Any]]) -> None:
             rates = [line for line in members if line["sky"] == sky]
             curves = curves_of(rates, "level", "identified_percent", lambda line: SHORT[line["algorithm"]])
             settings = {"xlabel": label, "ylabel": "identified / %", "xticks": range(4), "ylim": (0, 102)}
-            shown.append(Panel(_SKY_LABELS[sky], [*curves, *known], settings, "best"))
-        e.draw(
-            f"figure_6_{number}_classics.png", shown, columns=len(shown), width=5.5 * len(shown), height=4.4
-        )
+            shown.append(Panel(_SKY_LABELS[sky], [*curves, *known], settings))
+        look = {"columns": len(shown), "width": 5.5 * len(shown), "height": 4.4, "legend": "best"}
+        e.draw(f"figure_6_{number}_classics.png", shown, **look)
 
 
 def evaluate(e: Evaluation) -> None:
     """Rates, wrong answers, sizes and times of each algorithm beside the quoted ones."""
     lines = []
     for part in e.parts:
-        result = e.results[part.key]
+        result = e[part]
         for case in e.parameters["cases"]:
             times = result[f"ms_{case}"]
             line = {**part.values, "case": case}

@@ -99,7 +99,7 @@ def thesis_sky(name: SkyName) -> ThesisSky:
     focal = 1.0 / (PIXEL_DEG * STAMP)
     centre = 0.5 * (_SIDE_PX - 1)
     camera = Camera(_SIDE_PX, _SIDE_PX, (focal, focal), (centre, centre))
-    return ThesisSky(name, planar_sky(None, "faintest"), camera, _stamp(faint))
+    return ThesisSky(name, planar_sky(), camera, _stamp(faint))
 
 
 def _stamp(stars: StarCatalog) -> StarCatalog:

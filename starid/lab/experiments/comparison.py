@@ -26,8 +26,8 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Final, Literal, TypedDict
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal
 
 import numpy as np
 
@@ -89,13 +89,9 @@ class Outcome:
         """Rows whose check failed."""
         return tuple(row for row in self.rows if row.passed is False)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Convert to plain values."""
-        return asdict(self)
-
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Outcome:
-        """Make an outcome from the values of `to_dict`."""
+        """Make an outcome from the values of `dataclasses.asdict`."""
         rows = tuple(Row(**{**row, "interval": tuple(row["interval"])}) for row in values["rows"])
         return cls(rows, tuple(values["files"]), tuple(values["notes"]))
 
@@ -122,14 +118,6 @@ class Published:
             return []
 
 
-class Readings(TypedDict, total=False):
-    """A number from the author's version of the algorithm, from the printed one, and ours."""
-
-    author: float
-    printed: float
-    ours: float
-
-
 def space_before(unit: str) -> str:
     """Separator between a number and its unit."""
     return "" if unit in ("", "°", "″") else " "
@@ -144,12 +132,6 @@ def value_text(value: Any, unit: str, digits: int) -> str:
     return f"{value:.{digits}f}{space_before(unit)}{unit}"
 
 
-def markdown_table(head: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Format a table in Markdown, all columns but the first aligned to the right."""
-    text = ["| " + " | ".join(head) + " |", "|---" + "|---:" * (len(head) - 1) + "|"]
-    return "\n".join(text + ["| " + " | ".join(line) + " |" for line in lines])
-
-
 _ROUNDING_ERROR: Final = 1e-12
 """A published deviation below this is a rounding error."""
 
@@ -161,35 +143,32 @@ def _rounding(digits: int, unit: str) -> Tolerance:
     return 0.501 * 10.0**-digits, f"half of the last digit, {0.5 * 10.0**-digits:g}{space_before(unit)}{unit}"
 
 
-def _share(percent: float, trials: float) -> Tolerance:
+def _share(percent: float, trials: float) -> float:
     """The standard error is that of (k + 1)/(n + 2), so that a published 0 or 100 % has an uncertainty too."""
     share = (0.01 * percent * trials + 1.0) / (trials + 2.0)
-    error = 300.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
-    return error, f"3 standard errors of two shares of {trials:g}, {error:.2g} %"
+    return 300.0 * math.sqrt(2.0 * share * (1.0 - share) / trials)
 
 
-def _mean(_: float, sigma: float, trials: float) -> Tolerance:
-    error = 3.0 * max(sigma, _ROUNDING_ERROR) * math.sqrt(2.0 / trials)
-    return error, f"3 standard errors of two means of {trials:g}, {error:.2g}"
+def _mean(_: float, sigma: float, trials: float) -> float:
+    return 3.0 * max(sigma, _ROUNDING_ERROR) * math.sqrt(2.0 / trials)
 
 
-def _deviation(_: float, sigma: float, trials: float) -> Tolerance:
-    error = 3.0 * max(sigma, _ROUNDING_ERROR) / math.sqrt(trials - 1.0)
-    return error, f"3 standard errors of two deviations of {trials:g}, {error:.2g}"
+def _deviation(_: float, sigma: float, trials: float) -> float:
+    return 3.0 * max(sigma, _ROUNDING_ERROR) / math.sqrt(trials - 1.0)
 
 
-def _coefficient(published: float, trials: float) -> Tolerance:
+def _coefficient(published: float, trials: float) -> float:
     """By Fisher's transformation."""
-    error = 3.0 * (1.0 - published**2) * math.sqrt(2.0 / (trials - 3.0))
-    return error, f"3 standard errors of two coefficients of {trials:g}, {error:.2g}"
+    return 3.0 * (1.0 - published**2) * math.sqrt(2.0 / (trials - 3.0))
 
 
-_SAMPLED: Final[dict[str, Callable[..., Tolerance]]] = {
-    "sampling": _share,
-    "mean": _mean,
-    "deviation": _deviation,
-    "coefficient": _coefficient,
+_SAMPLED: Final[dict[str, tuple[str, str, Callable[..., float]]]] = {
+    "sampling": ("shares", " %", _share),
+    "mean": ("means", "", _mean),
+    "deviation": ("deviations", "", _deviation),
+    "coefficient": ("coefficients", "", _coefficient),
 }
+"""Word of a check → what is sampled, its unit, and three standard errors of the difference of two."""
 _BOUNDS: Final[dict[str, tuple[Kind, Callable[[Any, Any], bool]]]] = {
     ">": ("agrees", operator.gt),
     "<": ("agrees", operator.lt),
@@ -205,7 +184,10 @@ def _tolerance(known: Published, trials: int) -> Tolerance:
     if word in ("digit", "rounding"):
         return _rounding(known.digits if word == "digit" else int(rest), known.unit)
     if word in _SAMPLED:
-        return _SAMPLED[word](known.numbers[0], *(map(float, rest.split()) if rest else [trials]))
+        what, unit, error_of = _SAMPLED[word]
+        arguments = [float(each) for each in rest.split()] or [trials]
+        error = error_of(known.numbers[0], *arguments)
+        return error, f"3 standard errors of two {what} of {arguments[-1]:g}, {error:.2g}{unit}"
     return float(word), rest
 
 

@@ -24,7 +24,7 @@ def compute(context: Context, part: Part) -> Results:
     from starid.thesis.database_file import save_database
     from starid.thesis.frame_grid import make_grid
 
-    overlap = part.values["percent"] / 100.0
+    overlap = part["percent"] / 100.0
     parameters = DatabaseParameters(overlap=overlap)
     cells = make_grid(parameters.geometry, parameters.fov_deg, overlap).cells
     seconds, busy, size = math.nan, math.nan, 0

@@ -12,15 +12,17 @@ import csv
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starid.catalog import StarCatalog, load_catalog
+from starid.hipparcos import EPOCH
 from starid.lab.experiments.comparison import (
     Outcome,
     Published,
@@ -30,23 +32,18 @@ from starid.lab.experiments.comparison import (
     compared,
     null_model,
 )
-from starid.lab.experiments.figures import Panel, Picture, draw
+from starid.lab.experiments.figures import Curve, Panel, Picture, draw
 from starid.lab.experiments.tables import COLUMNS, PUBLISHED, published
-
-if TYPE_CHECKING:
-    from starid.catalog import StarCatalog
-    from starid.thesis.database import FeatureDatabase
-    from starid.thesis.frame_sky import FrameSky
-    from starid.thesis.lsi import LostInSpace, Solver
+from starid.thesis.database import DatabaseParameters, FeatureDatabase, build_database, sky_of
+from starid.thesis.database_file import load_database, save_database
+from starid.thesis.frame_sky import FrameSky
+from starid.thesis.lsi import LostInSpace, Solver
 
 Results = dict[str, NDArray[Any]]
 """Results of a part: named arrays."""
 
 Parameters = Mapping[str, Any]
 """What an experiment depends on; JSON values only."""
-
-EPOCH: Final = 1991.25
-"""Epoch of the catalogue: the published numbers are without proper motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +52,9 @@ class Part:
 
     key: str
     values: Parameters = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> Any:
+        return self.values[name]
 
 
 def parts_of(parameters: Parameters) -> list[Part]:
@@ -99,22 +99,37 @@ class Experiment:
     start_order: int = 2
     revision: int = 1
 
+    def parameters(self, *, quick: bool) -> Parameters:
+        """Return the parameters of the full or the quick run.
+
+        Raises
+        ------
+        ReproduceError
+            There is no quick run.
+        """
+        chosen = self.quick if quick else self.full
+        if chosen is None:
+            raise ReproduceError(f"reproduce: {self.name} has no quick form; run it without --quick")
+        return chosen
+
     def fingerprint(self, parameters: Parameters, seed: int, part: Part | None = None) -> str:
-        """Checksum of everything on which the outcome, or one part, depends."""
+        """Checksum of everything on which the outcome, or one part, depends.
+
+        Lists, which say which parts there are, do not matter for a part.
+        """
         content = {
             "name": self.name,
             "revision": self.revision,
             "seed": seed,
-            "parameters": dict(parameters) if part is None else _without_lists(parameters),
+            "parameters": {
+                key: value
+                for key, value in parameters.items()
+                if part is None or not isinstance(value, list | tuple)
+            },
             "part": None if part is None else [part.key, dict(part.values)],
         }
         text = json.dumps(content, sort_keys=True)
         return hashlib.blake2b(text.encode(), digest_size=8).hexdigest()
-
-
-def _without_lists(parameters: Parameters) -> dict[str, Any]:
-    """Parameters common to all parts; lists, which say which parts there are, are left out."""
-    return {key: value for key, value in parameters.items() if not isinstance(value, list | tuple)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,21 +149,21 @@ class Context:
         entropy = int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little")
         return np.random.default_rng([self.seed, entropy])
 
-    def database(self, overlap: float) -> FeatureDatabase:
-        """Planar database of the thesis for an overlap ratio (a fraction), built once and stored."""
-        return _database(self.databases, overlap)
-
     def database_file(self, overlap: float) -> Path:
-        """File of the database."""
-        return _database_file(self.databases, overlap)
+        """File of the planar database of the thesis for an overlap ratio (a fraction)."""
+        return self.databases / f"planar-{100 * overlap:g}.features"
+
+    def database(self, overlap: float) -> FeatureDatabase:
+        """The database, built once and stored."""
+        return _database(self.database_file(overlap), overlap)
 
     def lost_in_space(self, overlap: float, solver: Solver = "exact") -> LostInSpace:
         """The LSI algorithm with that database, kept for this process."""
-        return _lost_in_space(self.databases, overlap, solver)
+        return _lost_in_space(self.database_file(overlap), overlap, solver)
 
     def sky(self) -> FrameSky:
         """The stars of the planar databases."""
-        return planar_sky(None, "faintest")
+        return planar_sky()
 
 
 class Evaluation:
@@ -164,6 +179,9 @@ class Evaluation:
         self._columns: dict[int, str] = {}
         self._used: set[str] = set()
 
+    def __getitem__(self, part: Part) -> Results:
+        return self.results[part.key]
+
     def published(self, quantity: str) -> list[float]:
         """Return the published numbers of a quantity of this experiment; none if the thesis has none."""
         self._used.add(quantity)
@@ -178,17 +196,13 @@ class Evaluation:
         digits: int = 2,
         check: str = "",
         column: str = "",
-        author: Any = None,
-        printed: Any = None,
-        ours: Any = None,
-        trials: int = 0,
-        remark: str = "",
+        **readings: Any,
     ) -> None:
         """Add a row that compares what was measured with the line of `published.csv`, as the line says.
 
         If the file has no line for the quantity, `text`, `unit`, `digits` and `check` stand for it (see `Published`).
-        Rows of one `column` of a table are reported together, and those that a constant meets are marked. The others
-        are the arguments of `compared`.
+        Rows of one `column` of a table are reported together, and those that a constant meets are marked. The
+        readings and the others are the arguments of `compared`.
         """
         self._used.add(quantity)
         line = PUBLISHED.get((self.context.name, quantity))
@@ -196,8 +210,7 @@ class Evaluation:
             line = Published("" if text is None else str(text), unit, digits, check)
         if column:
             self._columns[len(self.rows)] = column
-        readings = {"author": author, "printed": printed, "ours": ours, "trials": trials}
-        self.rows.append(compared(quantity, line, **readings, remark=remark))
+        self.rows.append(compared(quantity, line, **readings))
 
     def compare_line(
         self, table: str, part: str, where: str, known: Mapping[str, float], measured: Mapping[str, Any]
@@ -230,9 +243,9 @@ class Evaluation:
         )
         self.files.append(write_csv(self.context.folder / name, columns))
 
-    def draw(self, name: str, panels: Sequence[Panel | Picture], **options: Any) -> None:
+    def draw(self, name: str, content: Iterable[Panel | Picture | tuple[str, Curve]], **options: Any) -> None:
         """Draw a figure; see `starid.lab.experiments.figures.draw`."""
-        self.files.append(draw(self.context.folder / name, panels, **options))
+        self.files.append(draw(self.context.folder / name, content, **options))
 
     def outcome(self) -> Outcome:
         """Return what was added; rows of a column of a table together, where the first of them stands.
@@ -252,11 +265,9 @@ class Evaluation:
         groups: dict[str | int, list[Row]] = {}
         for i, each in enumerate(self.rows):
             groups.setdefault(self._columns.get(i, i), []).append(each)
-        rows = [
-            each
-            for name, group in groups.items()
-            for each in (null_model(group) if isinstance(name, str) else group)
-        ]
+        rows = itertools.chain.from_iterable(
+            null_model(group) if isinstance(name, str) else group for name, group in groups.items()
+        )
         path = Path(__file__).parent / "notes" / f"{self.context.name}.md"
         notes = (path.read_text(encoding="utf-8").strip().format(**self.note),) if path.exists() else ()
         return Outcome(tuple(rows), tuple(self.files), notes)
@@ -280,65 +291,28 @@ def write_csv(path: Path, columns: Mapping[str, Sequence[Any] | NDArray[Any]]) -
 
 @lru_cache(maxsize=1)
 def star_catalog() -> StarCatalog:
-    """The stars at the epoch of the catalogue."""
-    from starid.catalog import load_catalog
-
+    """The stars at the epoch of the catalogue: the published numbers are without proper motion."""
     return load_catalog(epoch=EPOCH)
 
 
 @lru_cache(maxsize=16)
-def planar_sky(kappa: float | None, direction: str, fov_deg: float | None = None) -> FrameSky:
-    """Stars of the flat sky for a brightness limit (None: as in the published databases)."""
-    from typing import cast
-
-    from starid.thesis.database import DatabaseParameters, sky_of
-    from starid.thesis.frame_sky import Direction
-
-    parameters = replace(DatabaseParameters(), direction=cast("Direction", direction))
-    if kappa is not None:
-        parameters = replace(parameters, kappa=kappa)
-    if fov_deg is not None:
-        parameters = replace(parameters, fov_deg=fov_deg)
-    return sky_of(star_catalog(), parameters)
-
-
-@lru_cache(maxsize=4)
-def author_database(overlap: float) -> FeatureDatabase:
-    """Planar database with brightness relative to the brightest star of the catalogue.
-
-    These are the weights of the thesis's frame object, a − min(a). The normalised features differ only in r,
-    by hundredths of a degree before normalisation. The mean brightness A is larger by −min(a).
-    """
-    from starid.thesis.database import DatabaseParameters, build_database
-
-    stars, parameters = star_catalog(), DatabaseParameters(overlap=overlap)
-    least = float(stars.hp.min())
-    shifted = replace(stars, hp=stars.hp - least)
-    return build_database(shifted, replace(parameters, kappa=parameters.kappa - least))
-
-
-def _database_file(folder: Path, overlap: float) -> Path:
-    return folder / f"planar-{100 * overlap:g}.features"
+def planar_sky(**changes: float) -> FrameSky:
+    """Stars of the flat sky of the published databases, with some of the `DatabaseParameters` changed."""
+    return sky_of(star_catalog(), DatabaseParameters(**changes))  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=3)
-def _database(folder: Path, overlap: float) -> FeatureDatabase:
-    from starid.thesis.database import DatabaseParameters, build_database
-    from starid.thesis.database_file import load_database, save_database
-
+def _database(path: Path, overlap: float) -> FeatureDatabase:
     catalog = star_catalog()
-    path = _database_file(folder, overlap)
     if path.exists():
         database = load_database(path)
         if database.catalog_identity == catalog.identity:
             return database
-    folder.mkdir(parents=True, exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     save_database(build_database(catalog, DatabaseParameters(overlap=overlap)), path)
     return load_database(path)
 
 
 @lru_cache(maxsize=6)
-def _lost_in_space(folder: Path, overlap: float, solver: Solver) -> LostInSpace:
-    from starid.thesis.lsi import LostInSpace
-
-    return LostInSpace(_database(folder, overlap), solver=solver)
+def _lost_in_space(path: Path, overlap: float, solver: Solver) -> LostInSpace:
+    return LostInSpace(_database(path, overlap), solver=solver)

@@ -32,7 +32,7 @@ def _features(centres: Array, kappa: float) -> Array:
     """Features and θ (degrees) of frames, (n, 6); NaN for a frame without stars."""
     from starid.thesis.frame_sky import cell_features
 
-    sky = planar_sky(kappa, "faintest", FRAME_DEG)
+    sky = planar_sky(kappa=kappa, fov_deg=FRAME_DEG)
     table = np.full((len(centres), 6), np.nan)
     sums, out = np.empty(8), np.empty(5)
     for i, (ra, dec) in enumerate(centres):
@@ -45,17 +45,17 @@ def _features(centres: Array, kappa: float) -> Array:
 def compute(context: Context, part: Part) -> Results:
     """Features of the frames of a map, or along a line in α or δ."""
     del context
-    step = FRAME_DEG * (1.0 - part.values["percent"] / 100.0)
+    step = FRAME_DEG * (1.0 - part["percent"] / 100.0)
     ra = np.arange(0.0, 360.0, step)
     dec = -90.0 + step * np.arange(round(180.0 / step) + 1)
     dec = dec[dec <= 90.0 + 1e-9]
-    if part.values["axis"] == "map":
+    if part["axis"] == "map":
         places = np.stack(np.meshgrid(ra, dec), axis=-1).reshape(-1, 2)
-    elif part.values["axis"] == "ra":
+    elif part["axis"] == "ra":
         places = np.stack([ra, np.full_like(ra, -6.0 + 0.5 * FRAME_DEG)], axis=-1)
     else:
         places = np.stack([np.full_like(dec, 0.5 * FRAME_DEG), dec], axis=-1)
-    return {"ra": ra, "dec": dec, "places": places, "features": _features(places, part.values["kappa"])}
+    return {"ra": ra, "dec": dec, "places": places, "features": _features(places, part["kappa"])}
 
 
 def _maps(e: Evaluation) -> None:

@@ -1,4 +1,4 @@
-"""Figures as data: a figure is a list of panels, a panel a list of curves, and one function draws them."""
+"""Figures as data: a figure is curves, each with the title of its panel, and one function draws them."""
 
 from __future__ import annotations
 
@@ -27,15 +27,13 @@ class Curve:
 class Panel:
     """Curves with common axes; `settings` are those of `matplotlib.axes.Axes.set`.
 
-    Curves without a colour get one each, from dark to light; `cycle` leaves them to matplotlib. Those in `right` have
-    a scale of their own, up to `right_limit`.
+    Curves without a colour get one each, from dark to light. Those in `right` have a scale of their own, up to
+    `right_limit`.
     """
 
     title: str
-    curves: Iterable[Curve]
+    curves: list[Curve]
     settings: dict[str, Any] = field(default_factory=dict)
-    legend: str = ""
-    cycle: bool = False
     right: Sequence[Curve] = ()
     right_limit: float = 1.0
 
@@ -68,6 +66,12 @@ def precision_axes(symbol: str) -> dict[str, Any]:
     return {**words, "xmargin": 0.0, "ylim": (0.0, 102.0)}
 
 
+def plane_axes(half_width: float) -> dict[str, Any]:
+    """Settings of a panel that shows a frame, degrees."""
+    limits = (-half_width, half_width)
+    return {"xlabel": "x / °", "ylabel": "y / °", "xlim": limits, "ylim": limits}
+
+
 def curves_of(
     table: Iterable[Mapping[str, Any]],
     x: str,
@@ -85,12 +89,16 @@ def curves_of(
     ]
 
 
-def panels(curves: Iterable[tuple[str, Curve]], legend: str = "", **settings: Any) -> list[Panel]:
-    """Panels with the same settings, in order, from curves with the titles of their panels."""
-    found: dict[str, list[Curve]] = {}
-    for title, curve in curves:
-        found.setdefault(title, []).append(curve)
-    return [Panel(title, members, settings, legend) for title, members in found.items()]
+def panels_of(content: Iterable[Panel | Picture | tuple[str, Curve]]) -> list[Panel | Picture]:
+    """Panels in order; curves with the same title share one."""
+    found: dict[str | int, Panel | Picture] = {}
+    for number, each in enumerate(content):
+        if isinstance(each, Panel | Picture):
+            found[number] = each
+        else:
+            panel = found.setdefault(each[0], Panel(each[0], []))
+            panel.curves.append(each[1])  # type: ignore[union-attr]
+    return list(found.values())
 
 
 def _picture(fig: Any, axis: Any, picture: Picture) -> list[Any]:
@@ -104,30 +112,27 @@ def _picture(fig: Any, axis: Any, picture: Picture) -> list[Any]:
 
 def _curves(axis: Any, panel: Panel) -> list[Any]:
     """Draw the curves; return those with a label."""
-    curves = list(panel.curves)
-    free = [curve for curve in curves if "color" not in curve.options]
-    shades = dict(zip(map(id, free), [] if panel.cycle else colours(len(free)), strict=False))
+    free = [curve for curve in panel.curves if "color" not in curve.options]
+    shades = dict(zip(map(id, free), colours(len(free)), strict=True))
     drawn = []
-    for curve in curves:
+    for curve in panel.curves:
         colour = {"color": shades[id(curve)]} if id(curve) in shades else {}
-        drawn += axis.plot(
-            curve.x, curve.y, curve.style, label=curve.label or None, **(colour | curve.options)
-        )
+        options = {"label": curve.label or None, **colour, **curve.options}
+        drawn += axis.plot(curve.x, curve.y, curve.style, **options)
     if panel.right:
         right = axis.twinx()
         for curve in panel.right:
             drawn += right.plot(curve.x, curve.y, curve.style, label=curve.label, **curve.options)
         right.grid(visible=False)
         right.set_ylim(0.0, panel.right_limit)
-    if panel.legend:
-        axis.legend(loc=panel.legend)
     return [line for line in drawn if not line.get_label().startswith("_")]
 
 
 def draw(
     path: Path,
-    panels: Sequence[Panel | Picture],
+    content: Iterable[Panel | Picture | tuple[str, Curve]],
     *,
+    axes: Mapping[str, Any] | None = None,
     columns: int = 1,
     width: float = 7.0,
     height: float = 4.2,
@@ -136,21 +141,26 @@ def draw(
     legend_columns: int = 1,
     **options: Any,
 ) -> str:
-    """Draw the panels row by row, `columns` in a row; return the name of the file.
+    """Draw panels row by row, `columns` in a row; return the name of the file.
 
-    `legend` is the place of one legend for all panels, with the labels of the first. The other options are those of
+    `axes` are settings of all panels, besides those of each. `legend` is the place of the legend of each panel, or,
+    if it begins with "outside", of one legend for all, with the labels of the first. The other options are those of
     `matplotlib.pyplot.subplots`.
     """
-    rows = -(-len(panels) // columns)
-    fig, axes = figure(rows, columns, width=width, height=height, squeeze=False, **options)
-    for axis in axes.ravel()[len(panels) :]:
+    shown = panels_of(content)
+    rows = -(-len(shown) // columns)
+    fig, grid = figure(rows, columns, width=width, height=height, squeeze=False, **options)
+    for axis in grid.ravel()[len(shown) :]:
         axis.remove()
-    for axis, panel in zip(axes.ravel(), panels, strict=False):
+    common = legend.startswith("outside")
+    for axis, panel in zip(grid.ravel(), shown, strict=False):
         handles = _picture(fig, axis, panel) if isinstance(panel, Picture) else _curves(axis, panel)
-        axis.set(title=panel.title, **panel.settings)
+        axis.set(title=panel.title, **(axes or {}), **panel.settings)
         if "sharex" in options or "sharey" in options:
             axis.label_outer()
-        if axis is axes[0, 0] and legend:
+        if legend and not common:
+            axis.legend(loc=legend)
+        elif common and axis is grid[0, 0]:
             fig.legend(handles=handles, loc=legend, ncols=legend_columns)
     if title:
         fig.suptitle(title)

@@ -9,7 +9,7 @@ import numpy as np
 
 from starid.arrays import Array, Mask
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Curve, panels
+from starid.lab.experiments.figures import Curve, plane_axes
 from starid.lab.simulation import PIXEL_DEG, turned
 from starid.thesis.cme import matched_motion
 from starid.thesis.false_stars import ObservedFrame
@@ -85,9 +85,9 @@ def _draw_clusters(e: Evaluation, result: Results) -> None:
             (title, Curve(separations[~chosen], slopes[~chosen], ".", "outliers")),
             (title, Curve(separations[chosen], slopes[chosen], "o", "the cluster")),
         ]
-    shown = panels(curves, "best", xlabel="Δd / °", ylabel="Δm / °")
     title = "Figure 3.2: 441 disparities and the cluster of the true pairs"
-    e.draw("figure_3_2.png", shown, columns=2, width=10.0, height=4.4, title=title)
+    look = {"columns": 2, "width": 10.0, "height": 4.4, "legend": "best"}
+    e.draw("figure_3_2.png", curves, axes={"xlabel": "Δd / °", "ylabel": "Δm / °"}, title=title, **look)
 
 
 def _draw_pair(e: Evaluation, result: Results) -> None:
@@ -98,10 +98,9 @@ def _draw_pair(e: Evaluation, result: Results) -> None:
             (title, Curve(x[:-1], y[:-1], "o", "stars")),
             (title, Curve(x[-1:], y[-1:], "^", "false star")),
         ]
-    limits = (-0.5 * _FIELD_DEG, 0.5 * _FIELD_DEG)
-    shown = panels(curves, "best", xlabel="x / °", ylabel="y / °", xlim=limits, ylim=limits)
     title = "Figure 5.4: shifted by −5° in declination and turned by 10°"
-    e.draw("figure_5_4.png", shown, columns=2, width=9.0, height=4.6, title=title, sharey=True)
+    look = {"columns": 2, "width": 9.0, "height": 4.6, "legend": "best", "sharey": True}
+    e.draw("figure_5_4.png", curves, axes=plane_axes(0.5 * _FIELD_DEG), title=title, **look)
 
 
 def evaluate(e: Evaluation) -> None:

@@ -13,7 +13,7 @@ from starid.arrays import Mask
 from starid.lab.experiments.author_noise import filter_noise
 from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.figures import Curve, panels
+from starid.lab.experiments.figures import Curve
 from starid.lab.experiments.tables import CONFUSION
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, moved_frames
 from starid.plots import colours
@@ -102,7 +102,7 @@ def author_distances(
 
 def _author(context: Context, part: Part) -> Results:
     """Counts (6, first frames, frames, 4) and μ_d, σ_d (6, first frames, frames, 2)."""
-    kind, false_stars, stretch = (part.values[name] for name in ("kind", "false_stars", "stretch"))
+    kind, false_stars, stretch = (part[name] for name in ("kind", "false_stars", "stretch"))
     starts, count = int(context.parameters["first_frames"]), int(context.parameters["frames"])
     counts = np.zeros((len(FACTORS), starts, count, 4), dtype=np.int64)
     distances = np.full((len(FACTORS), starts, count, 2), math.nan)
@@ -121,7 +121,7 @@ def _author(context: Context, part: Part) -> Results:
 
 def _printed(context: Context, part: Part) -> Results:
     """Counts (6, 4) of the cluster filter and of ours, with the noise as printed."""
-    kind, false_stars = part.values["kind"], part.values["false_stars"]
+    kind, false_stars = part["kind"], part["false_stars"]
     counts: Results = {name: np.zeros((len(FACTORS), 4), dtype=np.int64) for name in ("any", "followed")}
     cluster = ClusterFilter()
     for k, factor in enumerate(FACTORS):
@@ -219,10 +219,10 @@ def _figures(e: Evaluation) -> None:
                 author = list(np.nanmean(distances[..., _DISTANCES.index(name)], axis=(1, 2)))
             curves.append((panel, Curve(FACTORS, author, "-o", f"f = {f}", colour | {"markersize": 3})))
         label = f"{name} / %" if name in _INDICATORS else f"mean {name} / °"
-        shown = panels(curves, xlabel="noise factor μ", ylabel=label)
-        size = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
+        axes = {"xlabel": "noise factor μ", "ylabel": label}
+        look = {"columns": len(kinds), "width": 11.0, "legend": "outside right upper"}
         title = f"{name}, as the author ran it (dotted: published)"
-        e.draw(f"figure_6_{number}.png", shown, title=title, **size)
+        e.draw(f"figure_6_{number}.png", curves, axes=axes, title=title, **look)
 
 
 def _compare_tables(e: Evaluation) -> None:

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Curve, Panel, curves_of, panels
+from starid.lab.experiments.figures import Curve, Panel, curves_of, plane_axes
 from starid.lab.experiments.fsf import (
     RADIUS_DEG,
     author_distances,
@@ -39,8 +39,8 @@ def compute_choice(context: Context, part: Part) -> Results:
     lost, shift_errors = [], []
     first, frames = frames_of_seven(context.rng("frames"), noise, int(context.parameters["frames"]))
     for frame in frames:
-        least = part.values.get("least") or part.values["share"] * len(frame.observed)
-        result = ClusterFilter(part.values["epsilon"], least)(first.observed, frame.observed)
+        least = part.values.get("least") or part["share"] * len(frame.observed)
+        result = ClusterFilter(part["epsilon"], least)(first.observed, frame.observed)
         lost.append(np.count_nonzero(~result.true_now))
         motion = matched_motion(first.observed, frame.observed, result.matches)
         if motion is not None:
@@ -52,7 +52,7 @@ def evaluate_choice(e: Evaluation) -> None:
     """Figure 6.12, and the choice of the thesis."""
     lines = {}
     for part in e.parts:
-        lost, shift = (e.results[part.key][name] for name in ("lost", "shift"))
+        lost, shift = (e[part][name] for name in ("lost", "shift"))
         error = float(np.mean(shift)) if shift.size else math.nan
         lines[part.key] = {"part": part.key, "lost_stars": float(lost.mean()), "shift_error_deg": error}
     e.write("parameter_choice.csv", list(lines.values()))
@@ -68,10 +68,10 @@ def evaluate_choice(e: Evaluation) -> None:
         by_share, "share", "lost_stars", lambda line: f"lost a frame, ε = {line['epsilon']:g}"
     )
     shown = [
-        Panel("", curves, {"xlabel": "ε (min_samples = 3)"}, "best"),
-        Panel("", lost_stars, {"xlabel": "min_samples / number of objects"}, "best"),
+        Panel("", curves, {"xlabel": "ε (min_samples = 3)"}),
+        Panel("", lost_stars, {"xlabel": "min_samples / number of objects"}),
     ]
-    e.draw("figure_6_12.png", shown, columns=2)
+    e.draw("figure_6_12.png", shown, columns=2, legend="best")
     chosen = lines["share0.5-eps0.4"]
     quantity = "stars lost a frame, ε = 0.4, min_samples = 0.5·n, position noise 0.1°"
     e.compare(quantity, printed=chosen["lost_stars"])
@@ -80,8 +80,8 @@ def evaluate_choice(e: Evaluation) -> None:
 
 def compute_case(context: Context, part: Part) -> Results:
     """Counts (4,) of ten frames, and errors of rotation and translation (10, 2), degrees."""
-    kind, clean = part.values["kind"], part.values["kind"] == "none"
-    noise = noise_of("both" if clean else kind, 0.0 if clean else 1.0, part.values["false_stars"])
+    kind, clean = part["kind"], part["kind"] == "none"
+    noise = noise_of("both" if clean else kind, 0.0 if clean else 1.0, part["false_stars"])
     counts = np.zeros(4, dtype=np.int64)
     errors = []
     first, frames = frames_of_seven(context.rng(part.key), noise, _CASE_FRAMES)
@@ -97,9 +97,9 @@ def evaluate_case(e: Evaluation) -> None:
     """All numbers of tables 6.3 and 6.4, and figure 6.13."""
     lines = []
     for part in e.parts:
-        f, kind = part.values["false_stars"], part.values["kind"]
-        known, c = CASE_STUDY[f, kind], Confusion(*e.results[part.key]["counts"].tolist())
-        errors = e.results[part.key]["errors"]
+        f, kind = part["false_stars"], part["kind"]
+        known, c = CASE_STUDY[f, kind], Confusion(*e[part]["counts"].tolist())
+        errors = e[part]["errors"]
         mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1)
         line = {"f": f, "noise": kind, "accuracy": c.accuracy, "precision": c.precision, "recall": c.recall}
         line |= {"rotation_error_deg": mean[0], "rotation_sigma_deg": sigma[0]}
@@ -128,14 +128,13 @@ def _draw_reconstruction(e: Evaluation) -> None:
         (x, y), (moved_x, moved_y) = second.positions[now].T, motion.apply(first.positions[before]).T
         curves.append((title, Curve(x, y, "o", "stars", {"fillstyle": "none"})))
         curves.append((title, Curve(moved_x, moved_y, "+", "reconstructed")))
-    limits = (-RADIUS_DEG, RADIUS_DEG)
-    shown = panels(curves, "upper right", xlabel="x / °", ylabel="y / °", xlim=limits, ylim=limits)
-    e.draw("figure_6_13.png", shown, columns=2, width=9.5, height=4.6, sharey=True)
+    look = {"columns": 2, "width": 9.5, "height": 4.6, "legend": "upper right", "sharey": True}
+    e.draw("figure_6_13.png", curves, axes=plane_axes(RADIUS_DEG), **look)
 
 
 def compute_correlation(context: Context, part: Part) -> Results:
     """μ_d and σ_d of the frames (n, 2), as the author ran it and as printed."""
-    factor, count = part.values["factor"], int(context.parameters["frames"])
+    factor, count = part["factor"], int(context.parameters["frames"])
     found = MatlabFilter(PIXEL_DEG)
     first, frames = frames_of_seven(context.rng(part.key), author_noise("both", factor, factor), count)
     author = np.array([author_distances(first.observed, frame.observed, found)[1] for frame in frames])
@@ -153,9 +152,9 @@ def evaluate_correlation(e: Evaluation) -> None:
     """Table 6.5, and the first fifty frames of each set."""
     lines, curves = [], []
     for part in e.parts:
-        motion, factor = e.results[part.key]["author"], part.values["factor"]
+        motion, factor = e[part]["author"], part["factor"]
         rho, p = correlation(motion[:, 0], motion[:, 1])
-        printed, _ = correlation(*e.results[part.key]["printed"].T)
+        printed, _ = correlation(*e[part]["printed"].T)
         lines.append({"factor": factor, "rho": rho, "p": p})
         e.compare(
             f"table 6.5: correlation of μ_d and σ_d, μ = f = {factor}",
@@ -169,15 +168,15 @@ def evaluate_correlation(e: Evaluation) -> None:
         trials = np.arange(min(50, len(motion)))
         for values, name in zip(motion[:50].T, ("μ_d", "σ_d"), strict=True):
             curves.append((f"μ = f = {factor}", Curve(trials, values, "-", f"{name} / °")))
-    shown = panels(curves, "upper right", xlabel="trial")
-    e.draw("figures_6_31_6_32_d.png", shown, height=1.6 * len(shown))
+    look = {"height": 1.6 * len(e.parts), "legend": "upper right"}
+    e.draw("figures_6_31_6_32_d.png", curves, axes={"xlabel": "trial"}, **look)
     e.write("table_6_5.csv", lines)
 
 
 def compute_crowd(context: Context, part: Part) -> Results:
     """Counts of the scalable filter among hundreds of objects, and times, ms."""
     rng = context.rng(part.key)
-    true, false = part.values["true_stars"], part.values["true_stars"] // 3
+    true, false = part["true_stars"], part["true_stars"] // 3
     total = round(true * 60.0**2 / 42.0**2)
     sky, magnitude = rng.uniform(-30.0, 30.0, (total, 2)), rng.uniform(0.0, 5.5, total)
     fixed, fixed_magnitude = rng.uniform(-20.0, 20.0, (false, 2)), rng.uniform(0.0, 5.5, false)
@@ -192,7 +191,7 @@ def compute_crowd(context: Context, part: Part) -> Results:
             "transient": rng.uniform(-20.0, 20.0, (false, 2)),
             "stationary": fixed,
             "drifting": turned(fixed + velocity * t, turn) + shift,
-        }[part.values["kind"]]
+        }[part["kind"]]
         places = np.concatenate([turned(sky, turn) + shift, others])
         places += rng.normal(0.0, sigma, places.shape)
         values = np.concatenate([magnitude, fixed_magnitude]) + rng.normal(0.0, 0.1, len(places))
@@ -212,12 +211,12 @@ def compute_crowd(context: Context, part: Part) -> Results:
 def evaluate_crowd(e: Evaluation) -> None:
     """Bounds on recall, precision and time."""
     for part in e.parts:
-        c = Confusion(*e.results[part.key]["counts"].tolist())
-        true = part.values["true_stars"]
-        label = f"{true} true and {true // 3} {part.values['kind']} false stars"
+        c = Confusion(*e[part]["counts"].tolist())
+        true = part["true_stars"]
+        label = f"{true} true and {true // 3} {part['kind']} false stars"
         for name, least in (("recall", 99.0), ("precision", 99.5)):
             quantity = f"scalable filter, {name}, {label}"
             e.compare(quantity, ours=c.percent(name), unit="%", check=f"≥ {least}")
-        fastest = float(np.percentile(e.results[part.key]["ms"], 10.0))
+        fastest = float(np.percentile(e[part]["ms"], 10.0))
         bound = "≤ 5" if true == 150 and not e.context.quick else ""
         e.compare(f"scalable filter, time a frame, {label}", ours=fastest, unit="ms", check=bound)

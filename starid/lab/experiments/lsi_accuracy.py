@@ -10,7 +10,7 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Picture, panels, precision, precision_axes
+from starid.lab.experiments.figures import Picture, precision, precision_axes
 from starid.lab.experiments.lsi_trials import COLUMNS, GRID_LABELS, OFF, ON, ROWS, share, shares, solve_frames
 from starid.plots import colours
 from starid.thesis.metrics import error_colours
@@ -84,16 +84,13 @@ def _precision(e: Evaluation, percents: list[float]) -> None:
         }
         columns = {f"p{p:g}_{grid}_{kind}_percent": curve.y for (p, grid, kind), curve in found.items()}
         e.write(f"figure_6_{number}.csv", {"threshold_deg": next(iter(found.values())).x} | columns)
-        shown = panels(
-            (
-                (f"{word}, {GRID_LABELS[grid]}", found[percent, grid, kind])
-                for (kind, word), grid, percent in itertools.product(_KINDS.items(), (ON, OFF), percents)
-                if (percent, grid, kind) in found
-            ),
-            **precision_axes(symbol),
+        curves = (
+            (f"{word}, {GRID_LABELS[grid]}", found[percent, grid, kind])
+            for (kind, word), grid, percent in itertools.product(_KINDS.items(), (ON, OFF), percents)
+            if (percent, grid, kind) in found
         )
-        size = {"columns": 4, "width": 16.0, "height": 9.9, "sharey": True}
-        e.draw(f"figure_6_{number}.png", shown, legend="outside right upper", **size)
+        look = {"columns": 4, "width": 16.0, "height": 9.9, "sharey": True, "legend": "outside right upper"}
+        e.draw(f"figure_6_{number}.png", curves, axes=precision_axes(symbol), **look)
 
 
 def _compare_best(e: Evaluation, on: Results, off: Results) -> None:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
 from starid.lab.experiments.author_noise import identification_noise
-from starid.lab.experiments.comparison import Readings
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
-from starid.lab.experiments.figures import Curve, Panel, curves_of, panels, precision, precision_axes
+from starid.lab.experiments.figures import Curve, Panel, curves_of, precision, precision_axes
 from starid.lab.experiments.lsi_patterns import add_patterns
 from starid.lab.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label, share, solve_frames
 from starid.lab.simulation import NoiseModel
@@ -31,10 +29,12 @@ _KINDS: Final = {
 }
 """Kind of noise → its name in a quantity, and in a figure."""
 _CASES: Final = (
-    *(("both", level, limit) for level in _LEVELS for limit in (0.3, 0.2, 0.1, 0.013)),
-    *((kind, level, IDENTIFIED_DEG) for kind in ("position", "brightness") for level in (0.0, 3.0)),
+    *(("both", level, ON, limit) for level in _LEVELS for limit in (0.3, 0.2, 0.1, 0.013)),
+    *((kind, level, ON, IDENTIFIED_DEG) for kind in ("position", "brightness") for level in (0.0, 3.0)),
+    *(("both", level, OFF, limit) for level in _LEVELS for limit in (0.3, 0.1)),
+    *((kind, n, grid, 1.0) for grid in (ON, OFF) for kind in ("false", "missing") for n in (1, 2, 3)),
 )
-"""Kind of noise, σ and limit of ε_f of the published shares."""
+"""Kind and level of the noise, test frames, and limit of ε_f of the shares that are compared."""
 _METHODS: Final = {"author_mse": "as the author ran it", "mse": "as printed", "fine": "sub-cell (ours)"}
 _RATES: Final = (
     (9, "position", "σ of positional noise / px"),
@@ -52,10 +52,9 @@ def compute(context: Context, part: Part) -> Results:
         mean = float(rng.normal()) if values.get("mean") else 0.0
         if values.get("root"):
             return identification_noise(level, str(kind))
-        made = NoiseModel.of(str(kind), level)
-        moved, dimmed = (mean * (sigma > 0.0) for sigma in (made.position_sigma_px, made.brightness_sigma))
-        scale = _UNIT_RANGE if values.get("six") else made.magnitude_range
-        return replace(made, position_mean_px=moved, brightness_mean=dimmed, magnitude_range=scale)
+        moved, dimmed = (mean * (kind in (one, "both")) for one in ("position", "brightness"))
+        scale = {"magnitude_range": _UNIT_RANGE} if values.get("six") else {}
+        return NoiseModel.of(str(kind), level, position_mean_px=moved, brightness_mean=dimmed, **scale)
 
     return solve_frames(
         context,
@@ -95,9 +94,10 @@ def _noise_figure(e: Evaluation, grid: str, quantity: str, reading: str) -> None
             _KINDS.items(), limits, cases
         )
     )
-    shown = panels(curves, "lower right", **precision_axes(f"{symbol} (MSE)"))
-    title = f"As {'the author ran it' if author else 'printed'}, frames {GRID_LABELS[grid]}"
-    e.draw(f"figure_6_{number}_{grid}_{reading}.png", shown, title=title, columns=2, width=8.5, height=9.0)
+    axes, title = precision_axes(f"{symbol} (MSE)"), "As the author ran it" if author else "As printed"
+    look = {"columns": 2, "width": 8.5, "height": 9.0, "legend": "lower right"}
+    title += f", frames {GRID_LABELS[grid]}"
+    e.draw(f"figure_6_{number}_{grid}_{reading}.png", curves, axes=axes, title=title, **look)
 
 
 def _false_figure(e: Evaluation) -> None:
@@ -109,8 +109,8 @@ def _false_figure(e: Evaluation) -> None:
         for grid, kind, count in itertools.product((ON, OFF), ("false", "missing"), range(4))
         if (key := _key(kind, count, grid)) in e.results
     )
-    shown = panels(curves, "center right", **precision_axes("ε_f (MSE)"))
-    e.draw("figure_6_8.png", shown, columns=2, width=8.5, height=6.6, sharey=True)
+    look = {"columns": 2, "width": 8.5, "height": 6.6, "sharey": True, "legend": "center right"}
+    e.draw("figure_6_8.png", curves, axes=precision_axes("ε_f (MSE)"), **look)
 
 
 def _rate_figures(e: Evaluation) -> None:
@@ -136,53 +136,43 @@ def _rate_figures(e: Evaluation) -> None:
             "rate_percent",
             lambda line: f"{_METHODS[line['method']]}, {GRID_LABELS[line['grid']]}",
         )
-        known = {
-            level: e.published(_quantity(kind, level, IDENTIFIED_DEG))
-            for case, level, _ in _CASES
-            if case == kind != "both"
-        }
+        known = [
+            (level, e.published(_quantity(case, level, ON, limit)))
+            for case, level, _, limit in _CASES
+            if case == kind and limit == IDENTIFIED_DEG
+        ]
         if known:
             mark = {"ms": 8, "color": "red"}
-            curves.append(Curve(list(known), list(known.values()), "x", "published (on the grid)", mark))
+            levels, rates = zip(*known, strict=True)
+            curves.append(Curve(levels, rates, "x", "published (on the grid)", mark))
         words = f"identification rate (ε_f ≤ {IDENTIFIED_DEG}°) / %"
-        panel = Panel("", curves, {"xlabel": label, "ylabel": words, "xticks": range(4)}, "best")
-        e.draw(f"figure_6_{number}.png", [panel], width=6.0, height=4.0)
+        axes = {"xlabel": label, "ylabel": words, "xticks": range(4)}
+        shown = [Panel("", curves, axes)]
+        e.draw(f"figure_6_{number}.png", shown, width=6.0, height=4.0, legend="best")
 
 
-def _readings(e: Evaluation, kind: str, level: float, limit: float, grid: str) -> Readings:
-    """Share within a limit for each variant computed."""
-    found: Readings = {}
-    if (key := _key(kind, level, grid, "root-")) in e.results:
-        found["author"] = share(e.results[key]["f_author_mse"], limit)
-    if (key := _key(kind, level, grid)) in e.results:
-        found["printed"] = share(e.results[key]["f_mse"], limit)
-        found["ours"] = share(e.results[key]["f_fine"], limit)
-    return found
+def _quantity(kind: str, level: float, grid: str, limit: float) -> str:
+    words = f"{_KINDS[kind][0]}, σ = {level:g}" if kind in _KINDS else count_label(int(level), kind)
+    return f"{words}, {GRID_LABELS[grid]}: share with ε_f ≤ {limit:g}°"
 
 
-def _quantity(kind: str, level: float, limit: float, grid: str = ON) -> str:
-    return f"{_KINDS[kind][0]}, σ = {level:g}, {GRID_LABELS[grid]}: share with ε_f ≤ {limit:g}°"
-
-
-def _compare_noise(e: Evaluation) -> None:
-    frames = e.results[f"none-{ON}"]["f_mse"].size
-    for kind, level, limit in _CASES:
-        values = _readings(e, kind, level, limit, ON)
-        if "author" in values:
-            angle = e.results.get(f"six-{kind}-{level:g}-{ON}")
-            remark = "" if angle is None else f"Interpretation (i): {share(angle['f_six'], limit):.2f} %."
-            e.compare(_quantity(kind, level, limit), **values, trials=frames, remark=remark)
-    for level, limit in itertools.product(_LEVELS, (0.3, 0.1)):
-        if values := _readings(e, "both", level, limit, OFF):
-            e.compare(_quantity("both", level, limit, OFF), **values, unit="%")
-
-
-def _compare_objects(e: Evaluation) -> None:
-    for grid, kind, count in itertools.product((ON, OFF), ("false", "missing"), (1, 2, 3)):
-        if (result := e.results.get(f"{kind}-{count}-{grid}")) is not None:
-            author, printed = (share(result[name], 1.0) for name in ("f_author_mse", "f_mse"))
-            quantity = f"{count_label(count, kind)}, {GRID_LABELS[grid]}: share with ε_f ≤ 1°"
-            e.compare(quantity, author=author, printed=printed, unit="%")
+def _compare(e: Evaluation) -> None:
+    """Compare the share within a limit, for each variant that was computed."""
+    for kind, level, grid, limit in _CASES:
+        printed = e.results.get(_key(kind, level, grid))
+        author = e.results.get(_key(kind, level, grid, "root-"), None if kind in _KINDS else printed)
+        if author is None and printed is None:
+            continue
+        angle = e.results.get(f"six-{kind}-{level:g}-{grid}")
+        e.compare(
+            _quantity(kind, level, grid, limit),
+            unit="%",
+            author=author and share(author["f_author_mse"], limit),
+            printed=printed and share(printed["f_mse"], limit),
+            ours=printed and share(printed["f_fine"], limit),
+            trials=e.results[f"none-{ON}"]["f_mse"].size,
+            remark="" if angle is None else f"Interpretation (i): {share(angle['f_six'], limit):.2f} %.",
+        )
 
 
 def _write(e: Evaluation) -> None:
@@ -200,8 +190,7 @@ def _write(e: Evaluation) -> None:
 
 def evaluate(e: Evaluation) -> None:
     """Shares within limits, the figures, and what ε_ψ says of the error."""
-    _compare_noise(e)
-    _compare_objects(e)
+    _compare(e)
     if f"both-3-mean-{ON}" in e.results:
         for case in itertools.product((ON, OFF), ("f", "theta"), ("author", "printed")):
             _noise_figure(e, *case)

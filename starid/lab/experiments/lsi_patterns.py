@@ -9,7 +9,7 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Evaluation
-from starid.lab.experiments.figures import Curve, panels
+from starid.lab.experiments.figures import Curve
 from starid.lab.experiments.lsi_trials import GRID_LABELS, OFF, ON, count_label
 
 _CASES: Final = {
@@ -51,9 +51,9 @@ def _draw_patterns(e: Evaluation, grid: str) -> None:
         for key, style, label in ((name, "-", "error"), ("psi_author", "--", "ε_ψ"))
     )
     title = f"LSI (MSE) as the author ran it, trials 560 to 600, frames {GRID_LABELS[grid]}"
-    size = {"columns": 2, "width": 9.5, "height": 15.0, "sharex": True}
-    shown = panels(curves, "upper right", xlabel="trial", ylabel="1 + log₁₀ ε")
-    e.draw(f"figures_6_20_to_6_27_and_b_{grid}.png", shown, title=title, **size)
+    axes = {"xlabel": "trial", "ylabel": "1 + log₁₀ ε"}
+    look = {"columns": 2, "width": 9.5, "height": 15.0, "sharex": True, "legend": "upper right"}
+    e.draw(f"figures_6_20_to_6_27_and_b_{grid}.png", curves, axes=axes, title=title, **look)
 
 
 def _below_thresholds(errors: Array, psi: Array, thresholds: Array) -> dict[str, Array]:
@@ -81,8 +81,8 @@ def _draw_thresholds(e: Evaluation, quantity: str, symbol: str, name: str) -> No
                 columns[f"{case}_{grid}_{what}_deg"] = values
                 curve = Curve(thresholds, values, "-", _CASES[case])
                 curves.append((f"{what} of {symbol} / °: {title}, {GRID_LABELS[grid]}", curve))
-    shown = panels(curves, "best", xlabel="threshold of ε_ψ")
-    e.draw(f"{name}.png", shown, columns=4, width=14.0, height=8.5, sharex=True)
+    look = {"columns": 4, "width": 14.0, "height": 8.5, "sharex": True, "legend": "best"}
+    e.draw(f"{name}.png", curves, axes={"xlabel": "threshold of ε_ψ"}, **look)
     e.write(f"{name}.csv", columns)
 
 

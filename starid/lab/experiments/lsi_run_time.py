@@ -45,10 +45,10 @@ def compute(context: Context, part: Part) -> Results:
     from starid.thesis.lsi import estimate_from_path, fill_dictionary, lsi_work
     from starid.thesis.subcell import SubcellSearch
 
-    lsi = context.lost_in_space(part.values["percent"] / 100.0)
+    lsi = context.lost_in_space(part["percent"] / 100.0)
     fine = SubcellSearch(lsi)
     step = lsi.database.grid.step_deg
-    frames = frames_under_test(context.rng(part.key), part.values["grid"], step, context.parameters["every"])
+    frames = frames_under_test(context.rng(part.key), part["grid"], step, context.parameters["every"])
     stars = list(stars_of(context.sky(), frames))
     features = [extract_features(brightness, positions) for brightness, positions in stars]
     observations = [lsi.database.normalise(vector) for vector in features]
@@ -88,11 +88,11 @@ def evaluate(e: Evaluation) -> None:
     """Times beside table 6.1."""
     lines: list[dict[str, Any]] = []
     for part in e.parts:
-        percent, grid = part.values["percent"], part.values["grid"]
+        percent, grid = part["percent"], part["grid"]
         # feature extraction, 1NN, dictionary, LASSO, estimation, and the total, ms
         means = dict(zip(_STAGES, e.published(f"table 6.1, p = {percent:g} %"), strict=True))
         for stage in (*_STAGES, "subcell"):
-            times = e.results[part.key][stage]
+            times = e[part][stage]
             line = {**part.values, "stage": stage, "published_mean_ms": means.get(stage, "")}
             line |= {"median_ms": float(np.median(times)), "mean_ms": float(np.mean(times))}
             line |= {"p99_ms": float(np.percentile(times, 99)), "worst_ms": float(np.max(times))}
@@ -105,7 +105,7 @@ def evaluate(e: Evaluation) -> None:
             e.compare(
                 f"p = {percent:g} %, {grid} the grid: {word}",
                 text=means.get(stage),
-                ours=float(np.median(e.results[part.key][stage])),
+                ours=float(np.median(e[part][stage])),
                 unit="ms",
                 digits=3,
                 check="less" if checked else "",

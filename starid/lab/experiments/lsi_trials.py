@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from starid.arrays import Array
-from starid.lab.experiments.comparison import Readings
 from starid.lab.experiments.experiment import Context, Results
 from starid.lab.simulation import NoiseModel, add_noise, turned
 from starid.thesis.features import extract_features
@@ -147,7 +146,7 @@ def share(errors: Array, limit: float) -> float:
 
 def shares(
     result: Results, limit: float, quantity: str = "f", ours: str = "fine", *, beyond: bool = False
-) -> Readings:
+) -> dict[str, Any]:
     """Share of errors within or beyond a limit, %, for both variants of LSI (MSE) and a search of this project."""
     author, printed, best = (
         100.0 - within if beyond else within

@@ -63,7 +63,7 @@ def _boresight_errors(context: Context, part: Part) -> Results:
     frames = frames_under_test(context.rng("frames"), OFF, step, context.parameters["every"])
     errors = np.full((2, len(frames)), np.nan)
     for i, (place, stars) in enumerate(zip(frames, stars_of(context.sky(), frames), strict=True)):
-        frame = _with_changed_stars(rng, part.values["case"], *stars)
+        frame = _with_changed_stars(rng, part["case"], *stars)
         if len(frame) == 0:
             continue
         errors[0, i] = error_of(lsi.solve(extract_features(frame.brightness, frame.positions)).mse, *place)
@@ -118,7 +118,7 @@ def evaluate(e: Evaluation) -> None:
     """What each case loses, and what is regained."""
     lines = []
     for part in e.parts:
-        errors = e.results[part.key]["errors"]
+        errors = e[part]["errors"]
         names = ("as seen", "put back") if part.key == "put-back" else ("whole field", "divided field")
         for name, one in zip(names, errors, strict=True):
             within = {f"within_{limit:g}": share(one, limit) for limit in (0.3, 1.0)}

@@ -55,6 +55,5 @@ def select(names: Sequence[str], *, quick: bool) -> list[Experiment]:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f"did you mean {near[0]}?" if near else "`starid reproduce --list` lists them all"
             raise ReproduceError(f"reproduce: there is no experiment {name}; {hint}")
-        if quick and known[name].quick is None:
-            raise ReproduceError(f"reproduce: {name} has no quick form; run it without --quick")
+        known[name].parameters(quick=quick)
     return [known[name] for name in dict.fromkeys(names)]

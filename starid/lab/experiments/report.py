@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from starid.files import write_atomically
-from starid.lab.experiments.comparison import Row, markdown_table
+from starid.lab.experiments.comparison import Row
 from starid.lab.experiments.runner import FinishedExperiment
 from starid.lab.experiments.tables import class_of, known_miss, numbers_by_choice
 
@@ -44,16 +44,24 @@ def _remark(experiment: str, row: Row) -> str:
     return " ".join(part for part in (row.remark, known.reason if known else "") if part)
 
 
-def _table(rows: Iterable[tuple[str, Row]]) -> list[str]:
-    lines = [
-        "| quantity | published | as the author ran it | as printed | ours | check | class | remark |",
-        "|---|---:|---:|---:|---:|---|---|---|",
-    ]
-    for experiment, row in rows:
-        values = (row.published, row.author, row.printed, row.ours, row.target)
-        cells = (row.quantity, *values, _mark(experiment, row), _remark(experiment, row))
-        lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
-    return lines
+def _table(head: str, numbers: int, lines: Iterable[Iterable[str]]) -> list[str]:
+    """Format a table in Markdown; `numbers` columns after the first are aligned to the right."""
+    names = head.split("|")
+    rule = "|---" + "|---:" * numbers + "|---" * (len(names) - 1 - numbers) + "|"
+    text = ["| " + " | ".join(names) + " |", rule]
+    return text + ["| " + " | ".join(map(_cell, line)) + " |" for line in lines]
+
+
+def _row_table(rows: Iterable[tuple[str, Row]]) -> list[str]:
+    head = "quantity|published|as the author ran it|as printed|ours|check|class|remark"
+    lines = (
+        (
+            *(row.quantity, row.published, row.author, row.printed, row.ours, row.target),
+            *(_mark(experiment, row), _remark(experiment, row)),
+        )
+        for experiment, row in rows
+    )
+    return _table(head, 4, lines)
 
 
 def counts(results: Sequence[FinishedExperiment]) -> dict[str, dict[str, int]]:
@@ -80,10 +88,11 @@ def _choices(results: Iterable[FinishedExperiment]) -> list[str]:
         f"The column *as the author ran it* rests on {len(found)} choices that the text of the thesis does not make. A number",
         "may depend on several.",
         "",
-        markdown_table(
-            ("choice", "numbers that depend on it", "of these agree", "it was fitted to"),
+        *_table(
+            "choice|numbers that depend on it|of these agree|it was fitted to",
+            3,
             (
-                (name, *(str(each[key]) for key in ("numbers", "agree", "fitted")))
+                (name, *(f"{each[key]}" for key in ("numbers", "agree", "fitted")))
                 for name, each in found.items()
             ),
         ),
@@ -105,7 +114,7 @@ def _section(finished: FinishedExperiment) -> list[str]:
     lines = [f"## {experiment.title}", ""]
     for note in outcome.notes:
         lines += [note, ""]
-    lines += _table((experiment.name, row) for row in outcome.rows)
+    lines += _row_table((experiment.name, row) for row in outcome.rows)
     lines.append("")
     for name in outcome.files:
         if name.endswith(".png"):
@@ -135,13 +144,13 @@ def report_text(results: Sequence[FinishedExperiment], *, quick: bool, seed: int
     ]
     found = counts(results)
     table = ((words, str(found[kind]["met"]), str(found[kind]["of"])) for kind, words in CLASSES.items())
-    lines += [markdown_table(("class", "met", "of"), table), ""]
+    lines += [*_table("class|met|of", 2, table), ""]
     lines += _choices(results)
     if lost:
-        lines += ["## Regressions", "", *_table(lost), ""]
+        lines += ["## Regressions", "", *_row_table(lost), ""]
     known = [entry for entry in missed if entry not in lost]
     if known:
-        lines += ["## Known misses", "", *_table(known), ""]
+        lines += ["## Known misses", "", *_row_table(known), ""]
     lines += ["## Contents", ""]
     lines += [f"* {result.experiment.title} — `{result.experiment.name}`" for result in results]
     lines.append("")

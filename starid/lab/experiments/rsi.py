@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -10,8 +11,8 @@ import numpy as np
 
 from starid.lab.experiments.author_noise import identification_noise
 from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
+from starid.lab.experiments.figures import Curve, Panel, precision, precision_axes
 from starid.lab.experiments.fsf import track_filter
-from starid.lab.experiments.rsi_figures import draw_sequences
 from starid.lab.experiments.rsi_trials import (
     BY_EQUATION,
     BY_TABLE,
@@ -21,6 +22,7 @@ from starid.lab.experiments.rsi_trials import (
     START,
     measured_step,
     method_of,
+    noise_label,
     set_label,
     side_as_printed,
     statistics,
@@ -34,11 +36,9 @@ SETTLING: Final = 5
 
 _BYTES_PER_CELL: Final = 5
 _FIELD_DEG: Final = 40.0
-_PUBLISHED: Final = (
-    *(f"{name}_{measure}" for name in ("error", "roll", "psi") for measure in ("mean", "sigma")),
-    *("trigger_percent", "exceeded_percent", "side_mean", "side_sigma"),
-    *("search_ms", "search_ms_sigma", "lasso_ms", "lasso_ms_sigma"),
-)
+_PUBLISHED: Final = tuple(name for name in RECURSION[0.995, 0, 0.5] if name != "region_kB")
+_SHOWN: Final = 40
+_LEAST: Final = 1e-4
 
 
 def parts(parameters: Parameters) -> list[Part]:
@@ -97,7 +97,7 @@ def _label(values: Mapping[str, Any]) -> str:
 
 def evaluate(e: Evaluation) -> None:
     """The tables beside ours, the figures, and the mean errors with memory against the published ones."""
-    found = {part.key: statistics(e.results[part.key]["numbers"], SETTLING) for part in e.parts}
+    found = {part.key: statistics(e[part]["numbers"], SETTLING) for part in e.parts}
     lines = []
     for part in e.parts:
         v, known = part.values, _published(part.values)
@@ -107,10 +107,10 @@ def evaluate(e: Evaluation) -> None:
         method = method_of(v["tau"], v["memory"], v["side"])
         lines.append({**v, "method": method, **found[part.key], **published})
     e.write("tables_6_7_6_8_6_9_h_1_h_2.csv", lines)
-    diagonal = [part for part in e.parts if part.values["false_stars"] == part.values["factor"]]
+    diagonal = [part for part in e.parts if part["false_stars"] == part["factor"]]
     _write_sides(e, diagonal, found)
     if not e.context.quick:
-        draw_sequences(e, diagonal, SETTLING)
+        _draw(e, diagonal)
     _compare(e, diagonal, found)
 
 
@@ -157,3 +157,69 @@ def _compare(e: Evaluation, diagonal: Sequence[Part], found: Mapping[str, dict[s
         worst = max(means, key=lambda words: means[words])
         quantity = f"greatest mean ε_f of all sets, p = {100 * overlap:g} %: RSI with memory (ours)"
         e.compare(quantity, ours=means[worst], remark=f"{worst}; {len(means)} sets.")
+
+
+def _draw(e: Evaluation, parts: Sequence[Part]) -> None:
+    """Draw all figures from the runs with μ = f; precision without the first `SETTLING` frames."""
+    parts = [part for part in parts if part["side"] != BY_TABLE]
+    for scale, overlap in itertools.product(e.parameters["scales"], e.parameters["overlaps"]):
+        curves = (
+            (
+                _set(part),
+                precision(
+                    e[part]["numbers"][0, SETTLING:],
+                    1.0,
+                    method_of(part["tau"], part["memory"]),
+                ),
+            )
+            for part in parts
+            # runs without noise belong to every scale
+            if (part["scale"] == scale or part["factor"] == 0) and part["overlap"] == overlap
+        )
+        title = f"Figures 6.37 to 6.41 and F: p = {100 * overlap:g} %, {noise_label(scale)}"
+        name = f"figures_6_37_to_6_41_and_f_p{100 * overlap:g}_x{scale:g}.png"
+        look = {"columns": 2, "width": 9.0, "height": 7.0, "sharey": True, "legend": "lower right"}
+        e.draw(name, curves, axes=precision_axes("ε_f"), title=title, **look)
+    scale, overlap = e.parameters["scales"][0], e.parameters["overlaps"][-1]
+    chosen = {"scale": scale, "overlap": overlap, "memory": 0}
+    _draw_frames(
+        e, [part for part in parts if chosen.items() <= part.values.items() and part["tau"] != LSI_ONLY]
+    )
+
+
+def _set(part: Part) -> str:
+    return f"μ = f = {part['factor']}"
+
+
+def _draw_frames(e: Evaluation, parts: Sequence[Part]) -> None:
+    """Draw frame by frame ε_ψ and ε_f (figures 6.33 to 6.36, E), and run times (6.42, 6.43, G)."""
+    frames = np.arange(1, _SHOWN + 1)
+    errors, times = [], []
+    for part in parts:
+        numbers = dict(zip(FIELDS, e[part]["numbers"][:, :_SHOWN], strict=True))
+        tau, words = part["tau"], f"{_set(part)}, τ = {part['tau']:g}"
+        error, psi = (1.0 + np.log10(np.maximum(numbers[name], _LEAST)) for name in ("error", "psi"))
+        hit = numbers["triggered"] > 0.0
+        curves = [
+            Curve(frames, error, "-", "1 + log₁₀ ε_f"),
+            Curve(frames, psi, "--", "1 + log₁₀ ε_ψ"),
+            Curve(frames, np.full(_SHOWN, 1.0 + np.log10(tau)), ":", "τ"),
+            Curve(frames[hit], psi[hit], "v", "update triggered"),
+        ]
+        errors.append(Panel(words, curves, {"xlabel": "frame"}))
+        left = [Curve(frames, numbers[name], "-", f"{name} / °") for name in ("error", "side")]
+        right = [
+            Curve(frames, numbers["search_ms"], "b--", "1NN / ms (right)"),
+            Curve(frames, numbers["lasso_ms"], "k:", "LASSO / ms (right)"),
+        ]
+        settings = {"xlabel": "frame", "ylim": (0.0, 4.0)}
+        times.append(Panel(words, left, settings, right=right, right_limit=1.0))
+    taus = len({part["tau"] for part in parts})
+    size = {"columns": taus, "width": 10.0, "height": 2.2 * len(parts) / taus, "sharex": True}
+    legend = {"legend": "outside lower center", "legend_columns": 4}
+    percent = f"p = {100 * e.parameters['overlaps'][-1]:g} %"
+    for name, number, shown, options in (
+        ("figures_6_33_to_6_36_and_e.png", "6.33 to 6.36 and E", errors, {"sharey": True}),
+        ("figures_6_42_6_43_and_g.png", "6.42, 6.43 and G", times, {}),
+    ):
+        e.draw(name, shown, title=f"Figures {number}: {percent}", **size, **legend, **options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -24,7 +24,7 @@ from starid.lab.experiments.rsi_trials import (
 from starid.lab.experiments.tables import RECURSION
 from starid.lab.simulation import PIXEL_DEG, NoiseModel, SimulatedFrame, sky_sequence, turned
 from starid.thesis.cme import matched_motion
-from starid.thesis.false_stars import FilterResult, ObservedFrame
+from starid.thesis.false_stars import FalseStarFilter, FilterResult
 from starid.thesis.features import extract_features
 from starid.thesis.fsf import ClusterFilter
 from starid.thesis.matlab_filter import MatlabFilter
@@ -43,16 +43,10 @@ _BYTES_PER_CELL: Final = 5
 _TABLES: Final = {0.995: "H.1", 0.9975: "H.2"}
 
 
-class _Replayed:
-    """Replays filter results, because several methods process the same frames."""
-
-    def __init__(self, results: Sequence[FilterResult]) -> None:
-        self._results = iter(results)
-
-    def __call__(self, before: ObservedFrame, now: ObservedFrame) -> FilterResult:
-        """Return the next result."""
-        del before, now
-        return next(self._results)
+def _replayed(results: Iterable[FilterResult]) -> FalseStarFilter:
+    """Replay filter results, because several methods process the same frames."""
+    left = iter(results)
+    return lambda _before, _now: next(left)
 
 
 def _settings(reading: str, tau: float) -> RsiSettings:
@@ -74,8 +68,8 @@ def compute(context: Context, part: Part) -> Results:
 
 def _trials(context: Context, part: Part) -> Results:
     """ε_f, ε_θ and ε_ψ of frames off the grid, from the region and from the whole database, (2, 3, n)."""
-    lsi = context.lost_in_space(part.values["overlap"], "matlab")
-    rng, noise = context.rng(part.key), identification_noise(part.values["factor"])
+    lsi = context.lost_in_space(part["overlap"], "matlab")
+    rng, noise = context.rng(part.key), identification_noise(part["factor"])
     frames = frames_under_test(rng, OFF, lsi.database.grid.step_deg, context.parameters["every"])
     numbers = np.empty((2, 3, len(frames)))
     stars = stars_of(context.sky(), frames, rng, lambda _: noise)
@@ -120,7 +114,7 @@ def _distances(frames: Sequence[SimulatedFrame], results: Sequence[FilterResult]
 
 def _sequences(context: Context, part: Part) -> Results:
     """Distances of the filter, and measurements (fields, n) of each database, reading and threshold."""
-    m, author = part.values["factor"], part.values["reading"] == "author"
+    m, author = part["factor"], part["reading"] == "author"
     noise = identification_noise(m, false_stars=m) if author else NoiseModel.of("both", m, false_stars=m)
     rng, count = context.rng(part.key), int(context.parameters["frames"])
     made = sky_sequence(rng, context.sky(), *START, noise, count=count, margin_deg=_MARGIN_DEG)
@@ -131,7 +125,7 @@ def _sequences(context: Context, part: Part) -> Results:
     readings = ("author",) if author else ("printed", "rigid")
     for overlap, reading, tau in itertools.product(context.parameters["overlaps"], readings, _TAUS):
         lsi = context.lost_in_space(overlap, "matlab" if author else "exact")
-        recursion = RecursiveIdentification(lsi, _Replayed(results), _settings(reading, tau))
+        recursion = RecursiveIdentification(lsi, _replayed(results), _settings(reading, tau))
         numbers = [measured_step(recursion.step(frame.observed), frame) for frame in frames]
         found[f"{reading}-p{100 * overlap:g}-t{tau:g}"] = np.array(numbers).T
     return found
@@ -197,8 +191,8 @@ def evaluate(e: Evaluation) -> None:
             compare(e, overlap, m, tau)
     lines = []
     for part in e.parts:
-        for name, numbers in e.results[part.key].items():
+        for name, numbers in e[part].items():
             if "reading" in part.values and name != "distances":
-                line = {"factor": part.values["factor"], "method": name}
+                line = {"factor": part["factor"], "method": name}
                 lines.append(line | statistics(numbers, _UNFILTERED))
     e.write("rsi_as_printed.csv", lines)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +15,7 @@ import numpy as np
 
 from starid.files import write_atomically
 from starid.lab.experiments.comparison import Outcome, ReproduceError
-from starid.lab.experiments.experiment import Context, Evaluation, Experiment, Parameters, Part, Results
+from starid.lab.experiments.experiment import Context, Evaluation, Experiment, Part, Results
 from starid.result_store import read_results, write_results
 
 OUTCOME_FILE: Final = "outcome.json"
@@ -33,7 +35,6 @@ class FinishedExperiment:
 
     experiment: Experiment
     outcome: Outcome
-    quick: bool
     seconds: float
     parts: int
 
@@ -59,12 +60,8 @@ class _Plan:
 
 
 def _plan(experiment: Experiment, folder: Path, *, quick: bool, seed: int) -> _Plan:
-    parameters: Parameters | None = experiment.quick if quick else experiment.full
-    if parameters is None:
-        raise ReproduceError(f"reproduce: {experiment.name} has no quick form; run it without --quick")
-    context = Context(
-        folder / experiment.name, folder / "databases", experiment.name, seed, parameters, quick
-    )
+    name, parameters = experiment.name, experiment.parameters(quick=quick)
+    context = Context(folder / name, folder / "databases", name, seed, parameters, quick)
     parts = tuple(experiment.parts(parameters))
     if len({part.key for part in parts}) != len(parts):
         raise ReproduceError(f"reproduce: {experiment.name} has two parts of the same name")
@@ -95,17 +92,7 @@ def _load_part(path: Path) -> tuple[Results, float]:
 
 def _stored_outcome(plan: _Plan) -> FinishedExperiment | None:
     """Return the stored outcome, if it is for the same parameters and all its files exist."""
-    stored = _read_outcome(plan.context.folder)
-    if stored is None or stored["fingerprint"] != plan.fingerprint:
-        return None
-    outcome = Outcome.from_dict(stored["outcome"])
-    if not all((plan.context.folder / name).exists() for name in outcome.files):
-        return None
-    return FinishedExperiment(plan.experiment, outcome, plan.context.quick, float(stored["seconds"]), 0)
-
-
-def _read_outcome(folder: Path) -> Mapping[str, Any] | None:
-    path = folder / OUTCOME_FILE
+    path = plan.context.folder / OUTCOME_FILE
     try:
         stored: Mapping[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
@@ -114,7 +101,12 @@ def _read_outcome(folder: Path) -> Mapping[str, Any] | None:
         raise ReproduceError(
             f"reproduce: {path} cannot be read ({error}); remove it to compute it again"
         ) from error
-    return stored
+    if stored["fingerprint"] != plan.fingerprint:
+        return None
+    outcome = Outcome.from_dict(stored["outcome"])
+    if not all((plan.context.folder / name).exists() for name in outcome.files):
+        return None
+    return FinishedExperiment(plan.experiment, outcome, float(stored["seconds"]), 0)
 
 
 def _evaluate_plan(plan: _Plan, computed: int) -> FinishedExperiment:
@@ -131,18 +123,14 @@ def _evaluate_plan(plan: _Plan, computed: int) -> FinishedExperiment:
     plan.experiment.evaluate(evaluation)
     outcome = evaluation.outcome()
     seconds += _processor_time() - start
-    text = json.dumps(
-        {
-            "fingerprint": plan.fingerprint,
-            "quick": plan.context.quick,
-            "seconds": round(seconds, 3),
-            "outcome": outcome.to_dict(),
-        },
-        indent=1,
-        ensure_ascii=False,
-    )
+    content = {
+        "fingerprint": plan.fingerprint,
+        "seconds": round(seconds, 3),
+        "outcome": dataclasses.asdict(outcome),
+    }
+    text = json.dumps(content, indent=1, ensure_ascii=False)
     write_atomically(plan.context.folder / OUTCOME_FILE, lambda path: path.write_text(text, encoding="utf-8"))
-    return FinishedExperiment(plan.experiment, outcome, plan.context.quick, seconds, computed)
+    return FinishedExperiment(plan.experiment, outcome, seconds, computed)
 
 
 def run(
@@ -170,10 +158,8 @@ def run(
     finished = {plan.experiment.name: _stored_outcome(plan) for plan in plans}
     open_plans = [plan for plan in plans if finished[plan.experiment.name] is None]
     todo = [(plan, part) for plan in open_plans for part in plan.parts if not plan.file(part).exists()]
-    missing = {plan.experiment.name: 0 for plan in open_plans}
-    for plan, _ in todo:
-        missing[plan.experiment.name] += 1
-    left, done = dict(missing), 0
+    missing = Counter(plan.experiment.name for plan, _ in todo)
+    left, done = missing.copy(), 0
 
     def end(plan: _Plan) -> None:
         finished[plan.experiment.name] = _evaluate_plan(plan, missing[plan.experiment.name])
@@ -201,11 +187,9 @@ def finished_in(
     folder: Path, experiments: Sequence[Experiment], *, quick: bool, seed: int
 ) -> list[FinishedExperiment]:
     """Load the outcomes stored in a folder for these parameters and this seed; compute nothing."""
-    found = []
-    for experiment in experiments:
-        if quick and experiment.quick is None:
-            continue
-        stored = _stored_outcome(_plan(experiment, folder, quick=quick, seed=seed))
-        if stored is not None:
-            found.append(stored)
-    return found
+    stored = (
+        _stored_outcome(_plan(experiment, folder, quick=quick, seed=seed))
+        for experiment in experiments
+        if not quick or experiment.quick is not None
+    )
+    return [each for each in stored if each is not None]

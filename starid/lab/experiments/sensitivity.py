@@ -142,8 +142,8 @@ def evaluate(e: Evaluation) -> None:
         add("K", factor, "valid answers beyond 1°", gross)
     for part in e.parts:
         if "epsilon" in part.values:
-            epsilon, least = part.values["epsilon"], part.values["share"]
-            precision, recall, _ = 100.0 * e.results[part.key]["indicators"]
+            epsilon, least = part["epsilon"], part["share"]
+            precision, recall, _ = 100.0 * e[part]["indicators"]
             quantity = f"ε = {epsilon:g}, min_samples = {least:g}·n"
             line = {"parameter": quantity, "value": epsilon, "measure": "precision and recall"}
             lines.append(line | {"as_the_author_ran_it": precision, "as_printed": recall})

@@ -65,8 +65,8 @@ def parts(parameters: Parameters) -> list[Part]:
 
 def compute(context: Context, part: Part) -> Results:
     """Errors, times and modes of the frames, (n, 8), in the order of `_COLUMNS`."""
-    identifier = _identifier(part.values["algorithm"])
-    recursive = part.values["algorithm"] == "rsi"
+    identifier = _identifier(part["algorithm"])
+    recursive = part["algorithm"] == "rsi"
     rng = context.rng(part.key)
     count = int(context.parameters["frames"])
     numbers = np.full((count, len(_COLUMNS)), np.nan)
@@ -76,7 +76,7 @@ def compute(context: Context, part: Part) -> Results:
     predicted: Attitude | None = None
     for i in range(count):
         attitude = propagate(attitude, np.radians(_SLEW_DEG), 1.0) if recursive else random_attitude(rng)
-        xy, flux = points(rng, identifier.camera, identifier.catalog, attitude, part.values["noise"])
+        xy, flux = points(rng, identifier.camera, identifier.catalog, attitude, part["noise"])
         begin = time.perf_counter()
         if recursive and predicted is not None:
             solution = identifier.track(xy, flux, predicted)
@@ -105,9 +105,9 @@ def evaluate(e: Evaluation) -> None:
     """Shares, errors and times of each algorithm and noise; none may be valid and wrong."""
     lines = []
     for part in e.parts:
-        numbers, noise = e.results[part.key]["numbers"], part.values["noise"]
-        name, label = part.values["algorithm"].upper(), _label(noise)
-        head = {"algorithm": part.values["algorithm"], "noise": label}
+        numbers, noise = e[part]["numbers"], part["noise"]
+        name, label = part["algorithm"].upper(), _label(noise)
+        head = {"algorithm": part["algorithm"], "noise": label}
         lines += [head | dict(zip(_COLUMNS, frame, strict=True)) for frame in numbers]
         found = dict(zip(_COLUMNS, numbers.T, strict=True))
         valid = found["valid"] > 0.0

@@ -107,13 +107,11 @@ KNOWN_MISSES: Final = {
 """Experiment and quantity → why the check fails."""
 
 
-def known_miss(
-    experiment: str, row: Row, known: Mapping[tuple[str, str], KnownMiss] | None = None
-) -> KnownMiss | None:
+def known_miss(experiment: str, row: Row) -> KnownMiss | None:
     """Return the entry for a failed row; None if there is none or fewer numbers agree than it states."""
     if row.passed is not False:
         return None
-    entry = (KNOWN_MISSES if known is None else known).get((experiment, row.quantity))
+    entry = KNOWN_MISSES.get((experiment, row.quantity))
     return entry if entry is not None and row.met >= entry.met else None
 
 

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
-from starid.lab.experiments.experiment import (
-    Context,
-    Evaluation,
-    Part,
-    Results,
-    author_database,
-    star_catalog,
-)
+from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve, Panel
 from starid.lab.experiments.lsi_trials import HALF_FRAME_DEG
+from starid.thesis.database import THESIS_KAPPA, DatabaseParameters, FeatureDatabase, build_database
+from starid.thesis.lasso import LAMBDAS
+from starid.thesis.lsi import LostInSpace
+from starid.thesis.matlab_lasso import matlab_path
 from starid.thesis.metrics import boresight_error
+from starid.thesis.subcell import SubcellSearch
 
 _CORNER: Final = (95.0, -85.0)
 _COLUMNS: Final = ("n", "A", "r", "sigma_A", "sigma_r")
@@ -24,7 +23,7 @@ _NEAREST: Final = 735
 _CELLS: Final = (509, 510, 511, 734, 735, 736, 959, 960, 961)
 _THETAS: Final = "polar angles θ of the dictionary"
 _LABELS: Final = {"mse": "MSE", "one_se": "1SE"}
-_PERCENT, _WIDER_PERCENT = 96.0, 98.0
+_OVERLAP, _WIDER_OVERLAP = 0.96, 0.98
 
 _LAMBDA: Final = {"mse": 1.00, "one_se": 1.40}
 """The λ of eq. 2.34 whose weights are nearest to the printed ones."""
@@ -32,14 +31,21 @@ _TURN: Final = 3.6
 """Degrees of polar angle per unit of the normalised scale."""
 
 
+def _author_database(overlap: float, brightest: float) -> FeatureDatabase:
+    """Planar database with magnitudes relative to the brightest star of the catalogue.
+
+    These are the weights of the thesis's frame object, a − min(a). The normalised features differ only in r,
+    by hundredths of a degree before normalisation. The mean brightness A is larger by −min(a).
+    """
+    stars = star_catalog()
+    parameters = DatabaseParameters(overlap=overlap, kappa=THESIS_KAPPA - brightest)
+    return build_database(replace(stars, hp=stars.hp - brightest), parameters)
+
+
 def _author() -> Results:
     """The author's version: weights relative to the brightest star, six features, MATLAB's `lasso`."""
-    from starid.thesis.lasso import LAMBDAS
-    from starid.thesis.lsi import LostInSpace
-    from starid.thesis.matlab_lasso import matlab_path
-
-    database, wider = author_database(_PERCENT / 100.0), author_database(_WIDER_PERCENT / 100.0)
     least = float(star_catalog().hp.min())
+    database, wider = (_author_database(overlap, least) for overlap in (_OVERLAP, _WIDER_OVERLAP))
     centre = np.array(_CORNER) + HALF_FRAME_DEG
     features = database.sky.features(float(centre[0]), float(centre[1]))
     cells = [database.exact_features(cell - 1) for cell in _CELLS]
@@ -74,9 +80,8 @@ def _author() -> Results:
 
 def compute(context: Context, part: Part) -> Results:
     """The example as printed, by the sub-cell search, and as the author ran it (`author_…`)."""
-    from starid.thesis.subcell import SubcellSearch
-
-    lsi = context.lost_in_space(part.values["percent"] / 100.0)
+    del part
+    lsi = context.lost_in_space(_OVERLAP)
     centre = np.array(_CORNER) + HALF_FRAME_DEG
     features = context.sky().features(float(centre[0]), float(centre[1]))
     observation = lsi.database.normalise(features)
@@ -185,4 +190,4 @@ def _draw(e: Evaluation, result: Results) -> None:
         for style, label, (x, y) in points
     )
     settings = {"xlabel": "α of the lower-left corner / °", "ylabel": "δ of the lower-left corner / °"}
-    e.draw("figure_5_1.png", [Panel("", [*cells, *marks], settings, "best")], width=7.5, height=5.4)
+    e.draw("figure_5_1.png", [Panel("", [*cells, *marks], settings)], width=7.5, height=5.4, legend="best")

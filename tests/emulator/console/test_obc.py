@@ -72,7 +72,7 @@ async def as_obc(emulation, icd, bus):
     await client.start()
     row = next(row for row in icd.telemetry.values() if row.answers == ("reply",))
     for _ in range(2):
-        await client.transact(icd.request(row, b""), row.name, row.size)
+        await client.transact(icd.request(row, b""), row.name)
     await client.close()
 
 

@@ -63,7 +63,7 @@ def test_truth_is_read_back_and_swapped_while_running(run):
                 ({"truth": {}}, "truth.kind: must be one of '42', 'file', 'fixed', 'live', 'rate', 'slew'"),
                 (
                     {"truth": {"kind": "fixed", "attitude": {"ra_deg": "x"}}},
-                    "truth.attitude.ra_deg: must be a valid number (given: 'x')",
+                    "truth.attitude.ra_deg: must be a number (given: 'x')",
                 ),
             ):
                 assert await control.do("set_truth", **wrong) == {"ok": False, "error": said}

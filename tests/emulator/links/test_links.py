@@ -23,7 +23,7 @@ from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Re
 from starhil.protocol.serial_interface import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
-from tests.protocol.composed_links import CUBESPACE
+from tests.protocol.composed_links import CUBESPACE, CUBESTAR
 
 SEED = 20260101
 JUNK = 10_000
@@ -46,9 +46,8 @@ class Linked:
 
     def over_serial(self, identifier, data=b"", dialect=None) -> list[Reply | LinkFault]:
         request = Request.of(identifier, data)
-        row = self.bench.icd.row_by_id(identifier)
-        host = CUBESPACE.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
-        host.expect(request, row.size if row and identifier >= 128 else 0)
+        host = CUBESTAR.host(Dialect(dialect or self.bench.device.parameters["serial_dialect"]))
+        host.expect(request)
         self.uart.take()
         self.uart.arrive(CUBESPACE.encode_request(request))
         return host.feed(b"".join(self.uart.take()), 0.0)

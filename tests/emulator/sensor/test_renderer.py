@@ -236,13 +236,13 @@ def test_other_cameras_render(catalog: StarCatalog) -> None:
     ],
 )
 def test_bad_sensors_are_rejected_in_one_line(field: str, value: object) -> None:
-    with pytest.raises(EmulatorError, match=rf"^sensor {field}: must be .*, not ") as caught:
+    with pytest.raises(EmulatorError, match=rf"^sensor\.{field}: must be .*, not ") as caught:
         SensorModel().with_(**{field: value})
     assert "\n" not in str(caught.value)
 
 
 def test_unknown_sensor_fields_are_named() -> None:
-    with pytest.raises(EmulatorError, match="sensor apperture_m: no such field"):
+    with pytest.raises(EmulatorError, match=r"sensor\.apperture_m: unknown key; did you mean aperture_m"):
         SensorModel().with_(apperture_m=0.01)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from starid.lab.experiments.figures import Curve, curves_of, draw, panels, precision
+from starid.lab.experiments.figures import Curve, Panel, curves_of, draw, panels_of, precision
 
 
 def test_lines_of_a_table_become_a_curve_for_each_label():
@@ -16,12 +16,12 @@ def test_lines_of_a_table_become_a_curve_for_each_label():
 
 def test_curves_of_one_title_share_a_panel_in_order():
     curves = [("b", Curve([0], [1], "-", "one")), ("a", Curve([0], [2])), ("b", Curve([0], [3]))]
-    made = panels(curves, "best", xlabel="x")
+    made = panels_of([*curves, Panel("a", [])])
     assert [(panel.title, [curve.y for curve in panel.curves]) for panel in made] == [
         ("b", [[1], [3]]),
         ("a", [[2]]),
+        ("a", []),
     ]
-    assert all(panel.legend == "best" and panel.settings == {"xlabel": "x"} for panel in made)
 
 
 def test_precision_is_the_share_of_errors_up_to_a_threshold():
@@ -31,6 +31,6 @@ def test_precision_is_the_share_of_errors_up_to_a_threshold():
 
 
 def test_a_figure_with_empty_places_is_drawn(tmp_path):
-    made = panels((f"panel {i}", Curve([0, 1], [0, i])) for i in range(3))
-    assert draw(tmp_path / "three.png", made, columns=2) == "three.png"
+    made = ((f"panel {i}", Curve([0, 1], [0, i], label="line")) for i in range(3))
+    assert draw(tmp_path / "three.png", made, columns=2, legend="best", axes={"xlabel": "x"}) == "three.png"
     assert (tmp_path / "three.png").read_bytes().startswith(b"\x89PNG")
