@@ -168,11 +168,11 @@ class AroundOptions:
             if path is not None:
                 prepare_output(path, option)
         return RunOptions(
-            self.truth_log,
-            self.overwrite,
-            self.control,
-            self.control_token or "",
-            self.scenario,
+            truth_log=self.truth_log,
+            overwrite=self.overwrite,
+            control=self.control,
+            control_token=self.control_token or "",
+            scenario=self.scenario,
             record=folder,
             view=self.view,
             view_token=self.view_token or "",
@@ -288,8 +288,8 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
     return found[0] if found else None
 
 
-def _as_toml(value: str | int) -> str:
+def _as_toml(value: str | float) -> str:
     """Write a value as TOML."""
-    if isinstance(value, int):
+    if isinstance(value, (int, float)):
         return str(value)
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
