@@ -287,7 +287,7 @@ def measured_attitude(values: Mapping[str, Value]) -> Quaternion:
 
     Raises BenchError: the attitude in the row is flagged invalid, or there is none.
     """
-    if values.get("valid") in (False, "false"):  # a flag, or a member of a map
+    if values.get("valid") is False:
         raise BenchError(f"the attitude is not valid (reason {show(values.get('reason', '?'))})")
     parts = [float(values[key]) for key in ("q_x", "q_y", "q_z")]
     if "q_w" in values:

@@ -19,7 +19,8 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.messages import RequestKind
+from starhil.protocol.names import remedy
 from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
@@ -29,10 +30,9 @@ from starhil.protocol.values import (
     Value,
     limits_text,
     number_of,
-    to_f32,
+    representable,
 )
 
-RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
 STRUCT_CODES: Final = dict(
@@ -116,6 +116,11 @@ class Field(FieldKeys):
         """Return the byte in the row that holds a bit of the raw value, and the bit in that byte; 0 is the lowest."""
         byte, position = divmod(self.shift + bit, 8)
         return self.offset + (byte if self.slot.order == "little" else self.size - 1 - byte), position
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether the values are true and false: a bit, or numbers that a `map` assigns to them."""
+        return self.kind == "flag" or (self.enum is not None and self.enum.is_flag)
 
     @property
     def scaled(self) -> bool:
@@ -245,13 +250,13 @@ class Field(FieldKeys):
     def to_physical(self, raw: Any) -> Value:
         """Convert a raw value to the physical one.
 
-        A number that is not in the enumeration stays a number.
+        A number that is not in the enumeration stays a number; `true` and `false` are flags.
         """
         match self.kind:
             case "flag":
                 return bool(raw)
             case "enum":
-                return self.enum.names.get(raw, int(raw)) if self.enum is not None else int(raw)
+                return self.enum.value_of(int(raw)) if self.enum is not None else int(raw)
             case "bytes":
                 return bytes(raw)
             case "text":
@@ -286,9 +291,7 @@ class Field(FieldKeys):
         return FieldError(f"{where}: {value!r} is outside {limits_text(low, high, self.unit)}", index=index)
 
     def _check_float(self, value: float, where: str, index: int) -> None:
-        low, high = self.physical_limits
-        if self.slot.type == "f32":
-            low, high = min(low, to_f32(low)), max(high, to_f32(high))
+        low, high = representable(*self.physical_limits, self.slot.type)
         if not low <= value <= high:
             raise self._outside(value, where, index)
 
@@ -317,7 +320,7 @@ class Field(FieldKeys):
             if isinstance(value, bool) or value in (0, 1):
                 return int(value)
             raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
-        if not check and isinstance(value, int) and low <= value <= high:
+        if not check and type(value) is int and low <= value <= high:
             return int(value)
         return self.enum.number(value, where, index=index)
 
@@ -360,7 +363,7 @@ class Row(RowKeys):
     """A telecommand or telemetry row: its keys, its layout, and the codec of its values."""
 
     provenance: Provenance = "ours"
-    kind: RowKind
+    kind: RequestKind
     size: int
     """Bytes of data."""
     fields: tuple[Field, ...]
@@ -447,9 +450,7 @@ class Row(RowKeys):
         unknown = given.keys() - self.named_fields.keys()
         if unknown:
             name = min(unknown)
-            hint = did_you_mean(name, self.named_fields)
-            known = ", ".join(self.named_fields) or "none"
-            raise FieldError(f"{self.name}.{name}: no such field{hint} (fields: {known})")
+            raise FieldError(f"{self.name}.{name}: no such field{remedy(name, self.named_fields)}")
         raw: list[Any] = [0] * len(self._sent)
         for index, (name, item, position) in enumerate(self._values):
             where = f"{self.name}.{name}"

@@ -97,6 +97,10 @@ class DefinitionModel(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
 
+FLAGS: Final = {"false": False, "true": True}
+"""Value of each member of an enumeration that is a flag."""
+
+
 class EnumDefinition(DefinitionModel):
     """An enumeration."""
 
@@ -119,16 +123,27 @@ class EnumDefinition(DefinitionModel):
         """Name of each number."""
         return MappingProxyType({number: name for name, number in self.values.items()})
 
+    @cached_property
+    def is_flag(self) -> bool:
+        """Whether the names are `true` and `false`, or one of them."""
+        return self.values.keys() <= FLAGS.keys()
+
+    def value_of(self, number: int) -> str | bool | int:
+        """Return the name of a number, or what it stands for in a flag; a number without a name stays a number."""
+        name = self.names.get(number)
+        return number if name is None else FLAGS[name] if self.is_flag else name
+
     def number(self, value: Value, where: str, *, index: int = 0) -> int:
-        """Return the number of a name, or of a number that has a name.
+        """Return the number of a name, a flag, or a number that has a name.
 
         Raise FieldError otherwise.
         """
-        if isinstance(value, str):
-            if value in self.values:
-                return self.values[value]
-        elif isinstance(value, (int, float)) and not isinstance(value, bool) and value in self.names:
-            return int(value)
+        name = str(value).lower() if isinstance(value, bool) else value
+        if isinstance(name, str):
+            if name in self.values:
+                return self.values[name]
+        elif isinstance(name, (int, float)) and name in self.names:
+            return int(name)
         allowed = ", ".join(f"{name} ({number})" for name, number in self.values.items())
         raise FieldError(f"{where}: {value!r} is not one of {allowed}", index=index)
 
@@ -138,6 +153,11 @@ def to_f32(value: float) -> float:
     if math.isfinite(value) and abs(value) > F32_MAX:
         return math.copysign(math.inf, value)
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
+
+
+def representable(low: float, high: float, type_: str) -> tuple[float, float]:
+    """Return limits widened to values that the type can represent: the f32 nearest to a limit may be outside it."""
+    return (min(low, to_f32(low)), max(high, to_f32(high))) if type_ == "f32" else (low, high)
 
 
 def number_of(value: Value, where: str, *, index: int = 0) -> int | float:
@@ -242,12 +262,9 @@ class Parameter(ParameterKeys):
             if not math.isfinite(number) or number != int(number):
                 raise FieldError(f"{self.name}: {number!r} is not a whole number")
             number = int(number)
-            low, high = self.minimum, self.maximum
         else:
             number = float(number)
-            single = self.type == "f32"
-            low = min(self.minimum, to_f32(self.minimum)) if single else self.minimum
-            high = max(self.maximum, to_f32(self.maximum)) if single else self.maximum
+        low, high = representable(self.minimum, self.maximum, self.type)
         if not low <= number <= high:
             limits = limits_text(self.minimum, self.maximum, self.unit)
             raise FieldError(f"{self.name}: {number:g} is outside {limits}")

@@ -182,7 +182,7 @@ def telecommand_crc(data: bytes) -> int:
 def _argument_converter(field: Field, unit: str, is_bool: bool) -> Callable[[Any], Any]:
     scale = factor(field.unit, unit) if unit else 1.0
     if is_bool:
-        return lambda value: value == "true" if isinstance(value, str) else bool(value)
+        return bool
     if scale in (None, 1.0):
         return lambda value: value
     return lambda value: value * scale

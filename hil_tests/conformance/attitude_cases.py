@@ -81,9 +81,9 @@ class AttitudeRow:
         return f"{self.row.name} has one attitude in all forms if it is valid, and the true one"
 
     def is_valid(self, seen: Mapping[str, Value]) -> bool:
-        """Return whether the flag, which may be a number, is set; without a flag, whether any number is not 0."""
+        """Return whether the flag, which may be the number 1, is set; without a flag, whether any number is not 0."""
         if self.flag is not None:
-            return str(seen[self.flag]).lower() in ("true", "1")
+            return seen[self.flag] == 1
         return self._is_stated(seen)
 
     def _is_stated(self, seen: Mapping[str, Value]) -> bool:

@@ -24,6 +24,8 @@ INVALID_PARAMETER: Final = "invalid_parameter"
 INVALID_CRC: Final = "crc"
 SEQUENCE: Final = "sequence"
 
+SETTING_ACTIONS: Final = frozenset({None, "nothing", "set_parameters", "subscribe", "select_unsolicited"})
+"""Actions of the device model that repeating a telecommand with the same data does not carry out again."""
 LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
 RECOVERY_S: Final = 1.0
@@ -63,18 +65,19 @@ class Settings(Protocol):
 
 
 class ReadableSettings:
-    """Settings for any unit: the telecommands whose values a telemetry row reports."""
+    """Settings for any unit: the telecommands whose values a telemetry row reports, unless they do something once, such as a reset."""
 
     def __init__(self) -> None:
         self._found: list[tuple[Row, bytes]] = []
 
     def prepare(self, probe: LinkProbe) -> None:
         """Record the settings."""
-        self._found = []
-        for row in probe.unit.telemetry.values():
-            first = next(iter(row.named.values()), None)
-            if first is not None and first.telecommand is not None:
-                self._found.append((probe.unit.telecommands[first.telecommand], probe.data_of(row)))
+        kept = SETTING_ACTIONS.union(probe.unit.plugin.actions if probe.unit.plugin is not None else ())
+        self._found = [
+            (command, probe.data_of(row)[part])
+            for command, row, part in probe.unit.reported_data
+            if command.action in kept
+        ]
 
     def restore(self, probe: LinkProbe) -> None:
         """Restore the settings."""
@@ -364,18 +367,20 @@ class LinkProbe(ABC):
         return ", ".join(f"{name} {value!s}" for name, value in found.items())
 
     def silence(self, *, booting: bool) -> str | None:
-        """Read three telemetry rows; return None if one is answered correctly, otherwise the invalid answer.
+        """Read three telemetry rows; return None if one is answered correctly, otherwise the invalid answer, and what to check.
 
         If the unit may be booting, the requests are repeated until it must have booted.
         """
         rows = sorted(self.unit.telemetry.values(), key=lambda row: row.size)[:3]
         end = self.now() + (self.times.boot_s if booting else 0.0)
         while True:
-            seen = [str(answer) for row in rows if (answer := self._bad_answer(row)) is not None]
+            seen = [answer for row in rows if (answer := self._bad_answer(row)) is not None]
             if len(seen) < len(rows):
                 return None
             if self.now() >= end:
-                return next((text for text in seen if text != "nothing"), "nothing")
+                worst = max(seen, key=lambda answer: (bool(answer.fault), answer.kind != "none"))
+                unclear = worst.kind != "none" and not worst.fault
+                return f"{worst}; check --dialect, --baud and the addresses" if unclear else str(worst)
 
     def _bad_answer(self, row: Row) -> Answer | None:
         """Request a row; return the answer if it is neither valid telemetry nor a published refusal."""

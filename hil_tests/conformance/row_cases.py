@@ -217,12 +217,13 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
             yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
-    for row in unit.telemetry.values():
-        source = next((item.telecommand for item in row.named.values() if item.telecommand), None)
-        if source is not None and unit.telecommands[source].action in (None, "nothing"):
-            title = f"{row.name} reports the bytes set by {source}"
-            run = partial(_read_back, unit.telecommands[source], row, marks)
-            yield case_in("settings", row.name, title, run, row, intrusive=True)
+    for command, row, part in unit.reported_data:
+        if command.action in (None, "nothing"):
+            title = f"{row.name} reports the bytes set by {command.name}"
+            run = partial(_read_back, command, row, part, marks)
+            alone = sum(other is row for _, other, _ in unit.reported_data) == 1
+            name = row.name if alone else f"{row.name}.{command.name}"
+            yield case_in("settings", name, title, run, row, intrusive=True)
 
 
 def _accepted(row: Row, probe: LinkProbe) -> None:
@@ -238,15 +239,15 @@ def _accepted(row: Row, probe: LinkProbe) -> None:
                 probe.send_command(row, row.encode({name: limit}))
 
 
-def _read_back(command: Row, row: Row, marks: bytes, probe: LinkProbe) -> None:
-    before = probe.data_of(row)
+def _read_back(command: Row, row: Row, part: slice, marks: bytes, probe: LinkProbe) -> None:
+    before = probe.data_of(row)[part]
     rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
     for turn in range(3):
         data = command.encode(
             {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
         )
         probe.send_command(command, data)
-        check_equal(probe.data_of(row), data, f"the bytes of {command.name}")
+        check_equal(probe.data_of(row)[part], data, f"the bytes of {command.name}")
     probe.send_command(command, before)
 
 

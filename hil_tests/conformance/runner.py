@@ -236,5 +236,4 @@ def _verdict_if_silent(probe: Probe, port: str, *, booting: bool) -> Verdict | N
         return None
     if seen == "nothing":
         return Verdict(FAILED, "an answer to a request", f"nothing answers on {port}")
-    remedy = "check --dialect, --baud and the addresses"
-    return Verdict(FAILED, "an answer to a request", f"no star sensor answers on {port}: {seen}; {remedy}")
+    return Verdict(FAILED, "an answer to a request", f"no valid answer on {port}: {seen}")

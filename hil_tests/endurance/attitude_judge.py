@@ -8,7 +8,7 @@ from typing import Final
 
 from starhil.hil_tests.attitude import Quaternion, conjugate, from_matrix, product
 from starhil.hil_tests.endurance.truth import Error, Motion, Vector, cross, frame_turned, of_pairs
-from starhil.hil_tests.endurance.violation import Known, Violation, flag, resolution
+from starhil.hil_tests.endurance.violation import Known, Violation, resolution
 from starhil.protocol.codec import Field
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.units_of_measure import factor
@@ -68,7 +68,7 @@ class AttitudeJudge:
         reported = [read[name] for name in (f"attitude.{letter}" for letter in "xyzw") if name in read]
         numbers = [float(value) for _, value in reported if not isinstance(value, (str, bytes))]
         stars = _stars(read)
-        if not flag(read["attitude.valid"][1]):
+        if not read["attitude.valid"][1]:
             if any(
                 abs(number) > resolution(field) for number, (field, _) in zip(numbers, reported, strict=True)
             ):

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
 from starhil.hil_tests.endurance.truth import Motion
-from starhil.hil_tests.endurance.violation import Known, Violation, flag, quantity_of, resolution
+from starhil.hil_tests.endurance.violation import Known, Violation, quantity_of, resolution
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
@@ -340,7 +340,7 @@ class Oracle:
         expected, tolerance = known
         wrong = False
         if isinstance(expected, bool) or isinstance(value, bool):
-            wrong = field.kind in ("flag", "integer", "bits", "enum") and flag(value) != flag(expected)
+            wrong = field.kind in ("flag", "integer", "bits", "enum") and bool(value) != bool(expected)
         elif isinstance(expected, str) or isinstance(value, str):
             wrong = type(value) is type(expected) and not field.aliases and value != expected
         else:

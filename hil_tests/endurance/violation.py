@@ -14,11 +14,6 @@ class Violation(Exception):  # noqa: N818 (what it is called)
     """Something that a unit must never do."""
 
 
-def flag(value: Value) -> bool:
-    """Return a truth value that may have been sent as a member of an enumeration."""
-    return value == "true" if isinstance(value, str) else bool(value)
-
-
 def quantity_of(field: Field) -> str:
     """Return the quantity that a field reports; empty if it reports none."""
     return PARAMETER + field.parameter if field.parameter else field.value or ""

@@ -46,6 +46,12 @@ def check_function(
             return custom(model.name)
 
 
+def described(model: Any) -> str:
+    """Return the name of the check that a definition selects, with its type, and its polynomial or plugin name if it has one."""
+    own = f"{model.poly:X}h" if model.kind == "crc" else getattr(model, "name", "")
+    return " ".join(filter(None, (model.kind, getattr(model, "type", ""), own)))
+
+
 def _sum(covered: bytes, size: int, complement: str) -> int:
     total = sum(covered) % (1 << 8 * size)
     return {"none": total, "ones": (1 << 8 * size) - 1 - total, "twos": -total % (1 << 8 * size)}[complement]

@@ -7,7 +7,7 @@ said so in docs/rules.md: the reader of the TOML files; the framing and check of
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +19,7 @@ from starhil.hil_tests.judge.rows import SIZES, Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import find_unit
+from starhil.protocol.names import find_unit
 
 
 @dataclass(frozen=True)
@@ -98,6 +98,26 @@ class Unit:
         if self.first_telemetry_id is not None:
             return row_id >= self.first_telemetry_id
         return any(row.id == row_id for row in self.telemetry.values())
+
+    def serial_answers(self, row: Row) -> Sequence[str]:
+        """Return the answers of a row on the serial line."""
+        return () if row.name in self.unanswered else row.answers
+
+    @cached_property
+    def reported_data(self) -> tuple[tuple[Row, Row, slice], ...]:
+        """Each telecommand whose last data telemetry reports, the row that does, and which of its bytes they are."""
+        found = []
+        for row in self.telemetry.values():
+            firsts = {
+                item.telecommand: item
+                for item in tuple(row.named.values())[::-1]
+                if item.telecommand is not None
+            }
+            for name, first in firsts.items():
+                command = self.telecommands[name]
+                start = first.offset - command.named[first.name].offset
+                found.append((command, row, slice(start, start + command.size)))
+        return tuple(found)
 
     def request(self, row: Row | int, data: bytes = b"", klass: str = "") -> Request:
         """Return the request for a row, or for an ID, which need not belong to one."""

@@ -65,6 +65,8 @@ class Answer:
         Header, data and check, without framing (serial).
     number
         Number that the unit gives its messages; None if it does not number such a message.
+    fault
+        What is wrong with a malformed answer, if its header can be read.
     """
 
     kind: AnswerKind
@@ -77,6 +79,7 @@ class Answer:
     time_s: float = 0.0
     body: bytes = b""
     number: int | None = None
+    fault: str = ""
 
     def __str__(self) -> str:
         where = "" if self.row_id is None else f" of {self.klass} {self.row_id}".replace("  ", " ")
@@ -86,6 +89,7 @@ class Answer:
             case "telemetry" | "burst" | "unsolicited":
                 return f"{self.kind}{where}, {len(self.data)} bytes: {self.data[:24].hex(' ')}"
             case "malformed":
-                return f"malformed, {len(self.data)} bytes: {self.data[:24].hex(' ')}"
+                what = f"malformed ({self.fault})" if self.fault else "malformed"
+                return f"{what}, {len(self.data)} bytes: {self.data[:24].hex(' ')}"
             case _:
                 return f"acknowledge{where}" if self.kind == "ack" else "nothing"

@@ -28,6 +28,8 @@ SIZES: Final = {
 """Bytes of each type of number."""
 LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
 """Largest finite number of each floating type; any finite number fits f64."""
+FLAGS: Final = {"false": False, "true": True}
+"""An enumeration with no other names is a flag."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +147,8 @@ class Field:
 
     def raw_of(self, value: Value) -> int:
         """Return the raw number of a flag, a member of an enumeration, or a physical number."""
-        if isinstance(value, str):
-            return (self.enum or {})[value]
+        if isinstance(value, str) or (isinstance(value, bool) and self.enum is not None):
+            return (self.enum or {})[str(value).lower() if isinstance(value, bool) else value]
         if isinstance(value, bytes):
             raise TypeError(f"{self.name}: bytes are not a number")
         if self.kind in ("enum", "flag") or (self.scale == 1.0 and self.bias == 0.0):
@@ -173,7 +175,11 @@ class Field:
         if self.kind == "flag":
             return bool(raw)
         if self.kind == "enum":
-            return next((name for name, number in (self.enum or {}).items() if number == raw), int(raw))
+            names = self.enum or {}
+            members: Mapping[str, Value] = FLAGS if names.keys() <= FLAGS.keys() else {}
+            return next(
+                (members.get(name, name) for name, number in names.items() if number == raw), int(raw)
+            )
         scaled = self.scale != 1.0 or self.bias != 0.0
         return raw * self.scale + self.bias if scaled else raw
 

@@ -18,7 +18,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, Final, Protocol
 
-from starhil.hil_tests.judge.checks import check_function
+from starhil.hil_tests.judge.checks import check_function, described
 from starhil.hil_tests.judge.definition import Unit, plugin_check, plugin_framing
 from starhil.hil_tests.judge.formats import CODE, first_byte_of, format_models, text_answer
 from starhil.hil_tests.judge.framings import Framing, Taken
@@ -115,6 +115,15 @@ class SerialLine:
         """Return a request as bytes on the line."""
         framing, envelope = self.request_format(request.klass)
         return framing.encode(envelope.body(request))
+
+    def post(self, request: Request, *, answered: bool = True) -> bytes:
+        """Return a request as bytes on the line, with the next sequence number; its answer is expected, if it has one."""
+        request = self.numbered(request)
+        line = self.encode(request)
+        row = self._unit.row(request)
+        if answered and (row is None or self._unit.serial_answers(row)):
+            self.expect(request)
+        return line
 
     def telemetry_frame(self, body: bytes, klass: str) -> bytes:
         """Return the body of a telemetry answer as bytes on the line."""
@@ -228,6 +237,7 @@ class Headed:
         self._klass = classes[0] if len(classes) == 1 else ""
         self._classes, self._elsewhere = classes, elsewhere
         self._start = framing.start
+        self._check = described(check)
         self._compute = check_function(check, unit.byte_order, partial(plugin_check, unit))
         self.covers = getattr(check, "covers", [])
         self.check_size = len(self._compute(b""))
@@ -296,26 +306,29 @@ class Headed:
             found = text_answer(self._unit.serial, text, asked, taken.body)
             if found is not None:
                 return found
+        malformed = partial(Answer, "malformed", data=taken.body)
         try:
             opened = self.replies.read(text, self._klass)
             request = None if opened is None else self._request(opened, asked)
-        except ValueError:
-            opened = request = None
+        except ValueError as error:
+            return malformed(fault=str(error))
         if opened is None or request is None:
-            return Answer("malformed", data=taken.body)
+            return malformed()
         header, data = taken.body[: opened.size], taken.body[opened.size : end]
-        if self.closed(header, data) != taken.body or self.replies.data_size(opened) not in (None, len(data)):
-            return Answer("malformed", data=taken.body)
+        computed = self._compute(self._covered(header, data))
+        if computed != taken.body[end:]:
+            received = taken.body[end:].hex(" ")
+            return malformed(fault=f"check {self._check}: computed {computed.hex(' ')}, received {received}")
+        size = self.replies.data_size(opened)
+        if size not in (None, len(data)):
+            return malformed(fault=f"length for {size} bytes of data, received {len(data)}")
         values = opened.values
         asynchronous = values.get("class") in self._unsolicited
         numbered = ("unsolicited" if asynchronous else "reply") in self._numbered
-        if (
-            asked is not None
-            and not asynchronous
-            and not numbered
-            and values.get("sequence", asked.sequence) != asked.sequence
-        ):
-            return Answer("malformed", data=taken.body)
+        if asked is not None and not asynchronous and not numbered:
+            sequence = values.get("sequence", asked.sequence)
+            if sequence != asked.sequence:
+                return malformed(fault=f"sequence {sequence}, must be {asked.sequence}")
         row = self._unit.row(request)
         klass = request.klass or (row.klass if row is not None else "")
         telemetry = row.is_telemetry if row is not None else self._unit.is_telemetry(klass, request.id)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -33,11 +33,12 @@ from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import settings_of
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import DEFAULT_UNIT
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import PacedWriter
-from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
 from tests.protocol.canopen.conftest import import_eds
@@ -167,7 +168,8 @@ class SimulatedUnit:
     """A device in simulated time, with one link and a probe on it; a context manager.
 
     `damage` is called with the unit before the device is switched on: it is how mutants are made. Another way is to
-    have the device serve another definition than that of the tester: a folder, in `served`.
+    have the device serve another definition than that of the tester: a folder, in `served`. `parameters` are those of the profile; by
+    default, any unit but the CubeStar identifies stars from the start.
     """
 
     def __init__(
@@ -177,6 +179,7 @@ class SimulatedUnit:
         dialect: str = "b",
         unit: str | Path = DEFAULT_UNIT,
         served: Path | None = None,
+        parameters: Mapping[str, Any] | None = None,
     ) -> None:
         self.loop = SimulatedLoop()
         self.kind = link
@@ -185,6 +188,8 @@ class SimulatedUnit:
         self.icd = load_unit(unit)
         self._served = self.icd if served is None else load_unit(served)
         self._damage = damage
+        starts = unit != DEFAULT_UNIT and link != "canopen"
+        self._parameters = parameters or ({"start_mode": "lost_in_space"} if starts else {})
 
     def __enter__(self) -> Self:
         asyncio.set_event_loop(self.loop)
@@ -212,9 +217,7 @@ class SimulatedUnit:
         self.imager = DirectImager(TruthImager().handle)
         attitude = Attitude.from_radec_roll(83.8, -1.2, 0.0)
         links = {"serial": {"dialect": self.dialect}}
-        starts = self.unit != DEFAULT_UNIT and self.kind != "canopen"
-        parameters = {"start_mode": "lost_in_space"} if starts else {}
-        profile = Profile.model_validate({"links": links, "parameters": parameters})
+        profile = Profile.model_validate({"links": links, "parameters": self._parameters})
         self.store = MemoryStore()
         self.device = Device(
             profile, self._served, LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)

@@ -121,7 +121,7 @@ def test_settings_that_cannot_be_read_or_restored_are_outcomes_of_the_run():
     ("seen", "text"),
     [
         ("nothing", "nothing answers on /dev/x"),
-        ("1F", "no star sensor answers on /dev/x: 1F; check --dialect, --baud and the addresses"),
+        ("1F; check --baud", "no valid answer on /dev/x: 1F; check --baud"),
     ],
 )
 def test_a_device_that_does_not_answer_ends_the_run(seen, text):

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
-from starhil.configs.units.cubestar.controls import parameter, reset, set_parameter
+from starhil.configs.units.cubestar.controls import parameter, reset, set_parameter, value_of
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES
 from starhil.hil_tests.conformance.case import Case
 from starhil.hil_tests.conformance.runner import run_cases
+from starhil.hil_tests.conformance.suites import serial_suite
 from starhil.hil_tests.interruption import Interrupted
+from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.can_framing import CanFrame
+from tests.conformance.links import write_unit
+from tests.conformance.mutants_units import bodies
 from tests.conformance.simulated import SimulatedUnit
 from tests.conformance.test_healthy import SUITES
 from tests.protocol.canopen.conftest import simulated_probe
@@ -39,7 +45,7 @@ def mute(unit: SimulatedUnit, monkeypatch, echo: bytes | None = None) -> None:
     ("echo", "message"),
     [
         (None, "nothing answers on /dev/ttyX"),
-        (b"$GPGGA,092750.000,5321.6802,N*76\r\n", "no star sensor answers on /dev/ttyX: "),
+        (b"$GPGGA,092750.000,5321.6802,N*76\r\n", "no valid answer on /dev/ttyX: "),
     ],
     ids=["mute", "foreign"],
 )
@@ -54,8 +60,25 @@ def test_a_run_stops_where_no_star_sensor_answers(link, echo, message, monkeypat
     first, *others = outcomes
     assert (first.id, first.status) == (f"{link}.answers", "failed")
     assert first.seen.startswith(message)
+    assert first.seen.endswith("check --dialect, --baud and the addresses") == (echo is not None)
     assert [outcome.id for outcome in others] == [case.id for case in SUITES[link]]
     assert {(outcome.status, outcome.seen) for outcome in others} == {("not run", f"not run: {first.seen}")}
+
+
+@pytest.mark.parametrize(
+    ("unit", "change", "fault"),
+    [
+        ("sagitta", lambda body, _stack: body[:-1] + bytes((body[-1] ^ 1,)), r"check xxh32: computed (.. .. ..) .., received \1 "),
+        ("st16", lambda body, stack: body[: -stack.check.size] + b"\0\0", r"check crc u16 1021h: computed .. .., received 00 00"),
+        ("st16", lambda body, stack: stack.requests.close(body[:1] + bytes((body[1] ^ 1,)) + body[2 : -stack.check.size], b""), "must be"),
+    ],
+    ids=["hash", "crc", "address"],
+)  # fmt: skip
+def test_a_run_names_what_is_wrong_with_every_answer(unit, change, fault):
+    with SimulatedUnit("serial", bodies(change), unit=unit) as simulated:
+        first, *_ = run_cases(simulated.probe, serial_suite(read_unit(unit)), port="/dev/ttyX")
+    assert re.match(rf"no valid answer on /dev/ttyX: malformed \(.*{fault}.*\), \d+ bytes: ", first.seen)
+    assert "--dialect" not in first.seen
 
 
 def test_a_run_stops_where_no_canopen_node_answers():
@@ -109,6 +132,69 @@ def test_cases_pass_with_any_settings_and_restore_them(link):
         outcomes = run_cases(unit.probe, cases)
         assert [(o.id, o.expected, o.seen) for o in outcomes if o.status != "passed"] == []
         assert_as_found(unit)
+
+
+@pytest.mark.parametrize("link", ["serial", "can"])
+def test_cases_pass_on_a_unit_that_identifies_stars_from_the_start(link):
+    areas = ("modes", "store", "reset", "images", "acknowledge")
+    cases = [case for case in SUITES[link] if case.id.split(".")[1] in areas]
+    with SimulatedUnit(link, parameters={"start_mode": "lost_in_space", "exposure": 120}) as unit:
+        outcomes = run_cases(unit.probe, cases)
+        assert [(o.id, o.expected, o.seen) for o in outcomes if o.status != "passed"] == []
+        unit.probe.command("reset")
+        unit.probe.sleep(5.0)
+        unit.probe.drain()
+        assert unit.probe.telemetry("device_status")["mode"] in ("lost_in_space", "tracking")
+        assert value_of(unit.probe, "exposure") == 120
+
+
+READBACK = """
+[[telemetry]]
+id = 140
+name = "state"
+doc = "Two telecommands as set, and another value."
+include = ["set_numbers", "uptime_only", "set_mode"]
+
+[[telemetry]]
+id = 141
+name = "uptime_only"
+doc = "Time since start."
+fields = [{ name = "uptime", type = "u32", unit = "s", value = "uptime" }]
+
+[[telecommand]]
+id = 3
+name = "set_mode"
+doc = "Set the mode."
+action = "set_mode"
+fields = [{ name = "mode", type = "u8", argument = "mode", map = { 1 = "standby", 2 = "lost_in_space" } }]
+
+[link.serial]
+"""
+
+
+def test_settings_that_a_row_reports_among_other_values_are_restored(tmp_path):
+    file = write_unit(tmp_path, "sum") / "unit.toml"
+    text = file.read_text()
+    before, _, after = text.partition("[[telemetry]]\nid = 128\n")
+    text = before + "[[telemetry]]\n" + after.partition("[[telemetry]]\n")[2]
+    file.write_text(text.replace("[link.serial]\n", READBACK))
+    cases = [
+        case
+        for case in serial_suite(read_unit(tmp_path))
+        if case.area in ("serial.settings", "serial.commands")
+    ]
+    with SimulatedUnit("serial", unit=tmp_path) as unit:
+        unit.probe.command(
+            "set_numbers", a=33, b=-1.5, c=4, d=0.5, e=10.0, f=2.0, g=-3, h=0.5, i=7, flag=True, group=9
+        )
+        found = unit.probe.telemetry("state")
+        outcomes = run_cases(unit.probe, cases)
+        seen = unit.probe.telemetry("state")
+        mode = unit.device.modes.mode.value
+    assert [(o.id, o.expected, o.seen) for o in outcomes if o.status != "passed"] == []
+    assert "serial.settings.state.set_numbers" in {o.id for o in outcomes}
+    assert {**seen, "uptime": 0} == {**found, "uptime": 0}
+    assert mode == "tracking"
 
 
 def test_an_interrupted_run_leaves_the_unit_as_it_was():

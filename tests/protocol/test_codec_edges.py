@@ -7,6 +7,7 @@ import struct
 
 import pytest
 
+from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.can_framing import encode_reply_frames
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.definition import UnknownNameError
@@ -196,3 +197,18 @@ def test_a_request_of_an_unknown_class_is_rejected_and_a_unit_without_classes_ne
 )
 def test_an_epoch_without_a_time_zone_is_utc(epoch, unix_s):
     assert Conventions(epoch=epoch).epoch_ns == unix_s * 10**9
+
+
+@pytest.mark.parametrize("module", ["codec", "judge"])
+def test_numbers_that_a_map_assigns_to_true_and_false_are_a_flag(module):
+    """A unit with `map = { 7 = true, 5 = false }`; the names are accepted too."""
+    row = load_unit("cubestar-gen2").telemetry["raw_cubestar"]
+    if module == "judge":
+        row = read_unit("cubestar-gen2").telemetry["raw_cubestar"]
+    name = "str0_identification"
+    for value, given in ((True, True), (True, "true"), (False, False), (False, "false")):
+        data = row.encode(
+            row.decode(bytes(row.size)) | {name: given}, **({"check": False} if module == "codec" else {})
+        )
+        assert row.decode(data)[name] is value
+    assert row.decode(bytes(row.size))[name] == 0

@@ -6,9 +6,9 @@ import pytest
 
 from starhil.protocol.device_model import device_model
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import SKELETON, bundled_units
 from starhil.protocol.plugin import quantity
 from starhil.protocol.unit_examples import check_unit, exchanges
-from starhil.protocol.unit_folders import SKELETON, bundled_units
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import FieldError, IcdError
 
@@ -108,6 +108,15 @@ def test_rows_of_two_classes_may_have_one_id(unit):
     assert icd.telemetry_row(5).name == "one"
     assert icd.telemetry_row(5, "watch").name == "two"
     assert icd.request(icd.telemetry["two"]).klass == "watch"
+
+
+def test_a_flag_of_a_map_may_have_a_default(unit):
+    row = unit(
+        HEAD
+        + telemetry('{ name = "a", type = "u8", map = { 3 = true, 5 = false }, default = false }', "one", 5)
+    ).telemetry["one"]
+    assert row.encode() == b"\5"
+    assert row.decode(b"\3") == {"a": True}
 
 
 def test_a_parameter_defaults_to_the_device_s(unit):

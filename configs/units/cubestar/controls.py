@@ -24,7 +24,7 @@ def standby(probe: LinkProbe) -> None:
 
 
 def reset(probe: LinkProbe) -> None:
-    """Reset the device and wait until it is in standby."""
+    """Reset the device and wait until it is in standby, the start mode that `CubeStarSettings` stores."""
     probe.command("reset")
     if not probe.answers(probe.unit.telecommands["reset"]):
         probe.expect_silence("reset is not answered on this link", 0.05)
@@ -90,7 +90,7 @@ class CubeStarSettings:
         self._mode = "standby"
 
     def prepare(self, probe: LinkProbe) -> None:
-        """Record the settings; then set standby and the defaults of the unit.
+        """Record the settings; then set standby and the defaults of the unit, and store them with standby as the start mode.
 
         Stored parameters that differ from the current ones become current.
         """
@@ -103,7 +103,9 @@ class CubeStarSettings:
         self._defaults = {name: row["default"] for name, row in rows.items()}
         self._mode = str(status["mode"])
         standby(probe)
-        set_parameters(probe, self._defaults)
+        start_mode = probe.unit.parameters["start_mode"]
+        set_parameters(probe, self._defaults | {start_mode.name: float((start_mode.enum or {})["standby"])})
+        save_parameters(probe)
 
     def restore(self, probe: LinkProbe) -> None:
         """Restore parameters, stored parameters and mode."""
