@@ -17,6 +17,7 @@ from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort, objects_of
 from starhil.hil_tests.endurance.unit import Unit
 from starhil.hil_tests.endurance.violation import Violation
+from starhil.hil_tests.judge import canopen
 from starhil.hil_tests.judge.messages import Answer, Request
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
@@ -344,8 +345,8 @@ class Obc:
             self._oracle.forget()  # some framings find a request in any bytes
         for can_id, content in frames:
             if link == "canopen":  # an SDO of another node
-                other = 0x580 + (can_id & 0xFF)
-                if other != 0x600 + getattr(self._ports[link], "node", 0):
+                other = canopen.SDO_RESPONSE + (can_id & 0xFF)
+                if other != canopen.SDO_REQUEST + getattr(self._ports[link], "node", 0):
                     self._unit.deliver(link, CanFrame(other, bytes.fromhex(content), extended=False))
                 continue
             if can_id & 0xFF not in (0, getattr(self._ports[link], "device", 0)):
