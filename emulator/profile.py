@@ -485,7 +485,7 @@ def _problems_of_keys(
         try:
             check({key: value})
         except (EmulatorError, ProtocolError) as error:
-            yield from (((section, key), str(text)) for text in error.args)
+            yield from (((section, key), text) for text in error.problems)
 
 
 def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
