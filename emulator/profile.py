@@ -26,8 +26,7 @@ from starhil.emulator.truth.config import (
 )
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import find, remedy
-from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
+from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, remedy
 from starhil.protocol.validation_messages import problems
 from starhil.protocol.values import IcdError
 from starid.earth import unix_time

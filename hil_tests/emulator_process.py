@@ -18,7 +18,7 @@ from typing import IO, Final, Self
 from urllib.parse import unquote
 
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
 """The first start on a machine compiles for minutes; later ones take about 3 s."""

@@ -216,6 +216,6 @@ def starhil_truth(starhil_control: ControlClient, starhil_emulator: EmulatorProc
     """Return the truth of the emulator: `point`, `set`, `attitude` and `error`."""
     from starhil.hil_tests.control import Truth
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.unit_folders import DEFAULT_UNIT
+    from starhil.protocol.names import DEFAULT_UNIT
 
     return Truth(starhil_control, load_unit(starhil_emulator.unit or DEFAULT_UNIT).conventions)
