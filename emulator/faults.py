@@ -15,6 +15,7 @@ from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
+from starhil.protocol.names import did_you_mean, remedy
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
@@ -77,6 +78,15 @@ class FaultRequest(Strict):
     can: WireFault | None = None
     """Faults of outgoing CAN frames, including CANopen."""
 
+    def of_bus(self, bus: str) -> WireFault | None:
+        """Return the faults of a bus, whose key is its name; None if they stay."""
+        fault: WireFault | None = getattr(self, bus)
+        return fault
+
+
+BUSES: Final = tuple(name for name in FaultRequest.model_fields if name not in ("optical", "device"))
+"""Names of the buses that faults can affect."""
+
 
 class Faults:
     """The currently injected faults, also of links that are opened later."""
@@ -95,9 +105,8 @@ class Faults:
         device = self._device
         if request.optical is not None:
             device.surroundings.faults = dict(request.optical)
-        faults = {"serial": request.serial, "can": request.can}
         for name, wire in self._wires:
-            fault = faults[name]
+            fault = request.of_bus(name)
             if fault is not None:
                 wire.settings = fault
         if request.device is not None:
@@ -124,12 +133,13 @@ class Faults:
                 ("reset", request.device.reset, list(enums["reset_cause"].values)),
             ):
                 if name is not None and name not in known:
-                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
+                    near = did_you_mean(name, known)
+                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}{near}")
             if request.device.upset is not None:
                 self._check_upset(request.device.upset)
         there = {name for name, _ in self._wires}
-        for name, fault in (("serial", request.serial), ("can", request.can)):
-            if fault is not None and name not in there:
+        for name in BUSES:
+            if request.of_bus(name) is not None and name not in there:
                 raise EmulatorError(
                     f"{name}: this run has no such link; start it with --{name}, or omit this fault"
                 )
@@ -138,7 +148,8 @@ class Faults:
         if upset.parameter is not None:
             definition = self._device.icd.parameters.get(upset.parameter)
             if definition is None:
-                raise EmulatorError(f"device.upset.parameter: {upset.parameter!r} is not a parameter")
+                hint = remedy(upset.parameter, self._device.icd.parameters)
+                raise EmulatorError(f"device.upset.parameter: no parameter named {upset.parameter!r}{hint}")
             if upset.bit >= memory_bits(definition):
                 raise EmulatorError(
                     f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"

@@ -12,15 +12,18 @@ from typing import Any, Final, Literal, Protocol
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError, Value
 
 Bus = Literal["can", "canopen", "serial"]
 
 KEPT_STEPS: Final = 1000
 """Number of latest transactions that can be saved as a session."""
+
+POLL_S: Final = 1.0
+"""Period in which the console reads every telemetry row that a page shows, and a recording every row, seconds."""
 
 SHORTEST_WAIT_S: Final = 0.05
 """Shortest pause that becomes a step of a session, seconds."""

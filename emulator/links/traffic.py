@@ -12,10 +12,10 @@ from starhil.emulator.links.base import Link
 from starhil.emulator.signals import Signal
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanHostReceiver, CanId, MessageType
 from starhil.protocol.codec import Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
 from starhil.protocol.values import Value
 
@@ -193,14 +193,12 @@ def _values(row: Row | None, data: bytes) -> str:
 
 
 def short(value: Value) -> str:
-    """Format a value."""
-    return (
-        value.hex(" ").upper()
-        if isinstance(value, bytes)
-        else f"{value:.6g}"
-        if isinstance(value, float)
-        else str(value)
-    )
+    """Format a value: a float with six digits, or all before the point and six after it."""
+    if isinstance(value, bytes):
+        return value.hex(" ").upper()
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.6f}".rstrip("0").rstrip(".") if 1e6 <= abs(value) < 1e15 else f"{value:.6g}"
 
 
 def canopen_text(frame: CanFrame) -> str:

@@ -14,7 +14,7 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import UnknownNameError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.unit_folders import find_unit
+from starhil.protocol.names import find_unit
 from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
 
 ICD = load_unit()
@@ -353,7 +353,7 @@ def test_unknown_numbers_of_enumerations_stay_numbers_in_telemetry() -> None:
 def test_unknown_names_offer_near_ones() -> None:
     with pytest.raises(UnknownNameError, match="did you mean quaternion") as caught:
         ICD.telemetry["quaternio"]
-    assert str(caught.value).startswith("no telemetry named 'quaternio'")
+    assert str(caught.value).startswith("no telemetry row named 'quaternio'")
     with pytest.raises(UnknownNameError, match="icd list"):
         ICD.parameters["zzz"]
 

@@ -148,6 +148,23 @@ def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_recovers
     wait_for_text(page, "#active", "no fault")
 
 
+def test_in_error_mode_no_attitude_is_shown_and_the_last_image_has_its_age(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    page.evaluate("starhil.link.control({ do: 'fault', device: { error: 'sensor' } })")
+    wait_for_text(page, "#mode", "error: sensor")
+    wait_for_text(page, "#validity", "no images")
+    wait_for_text(page, "#error-label", "last valid")
+    assert {page.locator(f"#{name}").text_content() for name in ("ra", "dec", "roll")} == {"–"}
+    page.wait_for_function(
+        "() => /^image of [1-9][0-9]* s ago$/.test(document.getElementById('when').textContent)"
+    )
+    stage = page.locator(".stage").evaluate("element => getComputedStyle(element).filter")
+    assert stage == "grayscale(1)"
+    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")  # the plots go on
+    assert send(page, "set_mode", mode="standby").startswith("accepted in ")
+
+
 def test_a_wrong_parameter_shows_the_refusal(page):
     assert send(page, "set_update_rate", rate=500) == "refused: invalid_parameter"
     problem = page.locator("#telecommand-form .problem").text_content()
@@ -304,6 +321,24 @@ def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page)
     assert said == "this image cannot be decoded"
     page.wait_for_function("painted => starhil.sky.painted > painted", arg=painted)
     assert not page.locator("#no-frame").is_visible()
+
+
+def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    *attitude, image = page.evaluate(
+        """async () => {
+            const { store, sky } = starhil;
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            store.frame = () => {};
+            store.message(store.hello);
+            store.history(new Float64Array(0));
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            return ["ra", "dec", "roll", "validity"].map((id) => document.getElementById(id).textContent).concat([sky.shown]);
+        }"""
+    )
+    assert attitude == ["–", "–", "–", "–"]
+    assert image is None
 
 
 def test_a_wrong_token_and_another_origin_get_403(emulator):
