@@ -41,9 +41,9 @@ from starhil.emulator.symlink_lock import lock_symlink
 from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import SensorTruth, Truth
 from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport

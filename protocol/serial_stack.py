@@ -20,7 +20,7 @@ from starhil.protocol import cubespace
 from starhil.protocol.checks import Check, build_check
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Order
-from starhil.protocol.cubespace import DialectReplies
+from starhil.protocol.cubespace import Dialect, DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.errors import ProtocolError
@@ -46,7 +46,6 @@ from starhil.protocol.messages import (
     error_code,
 )
 from starhil.protocol.plugin import Plugin
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
 
@@ -164,16 +163,12 @@ class SerialStack:
         framing, check, classes = self.link.framing, self.link.check, list[str]()
         if item is not None:
             framing, check, classes = item.framing or framing, item.check or check, item.classes or []
-        return MessageFormat(
-            build_framing(framing, self._plugin.framings),
-            framing,
-            build_check(check, self.byte_order, self._plugin.checks),
-            models,
-            self.byte_order,
-            self.classes.requests if name == "request_header" else self.classes.replies,
-            f"link.serial.{name}",
-            classes,
-        )
+        frames = build_framing(framing, self._plugin.framings)
+        checks = build_check(check, self.byte_order, self._plugin.checks)
+        overhead = {"start": len(frames.start), "check": checks.size, "end": len(frames.end)}
+        codes = self.classes.requests if name == "request_header" else self.classes.replies
+        header = Header(models, self.byte_order, codes, overhead, f"link.serial.{name}")
+        return MessageFormat(frames, framing, checks, header, classes)
 
     @property
     def framing(self) -> Framing:
@@ -213,7 +208,7 @@ class SerialStack:
                     known = ", ".join(self.classes.by_name) or "none"
                     raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
             formats = self.request_formats if where == "request" else self.reply_formats
-            if any(form.kind == "length" for form in formats.all) and "length" not in header.roles:
+            if any(form.model.kind == "length" for form in formats.all) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
         if self.request_header.counts:
             raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
@@ -221,9 +216,9 @@ class SerialStack:
         if self.texts.acknowledge is not None or self.texts.refusal is not None:
             texts.append(self.replies)
         for form in texts:
-            if form.kind in ("length", "fixed"):
+            if form.model.kind in ("length", "fixed"):
                 raise IcdError(
-                    f"link.serial: texts need a framing with an end, such as delimited, not {form.kind}"
+                    f"link.serial: texts need a framing with an end, such as delimited, not {form.model.kind}"
                 )
         if "id" not in self.request_header.roles and len(self.text_formats) < len(self.request_formats.all):
             raise IcdError("link.serial.request_header: needs a field with role id")
@@ -340,7 +335,7 @@ class SerialStack:
             row = self._by_text.get(words(text.decode("latin-1")))
             if row is None:
                 return Request(RequestKind.TELECOMMAND, self._unknown_id)
-            return Request(RequestKind(row.kind), row.id, klass=row.klass)
+            return Request(row.kind, row.id, klass=row.klass)
         opened = form.open(body)
         if isinstance(opened, LinkFault):
             return opened
@@ -366,7 +361,7 @@ class SerialStack:
             return RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
         item = self.classes.by_name.get(klass)
         row = self.row(klass, row_id)
-        return item.kind if item is not None else RequestKind(row.kind) if row is not None else None
+        return item.kind if item is not None else row.kind if row is not None else None
 
     def _request_size(self, form: MessageFormat, body: bytes) -> int | None:
         """Return the size of a request that begins with these bytes, or None if more are needed."""

@@ -16,8 +16,7 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import ErrorCode, LinkFault, Reply, Request
-from starhil.protocol.serial_interface import Receiver
+from starhil.protocol.messages import ErrorCode, LinkFault, Receiver, Reply, Request
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
