@@ -80,7 +80,7 @@ def _failing_in_one_line() -> Iterator[None]:
     try:
         yield
     except OneLineError as error:
-        raise pytest.fail.Exception("\n".join(map(str, error.args)), pytrace=False) from None
+        raise pytest.fail.Exception("\n".join(error.problems), pytrace=False) from None
 
 
 class _Emulators:
