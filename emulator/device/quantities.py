@@ -304,6 +304,7 @@ _quantity("uptime.milliseconds", int, "ms", "Time since start-up, fraction of th
 _named("mode", "mode", "Mode of the device.", lambda shot: shot.device.modes.mode.value)
 _quantity("mode.changes", int, "", "Mode changes since start-up.", lambda shot: shot.device.mode_changes)
 _named("error", "device_error", "Why the mode is `error`.", lambda shot: shot.device.modes.error or "none")
+_quantity("error.active", bool, "", "Whether the mode is `error`.", lambda shot: bool(shot.device.modes.error))
 _named("boot.reset_cause", "reset_cause", "Why the device restarted.", lambda shot: shot.device.reset_cause)
 _named("boot.cause", "boot_cause", "What started the running program.",
        lambda shot: "power" if shot.device.reset_cause == "power_on" else "command")

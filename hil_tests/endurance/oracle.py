@@ -75,6 +75,7 @@ class Oracle:
         self._last: tuple[int, ErrorCode] | None = None
         self._checks: dict[str, Callable[[str, Field, Value], None]] = {
             "mode": self._check_mode,
+            "error.active": self._check_in_error,
             "frame.counter": self._check_frames,
             "frame.period": self._check_period,
             "request.error": self._check_error,
@@ -371,6 +372,12 @@ class Oracle:
         if value not in self.modes:
             raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
         self.modes = set(IMAGING) if value in IMAGING else {value}
+
+    def _check_in_error(self, where: str, _field: Field, value: Value) -> None:
+        possible = self.modes & {"error"} if value else self.modes - {"error"}
+        if not possible:
+            raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
+        self.modes = possible
 
     def _expected(self, quantity: str, field: Field) -> tuple[float, float] | None:
         """Return the number that a field must report, and its tolerance; None if it is not known or has no rule."""

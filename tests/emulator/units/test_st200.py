@@ -123,6 +123,15 @@ def test_acquisition_is_cleared_when_the_lens_is_covered():
     with_unit("st200", "serial", scenario)
 
 
+def test_the_general_error_is_reported_in_error_mode_alone():
+    def scenario(unit: Emulated) -> None:
+        assert sample(unit)[2] & 0b01 == 0
+        unit.bench.device.modes.fail("sensor")
+        assert sample(unit)[2] & 0b01 == 1
+
+    with_unit("st200", "serial", scenario)
+
+
 @pytest.mark.parametrize(
     "command", ["show  record", "set keep-alive on", "shwo record", "SHOW RECORD", "", "\x00\xff"]
 )
