@@ -15,6 +15,7 @@ from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import DIRECTION_BITS, CatalogUpset
 from starhil.emulator.sky.objects import SkyObjects
 from starhil.emulator.truth.config import Strict
+from starhil.protocol.names import did_you_mean, remedy
 
 
 def check_sky(values: dict[str, Any]) -> dict[str, Any]:
@@ -124,7 +125,8 @@ class Faults:
                 ("reset", request.device.reset, list(enums["reset_cause"].values)),
             ):
                 if name is not None and name not in known:
-                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}")
+                    near = did_you_mean(name, known)
+                    raise EmulatorError(f"device.{key}: {name!r} is not one of {', '.join(known)}{near}")
             if request.device.upset is not None:
                 self._check_upset(request.device.upset)
         there = {name for name, _ in self._wires}
@@ -138,7 +140,8 @@ class Faults:
         if upset.parameter is not None:
             definition = self._device.icd.parameters.get(upset.parameter)
             if definition is None:
-                raise EmulatorError(f"device.upset.parameter: {upset.parameter!r} is not a parameter")
+                hint = remedy(upset.parameter, self._device.icd.parameters)
+                raise EmulatorError(f"device.upset.parameter: no parameter named {upset.parameter!r}{hint}")
             if upset.bit >= memory_bits(definition):
                 raise EmulatorError(
                     f"device.upset.bit: {upset.parameter} has bits 0 to {memory_bits(definition) - 1}"

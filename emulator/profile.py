@@ -26,7 +26,7 @@ from starhil.emulator.truth.config import (
 )
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import did_you_mean, find
+from starhil.protocol.names import find, remedy
 from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starhil.protocol.validation_messages import problems
 from starhil.protocol.values import IcdError
@@ -481,8 +481,7 @@ def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) 
         if name in LINK_PARAMETERS:
             raise EmulatorError(f"parameters.{name}: set {LINK_PARAMETERS[name]} instead")
         if name not in known:
-            hint = did_you_mean(name, known) or f"; known: {', '.join(known)}"
-            raise EmulatorError(f"parameters.{name}: unknown key{hint}")
+            raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
         try:
             known[name].check(value)
         except ProtocolError as error:

@@ -14,7 +14,7 @@ from starhil.hil_tests.images import Image, download_by_bursts, download_by_fram
 from starhil.hil_tests.links import HostLink
 from starhil.hil_tests.transactions import Ack, Reading, Transaction
 from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition, Names
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
 from starhil.protocol.values import Value
@@ -295,7 +295,13 @@ class AsyncObcClient:
             values = row.decode(reply.data)
         except ProtocolError as error:
             raise BadReplyError(str(error)) from None
-        return Reading(row.name, values, latency, time.time(), time.monotonic())
+        return Reading(
+            row.name,
+            Names(f"field of {row.name}", values.items(), few=True),
+            latency,
+            time.time(),
+            time.monotonic(),
+        )
 
 
 _ANSWERS: Final = {

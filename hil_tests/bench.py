@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Self
+from typing import Any, Final, Self
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S
 from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.control import ControlClient
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
@@ -115,6 +117,16 @@ class Bench:
         clients, self._clients = list(self._clients.values()), {}
         for client in clients:
             client.close()
+
+    def control(self, action: str, keys: Mapping[str, Any]) -> dict[str, Any]:
+        """Send a request on the control channel of the emulator, and return its answer.
+
+        Raises BenchError: the request was rejected, or the unit is not an emulator that the bench started.
+        """
+        if self.emulator is None:
+            raise BenchError("only an emulator that the bench started has a control channel: use --start")
+        with ControlClient(self.emulator.ready["control"]) as channel:
+            return channel.do(action, **keys)
 
     def restart(self, how: str) -> None:
         """End the emulator by SIGTERM (`term`) or SIGKILL (`kill`) and start it again.

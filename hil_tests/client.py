@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import functools
-import operator
 from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
 from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
@@ -26,9 +25,7 @@ from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import LinkFault, Reply
 from starhil.protocol.unit_folders import DEFAULT_UNIT
 
-__tracebackhide__ = operator.methodcaller(
-    "errisinstance", BenchError
-)  # pytest shows the caller's line instead
+__tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 Parameters = ParamSpec("Parameters")
 T = TypeVar("T")

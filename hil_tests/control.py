@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import operator
 import socket
 import time
 from contextlib import ExitStack
@@ -16,12 +15,10 @@ from starhil.hil_tests.attitude import (
     from_reported,
     unit,
 )
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
 from starhil.protocol.conventions import Conventions
 
-__tracebackhide__ = operator.methodcaller(
-    "errisinstance", BenchError
-)  # pytest shows the caller's line instead
+__tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 ANSWER_WITHIN_S: Final = 60.0
 """A step of the stepped clock takes as long as its frames."""
@@ -42,7 +39,7 @@ class ControlClient:
             raise BenchError(f"control channel {address}: {error.strerror or error}") from None
         self._lines = self._socket.makefile("rw", encoding="utf-8")
 
-    def do(self, action: str, **keys: Any) -> dict[str, Any]:
+    def do(self, action: str, /, **keys: Any) -> dict[str, Any]:
         """Send a request and return the answer.
 
         Raises BenchError: the request was rejected, or the channel does not answer.

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import operator
+from typing import Final
+
 from starhil.protocol.errors import OneLineError
+
+HIDDEN_BEHIND_ONE_LINE: Final = operator.methodcaller("errisinstance", OneLineError)
+"""Value of `__tracebackhide__` in a module whose frames pytest leaves out of the traceback of such an error, so that it ends
+at the line of the test."""
 
 
 class BenchError(OneLineError):

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import operator
 import threading
 from collections.abc import Coroutine
 from concurrent.futures import Future
 from typing import Any, TypeVar
 
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE
+from starhil.protocol.errors import OneLineError
 
-__tracebackhide__ = operator.methodcaller(
-    "errisinstance", BenchError
-)  # pytest shows the caller's line instead
+__tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 T = TypeVar("T")
 
@@ -34,7 +32,7 @@ class LoopThread:
         except KeyboardInterrupt:
             future.cancel()
             raise
-        except BenchError as error:
+        except OneLineError as error:
             raise error.with_traceback(None) from error.__cause__  # its frames are those of the loop
 
     @property

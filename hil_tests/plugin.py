@@ -17,9 +17,9 @@ pytest loads this module in every run, so the bench is imported only when a fixt
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import pytest
 
@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from starhil.hil_tests.client import ObcClient
     from starhil.hil_tests.control import ControlClient, Truth
     from starhil.hil_tests.emulator_process import EmulatorProcess
+    from starhil.protocol.names import Kind
+
+
+NAMED: Final[dict[Kind, str]] = {"unit": "--starhil-unit", "profile": "--starhil-profile"}
+"""Options that name what ships with the package, or a file."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -36,7 +41,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     group.addoption("--starhil-can", metavar="CHANNEL", help="CAN channel of a unit, instead of an emulator")
     group.addoption(
         "--starhil-dialect",
-        metavar="a|b|c",
+        choices=["a", "b", "c"],
         help="format of serial replies, for a unit that has several (default b)",
     )
     group.addoption(
@@ -59,6 +64,23 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers", "starhil(profile=None, settings=()): profile and settings of the emulator for a test"
     )
+    for kind, option in NAMED.items():
+        if (name := config.getoption(option)) is not None:
+            from starhil.protocol.names import find, not_found
+
+            if not find(kind, name).exists():
+                raise pytest.UsageError(f"{option}: {not_found(kind, name)}")
+
+
+@contextmanager
+def _failing_in_one_line() -> Iterator[None]:
+    """Let a test fail without a traceback if its fixture cannot be made."""
+    from starhil.protocol.errors import OneLineError
+
+    try:
+        yield
+    except OneLineError as error:
+        raise pytest.fail.Exception("\n".join(map(str, error.args)), pytrace=False) from None
 
 
 class _Emulators:
@@ -113,7 +135,8 @@ def _starhil_emulators(
 ) -> Iterator[_Emulators]:
     emulators = _Emulators(request.config, tmp_path_factory.mktemp("starhil"))
     yield emulators
-    emulators.close()
+    with _failing_in_one_line():
+        emulators.close()
 
 
 def _unit_option(config: pytest.Config) -> str:
@@ -139,7 +162,8 @@ def starhil_emulator(request: pytest.FixtureRequest) -> EmulatorProcess:
     if wanted or (marker is not None and marker.args):
         pytest.fail("the marker starhil takes profile=… and settings=[…]", pytrace=False)
     emulators: _Emulators = request.getfixturevalue("_starhil_emulators")
-    return emulators.get(profile, settings)
+    with _failing_in_one_line():
+        return emulators.get(profile, settings)
 
 
 def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
@@ -158,9 +182,10 @@ def _client(request: pytest.FixtureRequest, link: str) -> ObcClient:
         if spec is None:
             pytest.fail(f"unit {unit} has no {link} link", pytrace=False)
     common = {"unit": unit or "cubestar", "timeout_s": option("--starhil-timeout")}
-    if link == "can":
-        return ObcClient.open(can=spec, **common)
-    return ObcClient.open(serial=spec, dialect=option("--starhil-dialect"), **common)
+    with _failing_in_one_line():
+        if link == "can":
+            return ObcClient.open(can=spec, **common)
+        return ObcClient.open(serial=spec, dialect=option("--starhil-dialect"), **common)
 
 
 @pytest.fixture

@@ -32,6 +32,7 @@ interface definition. All errors of a file are reported, one a line, with file, 
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -64,15 +65,13 @@ from starhil.hil_tests.expect import (
 from starhil.hil_tests.raw_traffic import parse_frame, pattern
 from starhil.protocol.codec import Field as RowField
 from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.definition import InterfaceDefinition, UnknownNameError
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import did_you_mean, remedy
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import wording
 from starhil.protocol.values import FLAGS, Parameter
 
-LISTED: Final = "; `starhil icd list` lists all"
-"""Hint if no known name is similar."""
 ATTITUDE_FIELDS: Final = frozenset({"q_x", "q_y", "q_z"})
 
 
@@ -98,16 +97,17 @@ def _texts(value: Any) -> tuple[str, ...]:
     return tuple(values)
 
 
-def _known(kind: str, table: str, others: str = "", remedy: str = "") -> PlainValidator:
-    """Return a reader of names in a table of the definition; `remedy` for a name that is in another one."""
+def _known(table: str, others: str = "", instead: str = "") -> PlainValidator:
+    """Return a reader of names in a table of the definition; `instead`: what a name in the table `others` is."""
 
     def read(value: Any, info: ValidationInfo) -> Any:
-        known = getattr(_icd(info), table)
-        if _text(value) not in known:
-            elsewhere = others and value in getattr(_icd(info), others)
-            hint = f"; it is {remedy}" if elsewhere else did_you_mean(value, known) or LISTED
-            raise ValueError(f"unknown {kind} '{value}'{hint}")
-        return known[value]
+        icd = _icd(info)
+        if others and _text(value) in getattr(icd, others):
+            raise ValueError(f"{value!r} is {instead}")
+        try:
+            return getattr(icd, table)[_text(value)]
+        except UnknownNameError as error:
+            raise ValueError(str(error)) from None
 
     return PlainValidator(read)
 
@@ -131,6 +131,14 @@ def _hex_bytes(value: Any) -> bytes:
         raise ValueError(f'must be bytes in hexadecimal, such as "1F 7F 80 1F FF", not {value!r}') from None
 
 
+def _as_json(table: dict[str, Any]) -> dict[str, Any]:
+    try:
+        json.dumps(table)
+    except TypeError:
+        raise ValueError("must be numbers, texts, lists and tables; put a date in quotes") from None
+    return table
+
+
 def _file_name(name: str) -> str:
     if name in {"", ".."} or Path(name).name != name or "\0" in name:
         raise ValueError("must be a plain file name; the file is written to the log folder")
@@ -143,9 +151,9 @@ def _fraction(value: float) -> float:
     return value
 
 
-Telemetry = Annotated[Row, _known("telemetry row", "telemetry", "telecommands", "a telecommand: use command")]
-Telecommand = Annotated[Row, _known("telecommand", "telecommands", "telemetry", "telemetry: use read")]
-ParameterName = Annotated[Parameter, _known("parameter", "parameters")]
+Telemetry = Annotated[Row, _known("telemetry", "telecommands", "a telecommand: use command")]
+Telecommand = Annotated[Row, _known("telecommands", "telemetry", "telemetry: use read")]
+ParameterName = Annotated[Parameter, _known("parameters")]
 Refusal = Annotated[str, _member("error_code")]
 ImageSize = Annotated[str, _member("image_size")]
 HexBytes = Annotated[bytes, PlainValidator(_hex_bytes)]
@@ -395,6 +403,14 @@ class Restart(Step):
     signal: Literal["term", "kill"] = Field(alias="restart")
 
 
+class Control(Step):
+    """Send a request on the control channel of the emulator that the session started."""
+
+    default_name = "control channel: {self.action}"
+    action: Literal["fault", "clear_faults", "set_truth", "scenario", "step"] = Field(alias="control")
+    keys: Annotated[dict[str, Any], AfterValidator(_as_json)] = Field({}, alias="with")
+
+
 ACTIONS: Final[Mapping[str, type[Step]]] = {
     "command": Command,
     "read": Read,
@@ -406,6 +422,7 @@ ACTIONS: Final[Mapping[str, type[Step]]] = {
     "send": Send,
     "wait_s": Wait,
     "restart": Restart,
+    "control": Control,
 }
 """Key of an action → its class."""
 
@@ -552,7 +569,7 @@ def _texts_of(error: ErrorDetails, location: str, model: type[Keys]) -> Iterator
 def _explanation(error: ErrorDetails, key: str, known: list[str]) -> str:
     match error["type"]:
         case "extra_forbidden":
-            return f"unknown key '{key}'{did_you_mean(key, known) or '; known: ' + ', '.join(known)}"
+            return f"unknown key '{key}'{remedy(key, known)}"
         case "missing":
             return "must be given, but is missing"
         case _:
@@ -571,10 +588,7 @@ def _unknown_fields(key: str, row: Row, names: Iterable[str]) -> Iterator[str]:
     known = row.named_fields
     for name in names:
         if name not in known:
-            hint = did_you_mean(name, known) or (
-                f"; its fields: {', '.join(known)}" if known else "; it has none"
-            )
-            yield f"{key}: row '{row.name}' has no field '{name}'{hint}"
+            yield f"{key}: row '{row.name}' has no field '{name}'{remedy(name, known)}"
 
 
 def _impossible(item: RowField, wanted: Conditions) -> Iterator[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -104,7 +105,7 @@ class SessionRunner:
         return SessionResult(self._script.title, tuple(results), time.monotonic() - begin, interruption)
 
     def _links_of(self, step: Step) -> tuple[str, ...]:
-        if isinstance(step, scripts.Wait | scripts.Restart):
+        if isinstance(step, scripts.Wait | scripts.Restart | scripts.Control):
             return ("",)
         wanted = step.link or self._script.defaults.link
         if wanted == "both":
@@ -173,6 +174,8 @@ class SessionRunner:
             case scripts.Restart():
                 self._bench.restart(step.signal)
                 return Attempt(detail="ready again")
+            case scripts.Control():
+                return Attempt(detail=json.dumps(self._bench.control(step.action, step.keys)))
             case scripts.Command():
                 return self._command(step, self._bench.client(link))
             case scripts.Read():

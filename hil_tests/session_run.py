@@ -27,7 +27,7 @@ from starhil.hil_tests.results import (
     write_junit,
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.script import Script, load_script
+from starhil.hil_tests.script import Control, Script, load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.definition import InterfaceDefinition
@@ -201,6 +201,8 @@ def _emulator(
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
+    extra = ["--view", "auto"] if request.view == "auto" else []
+    extra += ["--control", "auto"] if any(isinstance(step, Control) for step in script.steps) else []
     return EmulatorProcess(
         emulator_command(
             profile=request.profile or _beside(wanted.profile, request.script),
@@ -212,7 +214,7 @@ def _emulator(
             settings=[*_pointed(script), *wanted.settings],
             state_dir=state,
             truth_log=truth_log,
-            extra=["--view", "auto"] if request.view == "auto" else (),
+            extra=extra,
         )
     )
 

@@ -3,36 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE
 from starhil.protocol.values import Value
+
+__tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
 
 @dataclass(frozen=True)
 class Ack:
-    """A telecommand was accepted."""
+    """A telecommand was accepted; acknowledgements of the same telecommand are equal."""
 
     name: str
-    latency_s: float
+    latency_s: float = field(compare=False)
     """Time from passing the request to the port until the last byte of the reply, s."""
 
 
 @dataclass(frozen=True)
 class Reading:
-    """One telemetry row in physical values."""
+    """One telemetry row in physical values; readings with the same values are equal, whenever they came."""
 
     name: str
     values: Mapping[str, Value]
-    latency_s: float
+    latency_s: float = field(compare=False)
     """Latency of the reply, s; 0 for unsolicited telemetry."""
-    received_unix_s: float
+    received_unix_s: float = field(compare=False)
     """Time of reception on the OBC's clock, seconds since 1970-01-01 UTC."""
-    received_s: float
+    received_s: float = field(compare=False)
     """Time of reception on `time.monotonic`, s; for intervals."""
 
-    def __getitem__(self, field: str) -> Value:
-        """Return the value of a field."""
-        return self.values[field]
+    def __getitem__(self, name: str) -> Value:
+        """Return the value of a field; UnknownNameError suggests similar names."""
+        return self.values[name]
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import remedy
 from starhil.protocol.values import (
     F32_MAX,
     INTEGER_RANGES,
@@ -452,9 +452,7 @@ class Row(RowKeys):
         unknown = given.keys() - self.named_fields.keys()
         if unknown:
             name = min(unknown)
-            hint = did_you_mean(name, self.named_fields)
-            known = ", ".join(self.named_fields) or "none"
-            raise FieldError(f"{self.name}.{name}: no such field{hint} (fields: {known})")
+            raise FieldError(f"{self.name}.{name}: no such field{remedy(name, self.named_fields)}")
         raw: list[Any] = [0] * len(self._sent)
         for index, (name, item, position) in enumerate(self._values):
             where = f"{self.name}.{name}"

@@ -16,7 +16,7 @@ from starhil.protocol.device_model import DeviceModel, device_model
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.link_schema import LinkModel, MessageClass
 from starhil.protocol.messages import ErrorCode, Request, RequestKind
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import did_you_mean, remedy
 from starhil.protocol.plugin import Plugin
 from starhil.protocol.values import EnumDefinition, Parameter, Section
 
@@ -31,15 +31,18 @@ class UnknownNameError(ProtocolError, KeyError):
 
 
 class Names(dict[str, _Item]):
-    """Items by name; a missing name raises UnknownNameError with suggestions."""
+    """Items by name; a missing name raises UnknownNameError with suggestions, or with all names if they are few."""
 
-    def __init__(self, what: str, items: Iterable[tuple[str, _Item]]) -> None:
+    def __init__(self, what: str, items: Iterable[tuple[str, _Item]], *, few: bool = False) -> None:
         super().__init__(items)
         self._what = what
+        self._few = few
 
     def __missing__(self, name: str) -> _Item:
-        hint = did_you_mean(name, self) or "; `starhil icd list` lists all"
-        raise UnknownNameError(f"no {self._what} named {name!r} in the interface definition{hint}")
+        __tracebackhide__ = True  # pytest shows the caller's line instead
+        listed = "; `starhil icd list` lists all"
+        hint = remedy(name, self) if self._few else did_you_mean(name, self) or listed
+        raise UnknownNameError(f"no {self._what} named {name!r}{hint}")
 
 
 @dataclass(frozen=True)

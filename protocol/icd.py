@@ -241,7 +241,7 @@ class _Reader:
             version=self._unit.version,
             doc=self._unit.doc,
             telecommands=Names("telecommand", ((row.name, row) for row in telecommands)),
-            telemetry=Names("telemetry", ((row.name, row) for row in telemetry)),
+            telemetry=Names("telemetry row", ((row.name, row) for row in telemetry)),
             enums=Names(
                 "enumeration",
                 {

@@ -37,6 +37,12 @@ def not_found(kind: Kind, name: str | Path) -> str:
     return f"{kind} {str(name)!r}: not found; give a path, or one of: {', '.join(known)}{hint}"
 
 
+def remedy(name: str, known: Iterable[str]) -> str:
+    """Return `; did you mean …?` for an unknown name, or `; known: …` with all names if none is similar."""
+    names = sorted(known)
+    return did_you_mean(name, names) or f"; known: {', '.join(names) or 'none'}"
+
+
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `; did you mean …?` with the known names most similar to an unknown one, or an empty text."""
     near = difflib.get_close_matches(name, list(known), n=3, cutoff=_MIN_SIMILARITY)

@@ -9,7 +9,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args, get_origin
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import did_you_mean, remedy
 
 _NEEDED: Final = {
     "float_type": "a number",
@@ -83,8 +83,8 @@ def problems(
             location, models = _along(model, item["loc"][:-1])
             key = str(item["loc"][-1])  # _along would drop it if it is also the tag of an alternative
             known = sorted({*(key for each in models for key in _keys_of(each)), *(() if location else also)})
-            remedy = (hints or {}).get(key) or did_you_mean(key, known) or f"; known: {', '.join(known)}"
-            location, texts = (*location, key), [f"unknown key{remedy}"]
+            hint = (hints or {}).get(key) or remedy(key, known)
+            location, texts = (*location, key), [f"unknown key{hint}"]
         elif item["type"] in _UNIONS:
             location = (*location, str(item["ctx"]["discriminator"]).strip("'"))
             texts = [_choice(item, models)]

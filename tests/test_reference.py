@@ -23,6 +23,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 
 WHOLE_ACTIONS = {
+    "control": "control = 'fault'",
     "command": 'command = "reset"',
     "read": 'read = "identification"',
     "listen": 'listen = "quaternion"',

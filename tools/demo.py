@@ -28,13 +28,8 @@ CROSS_LIMIT_ARCSEC = 60.0
 ROLL_LIMIT_ARCSEC = 300.0
 
 
-@dataclass(frozen=True, slots=True)
-class Leg:
-    """One session of the demo: script, link (also the name of the folder for its logs) and channel."""
-
-    script: str
-    link: str
-    channel: str
+SESSIONS = {"serial": "demo_serial", "can": "demo_can"}
+"""Link, which also names the folder of its logs → session of the OBC over it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +82,11 @@ def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Compa
     return Comparison(*columns, invalid=invalid)
 
 
-def run_leg(leg: Leg, out: Path, truth_log: Path) -> bool:
-    """Run a session of the OBC as a separate process; return whether every step passed."""
-    folder = out / leg.link
+def run_session(link: str, channel: str, out: Path, truth_log: Path) -> bool:
+    """Run the session of a link as a separate process; return whether every step passed."""
+    folder = out / link
     command = [
-        str(Path(sys.executable).with_name("starhil")), "session", leg.script, f"--{leg.link}", leg.channel,
+        str(Path(sys.executable).with_name("starhil")), "session", SESSIONS[link], f"--{link}", channel,
         "--log", str(folder), "--junit", str(folder / "junit.xml"), "--truth", str(truth_log),
     ]  # fmt: skip
     return subprocess.run(command, check=False).returncode == 0
@@ -154,11 +149,7 @@ def main() -> int:
         with EmulatorProcess(command) as emulator:
             where = " ".join(f"{key}={value}" for key, value in emulator.ready.items())
             console.print(f"Emulator ready after {time.monotonic() - begin:.1f} s: {where}")
-            legs = (
-                Leg("demo_serial", "serial", emulator.ready["serial"]),
-                Leg("demo_can", "can", emulator.ready["can"]),
-            )
-            passed = [run_leg(leg, out, truth_log) for leg in legs]
+            passed = [run_session(link, emulator.ready[link], out, truth_log) for link in SESSIONS]
     except BenchError as error:
         console.print(f"demo: {error}", style="red")
         return 1
@@ -166,7 +157,7 @@ def main() -> int:
         console.print("demo: a session failed; see its steps above", style="red")
         return 1
     truth = read_csv(truth_log)
-    comparisons = {leg.link: compare(read_csv(out / leg.link / "attitude.csv"), truth) for leg in legs}
+    comparisons = {link: compare(read_csv(out / link / "attitude.csv"), truth) for link in SESSIONS}
     good = report(comparisons, console)
     console.print(
         f"Images: {', '.join(map(str, sorted(out.rglob('*.png'))))}; logs in the same folders.\n"

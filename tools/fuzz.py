@@ -35,24 +35,14 @@ SLOWEST_S = 20
 MEMORY_MB = 3000
 CORPUS_BYTES = 3000
 INSTRUMENTED = (
-    *("starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.expect", "starhil.hil_tests.images"),
-    *("starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log", "starhil.hil_tests.emulator_process"),
-    *("starhil.emulator.control", "starhil.emulator.console"),
-    *(
-        "starhil.emulator.device",
-        "starhil.emulator.truth",
-        "starhil.emulator.profile",
-        "starhil.emulator.replay",
-    ),
-    *(
-        "starhil.emulator.cli.endurance",
-        "starhil.emulator.tape",
-        "starhil.emulator.json_lines",
-        "starhil.emulator.toml_file",
-        "starid.files",
-    ),
-    *("starid.imaging.image_io", "starid.camera_file", "starid.hipparcos", "starid.thesis.database_file"),
-)
+    "starhil.protocol", "starhil.hil_tests.script", "starhil.hil_tests.expect",
+    "starhil.hil_tests.images", "starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log",
+    "starhil.hil_tests.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
+    "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",
+    "starhil.emulator.replay", "starhil.emulator.cli.endurance", "starhil.emulator.tape",
+    "starhil.emulator.json_lines", "starhil.emulator.toml_file", "starid.files",
+    "starid.imaging.image_io", "starid.camera_file", "starid.hipparcos", "starid.thesis.database_file",
+)  # fmt: skip
 """Modules whose coverage guides; not those with kernels, because numba cannot read instrumented code."""
 
 

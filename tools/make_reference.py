@@ -20,7 +20,7 @@ import json
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, cast, get_args, get_type_hints
 
@@ -58,6 +58,9 @@ SUFFIXES: Final = {
     "_s": "s",
 }
 """Suffix of a key → unit, longest first."""
+
+CHOICES: Final = {"bits": "`8`, `12`, `16`"}
+"""Values of keys that are not all of a range."""
 
 OF_PARAMETERS: Final = ("exposure_s", "gain")
 """Fields of the sensor model that are parameters of the device, not keys of `[sensor]`."""
@@ -282,15 +285,7 @@ def sensor() -> str:
     """Keys of `[sensor]`."""
     from starhil.emulator.sensor.model import SensorModel
 
-    texts = attribute_docstrings(SensorModel, grouped=True)
-    rows: list[Row] = []
-    for field in dataclasses.fields(SensorModel):
-        if field.name in OF_PARAMETERS:
-            continue
-        low, high, of = field.metadata.get("limits", (0, 0, ""))
-        allowed = f"{low:g} to {high:g}" if of else "`8`, `12`, `16`"
-        rows.append((f"`{field.name}`", of, allowed, literal(field.default), texts[field.name]))
-    return table(rows)
+    return table(dataclass_rows(SensorModel, OF_PARAMETERS))
 
 
 def sky() -> str:
@@ -313,17 +308,18 @@ def sky() -> str:
     return "\n\n".join(parts)
 
 
-def dataclass_rows(kind: Any, skipped: Mapping[str, object] | None = None) -> list[Row]:
-    """Return a row for each field of a dataclass of the sky."""
+def dataclass_rows(kind: Any, skipped: Container[str] = ()) -> list[Row]:
+    """Return a row for each field of a dataclass of the sky or the sensor."""
     texts = attribute_docstrings(kind, grouped=True)
     rows: list[Row] = []
     for field in dataclasses.fields(kind):
-        if field.name in (skipped or {}):
+        if field.name in skipped:
             continue
-        low, high = field.metadata.get("limits", (None, None))
-        allowed = "" if low is None or high is None or abs(low) >= 1e5 else f"{number(low)} to {number(high)}"
+        low, high, *of = field.metadata.get("limits", (None, None))
+        allowed = "" if low is None or high is None or low <= -1e5 else f"{number(low)} to {number(high)}"
         value = "required" if field.default is dataclasses.MISSING else literal(field.default)
-        rows.append((f"`{field.name}`", unit(field.name), allowed, value, texts[field.name]))
+        name, of_field = field.name, of[0] if of else unit(field.name)
+        rows.append((f"`{name}`", of_field, CHOICES.get(name, allowed), value, texts[name]))
     return rows
 
 
@@ -565,20 +561,11 @@ def shown_default(value: Any) -> str:
 
 
 TABLES: Final[dict[str, Callable[[], str]]] = {
-    "actions": actions,
-    "commands": commands,
-    "device_parameters": device_parameters,
-    "faults": faults,
-    "identifier": identifier,
-    "model_quantities": model_quantities,
-    "orbit": orbit,
-    "profile": profile,
-    "quantities": quantities,
-    "scenario": scenario,
-    "sensor": sensor,
-    "sky": sky,
-    "truth": truth,
-    "unit_definition": unit_definition,
+    function.__name__: function
+    for function in (
+        *(actions, commands, device_parameters, faults, identifier, model_quantities, orbit, profile),
+        *(quantities, scenario, sensor, sky, truth, unit_definition),
+    )
 }
 """Name of a table in a page → function that writes it."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pydoc
+import re
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -9,6 +11,7 @@ import typer
 
 from starhil.emulator.cli.output import print_text
 from starhil.emulator.errors import EmulatorError
+from starhil.protocol.names import remedy
 
 _FOLDER: Final = Path(__file__).resolve().parents[2] / "docs"
 """Folder of the pages in the installation or checkout."""
@@ -17,10 +20,29 @@ _HEADING: Final = "# "
 """Beginning of a page; the others are directives for the web site."""
 
 
+_DIRECTIVES: Final = re.compile(r"^```\{eval-rst\}\n(.*?)^```\n", re.MULTILINE | re.DOTALL)
+"""Sphinx directives in a page of the API."""
+
+
 def pages() -> dict[str, str]:
-    """Return the pages in Markdown, by name."""
-    texts = {page.stem: page.read_text(encoding="utf-8") for page in sorted(_FOLDER.glob("*.md"))}
+    """Return the pages in Markdown, by name; those of the API are `api/NAME`."""
+    files = [*sorted(_FOLDER.glob("*.md")), *sorted(_FOLDER.glob("api/*.md"))]
+    texts = {
+        str(file.relative_to(_FOLDER).with_suffix("")): file.read_text(encoding="utf-8") for file in files
+    }
     return {name: text for name, text in texts.items() if text.startswith(_HEADING)}
+
+
+def _with_docstrings(directives: re.Match[str]) -> str:
+    """Return the documentation of what the directives name, as `pydoc` prints it."""
+    names = re.findall(r"^\.\. auto\w+:: (\S+)", directives[1], re.MULTILINE)
+    texts = []
+    for name in names:
+        try:
+            texts.append(pydoc.plain(pydoc.render_doc(name, "%s")))
+        except pydoc.ErrorDuringImport as error:  # the plugin without pytest
+            texts.append(f"{name}: {error}\n")
+    return "\n".join(texts)
 
 
 def names(incomplete: str) -> list[str]:
@@ -42,5 +64,5 @@ def command(
         return
     name = page.removeprefix("docs/").partition("#")[0].removesuffix(".md")
     if name not in found:
-        raise EmulatorError(f"page {page!r}: not found; one of: {', '.join(found)}")
-    print_text(found[name])
+        raise EmulatorError(f"page {page!r}: not found{remedy(name, found)}")
+    print_text(_DIRECTIVES.sub(_with_docstrings, found[name]))

@@ -20,7 +20,7 @@ def command(
     """Serve a CAN bus over TCP (socketcand protocol) for machines without SocketCAN.
 
     Connect python-can with interface socketcand, host, port and channel vcan0, and starhil
-    with --can socketcand:HOST:PORT/vcan0. SIGINT or SIGTERM ends the hub.
+    with --can socketcand:HOST:PORT/vcan0; `starhil docs walkthrough` shows the protocol. SIGINT or SIGTERM ends the hub.
     """
     import asyncio
     import signal

@@ -13,7 +13,7 @@ from typing import Any, Final
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.describe import describe, load_bright_stars
 from starhil.emulator.console.history import History, frame_message, json_row
-from starhil.emulator.console.obc import ConsoleObc, Exchange, ObcClient
+from starhil.emulator.console.obc import POLL_S, ConsoleObc, Exchange, ObcClient
 from starhil.emulator.console.pointing import pointing_request
 from starhil.emulator.console.runs import Runs
 from starhil.emulator.console.stepping import StepRunner
@@ -39,9 +39,6 @@ STATUS_S: Final = 0.5
 
 LINK_NAMES: Final = {"serial": "serial", "can": "CAN"}
 
-POLL_S: Final = 1.0
-"""Period in which every telemetry row shown on a page is read once, seconds."""
-
 CONTROL: Final = frozenset({"status", "truth", "set_truth", "step", "fault", "clear_faults", "scenario"})
 """Requests on the control channel that a page may make."""
 
@@ -59,7 +56,7 @@ class Console:
         self.obc = ConsoleObc(client, device.icd)
         self.history = History()
         self.runs = runs
-        runs.listeners.append(self._broadcast)
+        runs.changed.connect(self._broadcast)
         self.trace = WireTrace(
             device.icd,
             head.traffic,

@@ -143,7 +143,6 @@ def frame_message(measurement: Measurement, row: list[float]) -> bytes:
     numbers = json.dumps(
         {
             "row": json_row(row),
-            "reason": measurement.reason,
             "late": measurement.late,
             "rejected": measurement.result.refused,
             "true_q": measurement.truth.attitude.quaternion_xyzw.tolist(),

@@ -22,6 +22,9 @@ Bus = Literal["can", "canopen", "serial"]
 KEPT_STEPS: Final = 1000
 """Number of latest transactions that can be saved as a session."""
 
+POLL_S: Final = 1.0
+"""Period in which the console reads every telemetry row that a page shows, and a recording every row, seconds."""
+
 SHORTEST_WAIT_S: Final = 0.05
 """Shortest pause that becomes a step of a session, seconds."""
 

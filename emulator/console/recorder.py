@@ -23,7 +23,7 @@ from mcap.writer import CompressionType, Writer
 
 from starhil.emulator.clock import NANOSECONDS
 from starhil.emulator.console.history import COLUMNS, MODES, UNITS, History, json_row
-from starhil.emulator.console.obc import ObcClient, decode
+from starhil.emulator.console.obc import POLL_S, ObcClient, decode
 from starhil.emulator.device.measurement import Measurement
 from starhil.emulator.device.modes import Transition
 from starhil.emulator.guard import log_internal_error
@@ -39,9 +39,6 @@ MAX_PENDING: Final = 64
 
 MCAP_TIMES_NS: Final = range(1 << 64)
 """Times that an MCAP file can hold: Unix time, nanoseconds."""
-
-POLL_S: Final = 1.0
-"""Period in which every telemetry row is read once, seconds."""
 
 TRAFFIC_S: Final = 0.05
 """Wall time for which traffic is collected before it is written, seconds."""

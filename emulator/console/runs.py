@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.signals import Signal
 
 KEPT_RUNS: Final = 20
 KEPT_RESULTS: Final = 2000
@@ -38,16 +39,11 @@ class Run:
 
 
 class Runs:
-    """The latest runs.
-
-    Attributes
-    ----------
-    listeners
-        Functions that send a message to the pages of a console.
-    """
+    """The latest runs."""
 
     def __init__(self) -> None:
-        self.listeners: list[Callable[[dict[str, Any]], None]] = []
+        self.changed: Final = Signal[dict[str, Any]]("runs")
+        """Messages for pages."""
         self._runs: OrderedDict[str, Run] = OrderedDict()
 
     def report(self, event: object) -> None:
@@ -62,13 +58,9 @@ class Runs:
             case "end":
                 run = self._find(event)
                 run.end_s = time.time()
-                self._broadcast({"type": "run", **run.head()})
+                self.changed.emit({"type": "run", **run.head()})
             case _:
                 raise EmulatorError("report: event must be begin, result or end")
-
-    def _broadcast(self, message: dict[str, Any]) -> None:
-        for listener in self.listeners:
-            listener(message)
 
     def _begin_run(self, event: dict[str, Any]) -> None:
         planned = event.get("planned")
@@ -83,7 +75,7 @@ class Runs:
         self._runs[run.run] = run
         while len(self._runs) > KEPT_RUNS:
             self._runs.popitem(last=False)
-        self._broadcast({"type": "run", **run.head()})
+        self.changed.emit({"type": "run", **run.head()})
 
     def _add_result(self, event: dict[str, Any]) -> None:
         run = self._find(event)
@@ -93,7 +85,7 @@ class Runs:
         run.counts[str(result["status"])] += 1
         if len(run.results) < KEPT_RESULTS:
             run.results.append(result)
-        self._broadcast({"type": "result", "run": run.run, "counts": run.counts, "result": result})
+        self.changed.emit({"type": "result", "run": run.run, "counts": run.counts, "result": result})
 
     def _find(self, event: dict[str, Any]) -> Run:
         run = self._runs.get(str(event["run"]))

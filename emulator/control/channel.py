@@ -42,6 +42,7 @@ from starhil.emulator.truth.live import LiveTruth
 from starhil.emulator.truth_log import compare
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.flow import REQUEST_S, ConnectionLimit
+from starhil.protocol.names import did_you_mean, remedy
 from starhil.protocol.validation_messages import problems
 from starid.errors import StaridError
 
@@ -162,7 +163,8 @@ class ControlServer:
         """Execute a decoded request, without `id` and `token`, and return its answer."""
         wanted = str(request.pop("do", ""))
         if wanted not in self._actions:
-            return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}"}
+            near = did_you_mean(wanted, self._actions)
+            return {"ok": False, "error": f"do: must be one of {', '.join(self._actions)}{near}"}
         action, known = self._actions[wanted]
         try:
             head = self._head(request)
@@ -309,7 +311,7 @@ def _parse(model: type[Model], value: object) -> Model:
 def _check_keys(request: dict[str, Any], known: tuple[str, ...]) -> None:
     for key in request:
         if key not in known:
-            raise EmulatorError(f"unknown key {key!r}; known: {', '.join(known) or 'none'}")
+            raise EmulatorError(f"unknown key {key!r}{remedy(key, known)}")
 
 
 def _number(request: dict[str, Any], key: str, default: float | None = None) -> float:

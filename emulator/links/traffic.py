@@ -193,14 +193,12 @@ def _values(row: Row | None, data: bytes) -> str:
 
 
 def short(value: Value) -> str:
-    """Format a value."""
-    return (
-        value.hex(" ").upper()
-        if isinstance(value, bytes)
-        else f"{value:.6g}"
-        if isinstance(value, float)
-        else str(value)
-    )
+    """Format a value: a float with six digits, or all before the point and six after it."""
+    if isinstance(value, bytes):
+        return value.hex(" ").upper()
+    if not isinstance(value, float):
+        return str(value)
+    return f"{value:.6f}".rstrip("0").rstrip(".") if 1e6 <= abs(value) < 1e15 else f"{value:.6g}"
 
 
 def canopen_text(frame: CanFrame) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.messages import CatalogUpset
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import remedy
 from starid.camera import Camera
 from starid.catalog import StarCatalog
 from starid.errors import StaridError
@@ -72,7 +72,7 @@ def check_options(algorithm: str, options: Mapping[str, Any]) -> None:
     known = _known_options(getattr(importlib.import_module(module), name))
     for option, value in options.items():
         if option not in known:
-            hint = did_you_mean(option, known) or f"; known: {', '.join(sorted(known))}"
+            hint = remedy(option, known)
             raise EmulatorError(f"identifier.{option}: not an option of the algorithm {algorithm}{hint}")
         allowed = tuple(kind for word, kinds in _KINDS.items() if word in known[option] for kind in kinds)
         if not isinstance(value, allowed) or (isinstance(value, bool) and bool not in allowed):

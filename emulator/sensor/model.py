@@ -10,7 +10,7 @@ import numpy as np
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.sensor.noise import Digitizer
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import remedy
 from starid.arrays import Array
 from starid.attitude import ARCSEC_PER_RAD
 from starid.camera import Camera
@@ -119,8 +119,7 @@ class SensorModel:
         """Return a copy with some fields changed; an unknown name is an error."""
         known = {each.name for each in fields(self)}
         for unknown in sorted(changes.keys() - known):
-            hint = did_you_mean(unknown, known) or f"; known: {', '.join(sorted(known))}"
-            raise EmulatorError(f"sensor.{unknown}: unknown key{hint}")
+            raise EmulatorError(f"sensor.{unknown}: unknown key{remedy(unknown, known)}")
         return replace(self, **changes)
 
     @property

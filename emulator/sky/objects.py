@@ -16,7 +16,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.names import remedy
 from starid.arrays import Array
 
 _MAX_OBJECTS: Final = 100_000
@@ -235,9 +235,7 @@ def check_keys(where: str, given: Iterable[str], known: Iterable[str], taken: It
     """Reject an unknown key; the error suggests similar known ones, or lists all, with those `taken` already."""
     unknown = sorted(set(given) - set(known))
     if unknown:
-        possible = sorted({*known, *taken})
-        hint = did_you_mean(unknown[0], possible) or f"; known: {', '.join(possible)}"
-        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}{hint}")
+        raise EmulatorError(f"{where}: unknown key {unknown[0]!r}{remedy(unknown[0], {*known, *taken})}")
 
 
 def _from_table(name: str, kind: Any, values: Any) -> Any:

@@ -8,34 +8,35 @@ vectors is its conjugate. One of the two frames must be inertial and known (`sta
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 from xml.etree import ElementTree as ET
 
 import numpy as np
 
 from starhil.emulator.errors import EmulatorError
-from starhil.emulator.truth.feed_message import checked_attitude, checked_rate
-from starhil.emulator.truth.feed_rates import FeedError
-from starhil.emulator.truth.source import Vector
+from starhil.emulator.truth.feed_message import NORM_TOLERANCE
+from starhil.emulator.truth.source import MAX_RATE_DEG_S
 from starhil.emulator.truth.standard_frames import (
     NANOSECONDS,
     Row,
-    body_attitude,
-    euler_turn,
+    euler_turns,
     icrs_to,
-    inverse,
     is_inertial,
     orbit_of_rows,
     truth_of,
     unix_ns,
 )
 from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.files import read_number
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 TYPES: Final = {"QUATERNION": 4, "EULER_ANGLE": 3, "QUATERNION/ANGVEL": 7, "EULER_ANGLE/ANGVEL": 6}
 """Attitude types that are read, and the numbers in a row of each."""
@@ -75,7 +76,7 @@ def read_oem(path: Path, text: str) -> OrbitTable:
 
 def attitudes_of(path: Path, segments: Sequence[Segment]) -> FileTruth:
     """Return the truth of segments with the keywords of an AEM, in any notation."""
-    blocks = [list(_attitudes(f"truth file {path}, segment {n}", each)) for n, each in enumerate(segments, 1)]
+    blocks = [_attitudes(f"truth file {path}, segment {n}", each) for n, each in enumerate(segments, 1)]
     methods = {segment.keywords.get("INTERPOLATION_METHOD", "").upper() for segment in segments}
     return truth_of(path, blocks, smooth="LINEAR" not in methods)
 
@@ -100,7 +101,7 @@ def write_aem(truth: FileTruth, sensor: str) -> str:
     """Return the rows of a truth with dates as an AEM 2.0 (KVN), GCRF to the frame named `sensor`."""
     begin_ns = 1000 * round(1e6 * (truth.start_unix_s or 0.0))  # the resolution of such a float is 0.2 µs
     dates = [_date(begin_ns + round(t * NANOSECONDS)) for t in truth.times_s.tolist()]
-    numbers = np.array([inverse(attitude).quaternion_xyzw for attitude in truth.attitudes])
+    numbers = np.array([attitude.quaternion_xyzw * [-1.0, -1.0, -1.0, 1.0] for attitude in truth.attitudes])
     kind, frame_of_rates = "QUATERNION", []
     if truth.rates_rad_s is not None:
         kind, frame_of_rates = "QUATERNION/ANGVEL", [f"ANGVEL_FRAME = {sensor}"]
@@ -116,52 +117,54 @@ def write_aem(truth: FileTruth, sensor: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _attitudes(where: str, segment: Segment) -> Iterator[Row]:
+def _attitudes(where: str, segment: Segment) -> list[Row]:
+    from scipy.spatial.transform import Rotation
+
     kind = _keyword(where, segment, "ATTITUDE_TYPE").upper()
     if kind not in TYPES:
         raise EmulatorError(f"{where}: ATTITUDE_TYPE {kind[:40]!r} is not read; known: {', '.join(TYPES)}")
-    reference, body = (_keyword(where, segment, f"REF_FRAME_{letter}") for letter in "AB")
-    is_inverse = segment.keywords.get("ATTITUDE_DIR", "A2B").upper() == "B2A"
-    inertial = body if is_inertial(body) else reference
-    if is_inertial(body) and is_inertial(reference):
+    frames = [_keyword(where, segment, f"REF_FRAME_{letter}") for letter in "AB"]
+    of_a = is_inertial(frames[1])  # A is the body
+    if of_a and is_inertial(frames[0]):
         raise EmulatorError(f"{where}: both frames are inertial; one must be the body")
-    to_reference = icrs_to(where, inertial)
-    is_inverse ^= inertial == body
-    scalar_first = segment.keywords.get("QUATERNION_TYPE", "LAST").upper() == "FIRST"
-    size = 4 if kind.startswith("QUATERNION") else 3
-    for at_ns, numbers in segment.rows:
-        if len(numbers) != TYPES[kind]:
-            raise EmulatorError(
-                f"{where}: {len(numbers)} numbers in a row of {kind}, which has {TYPES[kind]}"
-            )
-        values, rate = np.array(numbers[:size]), None
-        try:
-            if size == 4:
-                turn = checked_attitude(
-                    "quaternion", np.roll(values, -1) if scalar_first else values, "attitude"
-                )
-            else:
-                turn = euler_turn(where, _keyword(where, segment, "EULER_ROT_SEQ"), values)
-            if kind.endswith("/ANGVEL"):
-                rate = checked_rate("rate", np.radians(numbers[size:]))
-        except FeedError as error:
-            raise EmulatorError(f"{where}: {error}") from None
-        if rate is not None:
-            rate = _rate_of_body(where, segment, rate, turn, reference, body, of_a=is_inverse)
-        turn = inverse(turn) if is_inverse else turn
-        yield Row(at_ns, body_attitude(to_reference, turn), rate)
+    to_reference = icrs_to(where, frames[of_a])
+    if not segment.rows:
+        return []
+    for size in {len(numbers) for _, numbers in segment.rows} - {TYPES[kind]}:
+        raise EmulatorError(f"{where}: {size} numbers in a row of {kind}, which has {TYPES[kind]}")
+    times, rows = zip(*segment.rows, strict=True)
+    values, rates = np.array(rows), None
+    if kind.startswith("QUATERNION"):
+        scalar_first = segment.keywords.get("QUATERNION_TYPE", "LAST").upper() == "FIRST"
+        quaternions, values = np.roll(values[:, :4], -1 if scalar_first else 0, axis=1), values[:, 4:]
+        if not (np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= NORM_TOLERANCE).all():
+            raise EmulatorError(f"{where}: a quaternion is not of length 1")
+        turns = Rotation.from_quat(quaternions)
+    else:
+        turns = euler_turns(where, _keyword(where, segment, "EULER_ROT_SEQ"), values[:, :3])
+        values = values[:, 3:]
+    is_inverse = segment.keywords.get("ATTITUDE_DIR", "A2B").upper() == "B2A"
+    to_body = turns if is_inverse != of_a else turns.inv()
+    if kind.endswith("/ANGVEL"):
+        rates = _rates_of_body(where, segment, np.radians(values), frames, to_body, of_a=of_a)
+    quaternions = (to_body * to_reference).as_quat()
+    return [
+        Row(at_ns, Attitude(quaternion), None if rates is None else rates[row])
+        for row, (at_ns, quaternion) in enumerate(zip(times, quaternions, strict=True))
+    ]
 
 
-def _rate_of_body(
-    where: str, segment: Segment, rate: Vector, turn: Attitude, reference: str, body: str, *, of_a: bool
-) -> Vector:
-    """Return the rate of the body in the frame of the body, from that of frame B relative to A in either frame."""
+def _rates_of_body(
+    where: str, segment: Segment, rates: Array, frames: Sequence[str], to_body: Rotation, *, of_a: bool
+) -> Array:
+    """Return the rates (n, 3) of the body in its frame, from those of frame B relative to A in either frame."""
     frame = _keyword(where, segment, "ANGVEL_FRAME")
-    if frame not in (reference, body):
+    if frame not in frames:
         raise EmulatorError(f"{where}: ANGVEL_FRAME {frame[:40]!r} is neither REF_FRAME_A nor REF_FRAME_B")
-    if of_a:  # A is the body
-        return -(rate if frame == reference else turn.to_icrs(rate))
-    return rate if frame == body else turn.to_sensor(rate)
+    if not np.degrees(np.abs(rates)).max() <= MAX_RATE_DEG_S * (1.0 + 1e-12):
+        raise EmulatorError(f"{where}: a rate exceeds {MAX_RATE_DEG_S:g} degrees per second")
+    turned: Array = rates if frame == frames[not of_a] else to_body.apply(rates)
+    return -turned if of_a else turned
 
 
 def _segments(where: str, kind: str, text: str) -> tuple[str, list[Segment]]:

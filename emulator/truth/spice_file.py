@@ -37,6 +37,39 @@ FORWARD: Final = 3
 TICKS_PER_S: Final = 1_000_000
 """Resolution of the clock of a written CK."""
 
+LEAP_SECONDS: Final = """KPL/LSK
+\\begindata
+DELTET/DELTA_T_A = ( 32.184 )
+DELTET/K = ( 1.657D-3 )
+DELTET/EB = ( 1.671D-2 )
+DELTET/M = ( 6.239996D0 1.99096871D-7 )
+DELTET/DELTA_AT = ( {} )
+\\begintext
+"""
+"""A leap-seconds kernel: SPICE's definition of ET."""
+
+CLOCK: Final = f"""KPL/SCLK
+\\begindata
+SCLK_KERNEL_ID = ( @2000-01-01 )
+SCLK_DATA_TYPE_$ = ( 1 )
+SCLK_PARTITION_START_$ = ( 0 )
+SCLK_PARTITION_END_$ = ( {4294967295 * TICKS_PER_S} )
+SCLK01_TIME_SYSTEM_$ = ( 2 )
+SCLK01_N_FIELDS_$ = ( 2 )
+SCLK01_MODULI_$ = ( 4294967296 {TICKS_PER_S} )
+SCLK01_OFFSETS_$ = ( 0 0 )
+SCLK01_OUTPUT_DELIM_$ = ( 1 )
+SCLK01_COEFFICIENTS_$ = ( 0 {{!r}} 1 )
+\\begintext
+"""
+"""A kernel of the clock with the number $: ticks from a terrestrial time, seconds past J2000."""
+
+META: Final = """KPL/MK
+\\begindata
+KERNELS_TO_LOAD = ( {} )
+\\begintext
+"""
+
 _LOCK: Final = threading.Lock()
 """SPICE has one set of kernels for the whole process."""
 
@@ -76,54 +109,51 @@ def read_kernels(path: Path) -> FileTruth:
             raise EmulatorError(
                 f"truth file {path}: its CKs have {len(structures)} structures, must have one"
             )
-        structure = structures.pop()
-        segments = [ticks for name in kernels for ticks in _ticks(spice, name)]
-        blocks = [_rows(spice, structure, ticks) for ticks in segments]
+        blocks = [rows for name in kernels for rows in _segments(spice, name)]
     return truth_of(path, blocks, smooth=False)
 
 
-def _ticks(spice: Any, kernel: str) -> Iterator[np.ndarray[Any, Any]]:
-    """Yield the clock's ticks at which each segment of a CK is read."""
+def _segments(spice: Any, kernel: str) -> list[list[Row]]:
+    """Return the rows of each segment of a CK."""
+    segments = []
     handle = spice.dafopr(kernel)
     try:
         spice.dafbfs(handle)
         while spice.daffna():
             summary = spice.dafgs(5)
-            (begin, end), (structure, _, kind, *_) = spice.dafus(summary, 2, 6)
+            (begin, end), (structure, _, kind, has_rates, *_) = spice.dafus(summary, 2, 6)
+            clock = spice.ckmeta(structure, "SCLK")
             if kind == FORWARD:
                 count = spice.cknr03(handle, summary)
-                yield np.array([spice.ckgr03(handle, summary, number)[0] for number in range(1, count + 1)])
+                ticks = [spice.ckgr03(handle, summary, number)[0] for number in range(1, count + 1)]
             else:
-                clock = spice.ckmeta(structure, "SCLK")
-                first, last = (spice.sct2e(clock, ticks) for ticks in (begin, end))
+                first, last = (spice.sct2e(clock, tick) for tick in (begin, end))
                 count = min(int((last - first) / STEP_S) + 2, MAX_ROWS)
                 inner = [spice.sce2c(clock, et) for et in np.linspace(first, last, count)[1:-1]]
-                yield np.array([begin, *inner, end])
+                ticks = [begin, *inner, end]
+            segments.append((structure, ticks, bool(has_rates)))
     finally:
         spice.dafcls(handle)
+    # SPICE has one search at a time, which reading attitudes would end
+    return [
+        [_row(spice, structure, tick, has_rates=has_rates) for tick in ticks]
+        for structure, ticks, has_rates in segments
+    ]
 
 
-def _rows(spice: Any, structure: int, ticks: np.ndarray[Any, Any]) -> list[Row]:
-    clock, spacecraft = spice.ckmeta(structure, "SCLK"), spice.ckmeta(structure, "SPK")
-    has_orbit = spice.ktotal("SPK") > 0
-    rows = []
-    for tick in ticks:
-        try:
-            matrix, rate, _ = spice.ckgpav(structure, tick, 0.0, "J2000")
-        except spice.exceptions.NotFoundError:  # no angular velocities in the CK
-            matrix, _ = spice.ckgp(structure, tick, 0.0, "J2000")
-            rate = None
-        et = spice.sct2e(clock, tick)
-        orbit = None
-        if has_orbit:
-            state, _ = spice.spkez(spacecraft, et, "J2000", "NONE", EARTH)
-            orbit = OrbitState(1e3 * state[:3], 1e3 * state[3:])
-        unix_s = et - spice.deltet(et, "ET") + J2000_UNIX_S
-        attitude = Attitude.from_matrix(matrix)
-        rows.append(
-            Row(round(unix_s * NANOSECONDS), attitude, None if rate is None else matrix @ rate, orbit)
-        )
-    return rows
+def _row(spice: Any, structure: int, tick: float, *, has_rates: bool) -> Row:
+    rate, orbit = None, None
+    if has_rates:
+        matrix, rate, _ = spice.ckgpav(structure, tick, 0.0, "J2000")
+        rate = matrix @ rate
+    else:
+        matrix, _ = spice.ckgp(structure, tick, 0.0, "J2000")
+    et = spice.sct2e(spice.ckmeta(structure, "SCLK"), tick)
+    if spice.ktotal("SPK"):
+        state, _ = spice.spkez(spice.ckmeta(structure, "SPK"), et, "J2000", "NONE", EARTH)
+        orbit = OrbitState(1e3 * state[:3], 1e3 * state[3:])
+    unix_s = et - spice.deltet(et, "ET") + J2000_UNIX_S
+    return Row(round(unix_s * NANOSECONDS), Attitude.from_matrix(matrix), rate, orbit)
 
 
 def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
@@ -150,9 +180,8 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
         spice.furnsh(str(files[".tls"]))
         begin_et = (truth.start_unix_s or 0.0) + float(truth.times_s[0]) - J2000_UNIX_S
         begin_et += spice.deltet(begin_et, "UTC")
-        files[".tsc"].write_text(
-            _clock(-structure // 1000, spice.unitim(begin_et, "ET", "TDT")), encoding="ascii"
-        )
+        clock = CLOCK.replace("$", str(-structure // 1000)).format(spice.unitim(begin_et, "ET", "TDT"))
+        files[".tsc"].write_text(clock, encoding="ascii")
         handle = spice.ckopn(str(files[".bc"]), "starhil", 0)
         spice.ckw03(
             handle, ticks[0], ticks[-1], structure, "J2000", truth.rates_rad_s is not None, "starhil",
@@ -160,45 +189,15 @@ def write_kernels(truth: FileTruth, path: Path, structure: int) -> None:
         )  # fmt: skip
         spice.ckcls(handle)
         names = ", ".join(f"'{file.name}'" for file in files.values())
-        path.write_text(_kernel("MK", KERNELS_TO_LOAD=names), encoding="ascii")
+        path.write_text(META.format(names), encoding="ascii")
 
 
 def _leap_seconds() -> str:
-    """Return a leap-seconds kernel: SPICE's definition of ET, and the table of `erfa`."""
+    """Return a leap-seconds kernel with the table of `erfa`."""
     import erfa
 
-    table = erfa.leap_seconds.get()
-    rows = [
-        f"{row['tai_utc']:g}, @{row['year']}-{row['month']:02d}-01" for row in table if row["year"] >= 1972
-    ]
-    constants = {"DELTA_T_A": "32.184", "K": "1.657D-3", "EB": "1.671D-2", "M": "6.239996D0 1.99096871D-7"}
-    return _kernel(
-        "LSK",
-        **{f"DELTET/{name}": value for name, value in constants.items()},
-        **{"DELTET/DELTA_AT": "\n".join(rows)},
-    )
-
-
-def _clock(number: int, begin_tt_s: float) -> str:
-    """Return a clock kernel of ticks of `1 / TICKS_PER_S` from a terrestrial time, seconds past J2000."""
-    of_type_1 = {
-        "TIME_SYSTEM": "2",
-        "N_FIELDS": "2",
-        "MODULI": f"4294967296 {TICKS_PER_S}",
-        "OFFSETS": "0 0",
-        "OUTPUT_DELIM": "1",
-        "COEFFICIENTS": f"0 {begin_tt_s!r} 1",
-    }
-    partition = {"START": "0", "END": f"{4294967295 * TICKS_PER_S}"}
-    return _kernel(
-        "SCLK",
-        **{"SCLK_KERNEL_ID": "@2000-01-01", f"SCLK_DATA_TYPE_{number}": "1"},
-        **{f"SCLK_PARTITION_{name}_{number}": value for name, value in partition.items()},
-        **{f"SCLK01_{name}_{number}": value for name, value in of_type_1.items()},
-    )
-
-
-def _kernel(kind: str, **values: str) -> str:
-    """Return a text kernel."""
-    lines = "".join(f"{name} = ( {value} )\n" for name, value in values.items())
-    return f"KPL/{kind}\n\\begindata\n{lines}\\begintext\n"
+    return LEAP_SECONDS.format("\n".join(
+        f"{row['tai_utc']:g}, @{row['year']}-{row['month']:02d}-01"
+        for row in erfa.leap_seconds.get()
+        if row["year"] >= 1972
+    ))  # fmt: skip

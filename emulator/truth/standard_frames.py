@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from time import strptime
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -18,8 +18,12 @@ from starhil.emulator.truth.feed_rates import FeedError, FeedRates
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import Vector
 from starhil.emulator.truth.table import FileTruth, OrbitTable
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.earth import utc_of_tai
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 NANOSECONDS: Final = 1_000_000_000
 ICRS_NAMES: Final = ("ICRF", "ICRF1", "ICRF2", "ICRF3", "GCRF", "ICRS", "GCRS")
@@ -47,14 +51,15 @@ class Row:
 
 
 @lru_cache
-def icrs_to(where: str, frame: str) -> Attitude:
+def icrs_to(where: str, frame: str) -> Rotation:
     """Return the rotation from ICRS to an inertial frame; EmulatorError names one that is not known."""
     import erfa
+    from scipy.spatial.transform import Rotation
 
     if frame.upper() in ICRS_NAMES:
-        return Attitude.identity()
+        return Rotation.identity()
     if frame.upper() in J2000_NAMES:
-        return Attitude.from_matrix(erfa.bp06(2_451_545.0, 0.0)[0])
+        return Rotation.from_matrix(erfa.bp06(2_451_545.0, 0.0)[0])
     known = ", ".join((*ICRS_NAMES, *J2000_NAMES))
     raise EmulatorError(f"{where}: frame {frame[:40]!r} is not known; known: {known}")
 
@@ -120,7 +125,7 @@ def truth_of(path: Path, blocks: Sequence[Sequence[Row]], *, smooth: bool) -> Fi
 
 
 def orbit_of_rows(
-    path: Path, frame: Attitude, dates_ns: Sequence[int], rows_m: Sequence[Sequence[float]]
+    path: Path, frame: Rotation, dates_ns: Sequence[int], rows_m: Sequence[Sequence[float]]
 ) -> OrbitTable:
     """Return the orbit of rows of x, y, z, vx, vy, vz (m, m/s) in the frame to which `frame` turns ICRS."""
     times = np.array(dates_ns, dtype=np.float64) / NANOSECONDS
@@ -129,27 +134,17 @@ def orbit_of_rows(
         raise EmulatorError(f"orbit file {path}: has no rows, or a date is not later than the one before")
     if np.abs(values).max() > MAX_METRES:
         raise EmulatorError(f"orbit file {path}: a number is outside ±{MAX_METRES:g}")
-    turned = [frame.to_icrs(values[:, first : first + 3]) for first in (0, 3)]
+    turned = [frame.inv().apply(values[:, first : first + 3]) for first in (0, 3)]
     return OrbitTable(path, times, [OrbitState(*pair) for pair in zip(*turned, strict=True)])
 
 
-def body_attitude(icrs_to_reference: Attitude, reference_to_body: Attitude) -> Attitude:
-    """Return the attitude ICRS→body."""
-    return Attitude.from_matrix(reference_to_body.matrix @ icrs_to_reference.matrix)
-
-
-def inverse(rotation: Attitude) -> Attitude:
-    """Return the inverse of a rotation."""
-    return Attitude(rotation.quaternion_xyzw * [-1.0, -1.0, -1.0, 1.0])
-
-
-def euler_turn(where: str, sequence: str, angles_deg: Vector) -> Attitude:
-    """Return the rotation by successive turns of the frame about its axes: XYZ, or digits."""
+def euler_turns(where: str, sequence: str, angles_deg: Array) -> Rotation:
+    """Return the rotations by successive turns (n, 3) of the frame about its axes: XYZ, or digits."""
     from scipy.spatial.transform import Rotation
 
-    axes = sequence.upper().translate(str.maketrans("123", "XYZ"))
     try:
-        turns = Rotation.from_euler(axes, angles_deg, degrees=True)
+        return Rotation.from_euler(
+            sequence.upper().translate(str.maketrans("123", "XYZ")), angles_deg, degrees=True
+        )
     except ValueError:
         raise EmulatorError(f"{where}: {sequence[:40]!r} is not a sequence of three axes") from None
-    return inverse(Attitude(turns.as_quat()))

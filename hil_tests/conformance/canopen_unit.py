@@ -31,7 +31,7 @@ from starhil.hil_tests.judge.canopen import (
     entries,
     is_text,
     pdo_can_id,
-    with_byte_order,
+    row_data,
     written,
 )
 from starhil.hil_tests.judge.definition import Unit
@@ -91,21 +91,16 @@ class EntryAccess:
         """
         seen = [b"", bytes(row.size)]
         for _ in range(10):
-            data = bytearray(row.size)
-            for entry, slot in _slots(self._found, row):
-                data[slot.offset : slot.offset + slot.size] = self._read(entry, slot)
-            seen.append(bytes(data))
+            seen.append(row_data(row, self._found, self._read))
             if seen[-1] == seen[-2]:
                 break
         return checked_values(row, seen[-1])
 
-    def _read(self, entry: Entry, slot: Field) -> bytes:
-        """Read an entry and check its size; return it in the byte order of its row."""
+    def _read(self, entry: Entry) -> bytes:
         data = self._probe.value(entry)
-        if not entry.size:
-            return data.ljust(slot.size, b"\0")
-        check_equal(len(data), entry.size, f"bytes of {entry.name}h")
-        return with_byte_order(slot, data)
+        if entry.size:
+            check_equal(len(data), entry.size, f"bytes of {entry.name}h")
+        return data
 
     def command(self, name: str, **values: Value) -> None:
         """Write an entry that executes a telecommand, which must be accepted."""
@@ -122,14 +117,10 @@ class EntryAccess:
         self._probe.wait_for(NOBODY, seconds)
 
 
-def _slots(found: list[Entry], row: Row) -> Iterator[tuple[Entry, Field]]:
-    for entry in found:
-        if entry.row is row and entry.slot is not None:
-            yield entry, entry.slot
-
-
 def _carries(found: list[Entry], row: Row, item: Field) -> bool:
-    return item.offset in {slot.offset for _, slot in _slots(found, row)}
+    return item.offset in {
+        entry.slot.offset for entry in found if entry.row is row and entry.slot is not None
+    }
 
 
 def _write(entry: Entry, command: Row, values: dict[str, Value], probe: CanopenProbe) -> None:

@@ -116,7 +116,7 @@ class SerialProbe(LinkProbe):
 
     def answers(self, row: Row) -> Sequence[str]:
         """Return the answers of a row on the serial line."""
-        return () if row.name in self.unit.unanswered else row.answers
+        return self.unit.serial_answers(row)
 
     def can_refuse(self, klass: str) -> bool:
         """Return whether answers of a class can express a refusal."""
@@ -140,11 +140,7 @@ class SerialProbe(LinkProbe):
 
     def post_request(self, request: Request, *, answered: bool = True) -> None:
         """Send a request without waiting."""
-        request = self.line.numbered(request)
-        row = self.unit.row(request)
-        if answered and (row is None or self.answers(row)):
-            self.line.expect(request)
-        self.send(self.line.encode(request))
+        self.send(self.line.post(request, answered=answered))
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
         """Return the next unread answer; bytes without an end are a malformed one."""

@@ -123,6 +123,9 @@ class Obc:
             raise Violation(f"{link}: {event} without a request")
         if row is None or row.kind != "telemetry":
             raise Violation(f"{link}: unsolicited {event}")
+        host = self._oracle.in_use("host_address")
+        if link == "can" and host not in (None, event.other):
+            raise Violation(f"{link}: {event} to address {event.other}, not {host!r}")
         if not self._oracle.streams:
             raise Violation(f"{link}: {row.name} without a subscription")
         self._outcome.readings += 1
@@ -145,7 +148,7 @@ class Obc:
         request = Request(row_id, data, klass, telemetry=kind == "telemetry")
         try:
             self._ports[link].ask(request)
-        except ValueError:
+        except (ValueError, OverflowError):
             return  # the header has no room for such an ID
         self._outcome.requests += 1
         counts = link != "canopen" or (kind == "telecommand" and not self._oracle.is_outside(row, data))
@@ -311,6 +314,7 @@ class Obc:
             self._oracle.counted("telemetry")
             if reply.row_id not in (None, row.id) or len(reply.data) != row.size:
                 raise Violation(f"{link}: {reply} where {row.name} was next")
+            self._oracle.read(row, reply.data)
 
     async def flood(self, link: str, row: Sequence[Any], count: int, data: str = "") -> None:
         """Send the same request many times, each judged, so that counters of 16 bits wrap."""

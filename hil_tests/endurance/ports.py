@@ -11,7 +11,6 @@ from typing import Any, Final, Protocol
 from starhil.hil_tests.judge import can, canopen
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
-from starhil.hil_tests.judge.rows import Row
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 
@@ -26,7 +25,7 @@ class Port(Protocol):
     """An OBC on one link."""
 
     def ask(self, *requests: Request) -> None:
-        """Send requests without a pause; raise ValueError for one that cannot be written."""
+        """Send requests without a pause; raise ValueError or OverflowError for one that cannot be written."""
         ...
 
     def cut(self, request: Request, share: float) -> None:
@@ -42,22 +41,13 @@ class SerialPort:
     """An OBC on a serial line; `dialect` is that of the answers, of a unit that has several."""
 
     def __init__(self, unit: Unit, deliver: Deliver, take: Take, dialect: str | None) -> None:
-        self._unit = unit
         self._deliver, self._take = deliver, take
         self._line = SerialLine(unit, dialect)
         self.dialect = self._line.dialect
 
     def ask(self, *requests: Request) -> None:
         """Send requests in one piece."""
-        try:
-            data = b"".join(self._line.encode(request) for request in requests)
-        except OverflowError as error:
-            raise ValueError(f"the header has no room: {error}") from None
-        for request in requests:
-            row = self._unit.row(request)
-            if row is None or row.name not in self._unit.unanswered:
-                self._line.expect(request)
-        self._deliver(data)
+        self._deliver(b"".join(self._line.post(request) for request in requests))
 
     def cut(self, request: Request, share: float) -> None:
         """Send the first bytes of a request."""
@@ -92,9 +82,13 @@ class CanPort:
             self._deliver(frame)
 
     def answers(self) -> list[Heard]:
-        """Return what has arrived; a frame between other addresses is malformed."""
+        """Return what has arrived; a frame of another source, or an answer to another OBC, is malformed."""
+
+        def is_unasked(frame: CanFrame) -> bool:
+            return frame.id >> 24 in can.UNSOLICITED and frame.id >> 8 & 0xFF == self.device
+
         taken = list(self._take())
-        asked = iter([item for item in taken if item[1].id >> 24 not in can.UNSOLICITED])
+        asked = iter([item for item in taken if not is_unasked(item[1])])
         found = []
         for at_s, frame in asked:
             if frame.id & 0xFFFF == self.device << 8 | HOST:
@@ -103,7 +97,7 @@ class CanPort:
                 answer = Answer("malformed", data=frame.id.to_bytes(4, "big") + frame.data)
             found.append((at_s, answer))
         for instant in dict.fromkeys(at_s for at_s, _ in taken):
-            frames = [frame for at_s, frame in taken if at_s == instant and frame.id >> 24 in can.UNSOLICITED]
+            frames = [frame for at_s, frame in taken if at_s == instant and is_unasked(frame)]
             found += [(instant, answer) for answer in can.unsolicited(frames)]
         return found
 
@@ -130,11 +124,13 @@ class CanopenPort:
             if row is None:
                 raise ValueError(f"{request}: no such row")
             try:
-                answer = Answer("telemetry", data=self._read(row)) if row.is_telemetry else Answer("ack")
-                if not row.is_telemetry:
-                    (entry,) = self._objects[row.kind, row.name]
-                    data = canopen.written(entry, row, request.data)
-                    canopen.download(self._exchange, entry.index, entry.subindex, data)
+                found = self._objects[row.kind, row.name]
+                if row.is_telemetry:
+                    answer = Answer("telemetry", data=canopen.row_data(row, found, self._read))
+                else:
+                    data = canopen.written(found[0], row, request.data)
+                    canopen.download(self._exchange, found[0].index, found[0].subindex, data)
+                    answer = Answer("ack")
             except canopen.AbortedError as abort:
                 answer = Answer("nack", abort.code)
             except canopen.BadResponseError as error:
@@ -146,18 +142,11 @@ class CanopenPort:
     def cut(self, request: Request, share: float) -> None:
         """Send nothing: the next transfer of a client aborts an incomplete one."""
 
-    def _read(self, row: Row) -> bytes:
-        data = bytearray(row.size)
-        for entry in self._objects[row.kind, row.name]:
-            value = canopen.upload(self._exchange, entry.index, entry.subindex)
-            if entry.slot is None:  # the whole row
-                return value
-            slot = entry.slot
-            piece = canopen.with_byte_order(slot, value).ljust(
-                slot.size, b"\0"
-            )  # a text ends before its NULs
-            data[slot.offset : slot.offset + slot.size] = piece
-        return bytes(data)
+    def _read(self, entry: canopen.Entry) -> bytes:
+        data = canopen.upload(self._exchange, entry.index, entry.subindex)
+        if entry.size and len(data) != entry.size:
+            raise canopen.BadResponseError(f"{entry.size} bytes of {entry.name}h", data)
+        return data
 
     def _exchange(self, request: bytes) -> bytes | None:
         """Send a request; return the response, several as one that is too long, None for none."""
@@ -198,14 +187,7 @@ def objects_of(unit: Unit) -> Objects:
     layout = unit.canopen
     records = [placed.index for placed in layout.object if placed.requests]
     if records:
-        return {
-            (row.kind, row.name): [
-                canopen.Entry(
-                    records[0], row.id, row.name, row.size, command=None if row.is_telemetry else row
-                )
-            ]
-            for row in unit.rows
-        }
+        return {(row.kind, row.name): [canopen.whole_row(records[0], row.id, row)] for row in unit.rows}
     every = list(canopen.entries(unit, layout))
     found: Objects = {}
     for row in unit.rows:

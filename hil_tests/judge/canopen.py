@@ -11,8 +11,8 @@ big-endian on its other links is converted.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from starhil.hil_tests.judge.definition import Unit
@@ -163,8 +163,7 @@ def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
         if placed.telemetry is not None and placed.type is not None:
             row = unit.telemetry[placed.telemetry]
             command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
-            whole = Field("", "bytes", "bytes", "little", 0, row.size)
-            yield Entry(index, 0, at, row.size, row, whole, command)
+            yield replace(whole_row(index, 0, row), name=at, command=command)
         elif placed.telemetry is not None:
             row = unit.telemetry[placed.telemetry]
             command = None if placed.telecommand is None else unit.telecommands[placed.telecommand]
@@ -184,6 +183,14 @@ def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
         for number, packed in enumerate(placed.packed, 1):
             name = packed.name or packed.source.partition(".")[2]
             yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type))
+
+
+def whole_row(index: int, subindex: int, row: Row) -> Entry:
+    """Return an entry that reads all data of a telemetry row as one slot, or executes a telecommand."""
+    if not row.is_telemetry:
+        return Entry(index, subindex, row.name, row.size, command=row)
+    slot = Field("", "bytes", "bytes", "little", 0, row.size)
+    return Entry(index, subindex, row.name, row.size, row, slot)
 
 
 def _entry(unit: Unit, placed: Any, index: int, subindex: int, name: str) -> Entry:
@@ -219,6 +226,16 @@ def _bytes_of(type_: str) -> int:
 def with_byte_order(slot: Field | None, data: bytes) -> bytes:
     """Convert bytes between the byte order of a slot and CANopen's, little-endian."""
     return data[::-1] if slot is not None and slot.order == "big" and slot.type != "bytes" else data
+
+
+def row_data(row: Row, found: Iterable[Entry], read: Callable[[Entry], bytes]) -> bytes:
+    """Return the data of a row, read through the entries that hold its slots; a text ends before its NULs."""
+    data = bytearray(row.size)
+    for entry in found:
+        if entry.row is row and (slot := entry.slot) is not None:
+            value = with_byte_order(slot, read(entry)).ljust(slot.size, b"\0")
+            data[slot.offset : slot.offset + slot.size] = value
+    return bytes(data)
 
 
 def written(entry: Entry, command: Row, data: bytes) -> bytes:

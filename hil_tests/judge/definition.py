@@ -7,7 +7,7 @@ said so in docs/rules.md: the reader of the TOML files; the framing and check of
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -98,6 +98,10 @@ class Unit:
         if self.first_telemetry_id is not None:
             return row_id >= self.first_telemetry_id
         return any(row.id == row_id for row in self.telemetry.values())
+
+    def serial_answers(self, row: Row) -> Sequence[str]:
+        """Return the answers of a row on the serial line."""
+        return () if row.name in self.unanswered else row.answers
 
     @cached_property
     def reported_data(self) -> tuple[tuple[Row, Row, slice], ...]:

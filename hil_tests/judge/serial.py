@@ -116,6 +116,15 @@ class SerialLine:
         framing, envelope = self.request_format(request.klass)
         return framing.encode(envelope.body(request))
 
+    def post(self, request: Request, *, answered: bool = True) -> bytes:
+        """Return a request as bytes on the line, with the next sequence number; its answer is expected, if it has one."""
+        request = self.numbered(request)
+        line = self.encode(request)
+        row = self._unit.row(request)
+        if answered and (row is None or self._unit.serial_answers(row)):
+            self.expect(request)
+        return line
+
     def telemetry_frame(self, body: bytes, klass: str) -> bytes:
         """Return the body of a telemetry answer as bytes on the line."""
         framing, _ = _of_class(self._answers_in, klass)

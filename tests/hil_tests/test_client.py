@@ -11,6 +11,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.images import list_files
 from starhil.hil_tests.raw_traffic import send_and_listen
+from starhil.protocol.definition import UnknownNameError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.serial_interface import Dialect
@@ -45,6 +46,26 @@ def test_telemetry_comes_in_physical_units(pair):
     reading = client.read("precise_attitude")
     assert (reading["valid"], reading["mode"], reading["q_w"]) == (True, "tracking", 1.0)
     assert 0.0 < reading.latency_s < PATIENCE_S
+
+
+def test_readings_of_the_same_values_are_equal_whenever_they_came(pair):
+    device, client = pair
+    device.telemetry["rates"] = {"rate_x": 0.3}
+    first, second = client.read("rates"), client.read("rates")
+    assert (first == second, first.received_s == second.received_s) == (True, False)
+    device.telemetry["rates"] = {"rate_x": 0.4}
+    assert client.read("rates") != first
+
+
+def test_an_unknown_field_of_a_reading_is_named_with_similar_ones(pair):
+    device, client = pair
+    device.telemetry["rates"] = {"rate_x": 0.3}
+    reading = client.read("rates")
+    for look_up in (reading.__getitem__, reading.values.__getitem__):
+        with pytest.raises(UnknownNameError, match=r"^no field of rates named 'rat_x'; did you mean rate_x"):
+            look_up("rat_x")
+        with pytest.raises(KeyError, match=r"named 'foo'; known: rate_x, rate_y, rate_z$"):
+            look_up("foo")
 
 
 def test_a_telecommand_reaches_the_device_unchanged(pair):

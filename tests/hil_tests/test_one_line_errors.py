@@ -11,6 +11,6 @@ from starhil.protocol.icd import load_unit
 def test_an_unknown_row_with_a_line_break_is_named_in_one_line(tmp_path, row):
     path = tmp_path / "session.toml"
     path.write_text(f'title = "t"\n[[step]]\nname = "s"\nread = "{row}"\n')
-    with pytest.raises(ScriptError, match="unknown telemetry row") as caught:
+    with pytest.raises(ScriptError, match="no telemetry row named") as caught:
         load_script(path, load_unit("cubestar"))
     assert len(str(caught.value).splitlines()) == 1

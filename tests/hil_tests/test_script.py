@@ -112,8 +112,8 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             "[[step]]\ncommand = 'set_mod'\nwith = { mode = 'standby' }",
             ["step 1", "set_mod", "did you mean set_mode?"],
         ),
-        ("[[step]]\nread = 'reset'", ["it is a telecommand: use command"]),
-        ("[[step]]\ncommand = 'identification'", ["it is telemetry: use read"]),
+        ("[[step]]\nread = 'reset'", ["'reset' is a telecommand: use command"]),
+        ("[[step]]\ncommand = 'identification'", ["'identification' is telemetry: use read"]),
         (
             "[[step]]\nwait_s = 1\n[[step]]\nread = 'rates'\nexpect = { rat_x = 1 }",
             ["step 2", "rat_x", "did you mean rate_x"],
@@ -176,10 +176,10 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             "[truth]\nquaternion_xyzw = [1, 'x']\n[[step]]\nwait_s = 1",
             ["'quaternion_xyzw' must be a list of 4"],
         ),
-        ("[[step]]\ncommand = 'xyzzy'", ["unknown telecommand 'xyzzy'", "`starhil icd list` lists all"]),
-        ("[[step]]\nread = 'xyzzy'", ["unknown telemetry row 'xyzzy'", "`starhil icd list` lists all"]),
+        ("[[step]]\ncommand = 'xyzzy'", ["no telecommand named 'xyzzy'; `starhil icd list` lists all"]),
+        ("[[step]]\nread = 'xyzzy'", ["no telemetry row named 'xyzzy'; `starhil icd list` lists all"]),
         ("[[step]]\nset_parameter = 'xyzzy'\nvalue = 1", ["'xyzzy'", "`starhil icd list` lists all"]),
-        ("[[step]]\nread = 'rates'\nexpect = { xyzzy = 1 }", ["'xyzzy'; its fields: rate_x, rate_y"]),
+        ("[[step]]\nread = 'rates'\nexpect = { xyzzy = 1 }", ["'xyzzy'; known: rate_x, rate_y"]),
         ("[[step]]\nread = 'precise_attitude'\nexpect = { mode = 'xyzzy' }", ["; one of: boot, standby,"]),
         (
             "[[step]]\nread = 'image_frame'\nexpect = { data = 'hello' }",
@@ -276,7 +276,7 @@ def test_every_wrong_field_of_a_step_is_reported(load):
             ["'within_s' must be a number", "unknown key 'mn'", "capture: row 'rates' has no field 'rate_q'"],
         ),
         ("sample = { telemetry = 'rates', every_s = -1, fr_s = 3 }", ["'every_s'", "'for_s'", "'fr_s'"]),
-        ("sample = 'ratse'\nevery_s = 1\nfor_s = 1\nfle = 'x'", ["unknown telemetry row 'ratse'", "'fle'"]),
+        ("sample = 'ratse'\nevery_s = 1\nfor_s = 1\nfle = 'x'", ["no telemetry row named 'ratse'", "'fle'"]),
         ("set_parameter = 'exposure'\nvalu = 5\nlink = 'cn'", ["'value' must be given", "'valu'", "'link'"]),
     ],
 )  # fmt: skip

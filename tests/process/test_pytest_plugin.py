@@ -71,6 +71,8 @@ def test_each_test_begins_after_a_reset(tmp_path):
 
 
 FAILS = """
+import pytest
+
 from starhil.hil_tests.errors import BenchError
 
 def test_refused(starhil_serial):
@@ -78,13 +80,55 @@ def test_refused(starhil_serial):
 
 def test_no_such_action(starhil_control):
     starhil_control.do("dance")
+
+def test_no_such_row(starhil_serial):
+    starhil_serial.read("identificaton")
+
+def test_no_such_field(starhil_serial):
+    assert starhil_serial.read("identification")["runtme_s"] == 0
+
+def test_no_such_field_in_a_condition(starhil_serial):
+    starhil_serial.wait_for("precise_attitude", lambda reading: reading["vald"], within_s=1)
+
+def test_no_such_field_of_a_telecommand(starhil_serial):
+    starhil_serial.command("set_mode", mod="standby")
+
+@pytest.mark.starhil(profile="idel")
+def test_no_such_profile(starhil_serial):
+    pass
+
+@pytest.mark.starhil(settings=["run.sede=1"])
+def test_no_such_key(starhil_serial):
+    pass
 """
 
 
-def test_the_traceback_of_a_refused_request_ends_at_the_test(tmp_path):
+def test_the_traceback_of_an_error_ends_at_the_test_and_a_fixture_has_none(tmp_path):
     out = run_pytest(tmp_path, FAILS, "--tb=short")
-    assert "2 failed" in out
+    assert "6 failed, 2 errors" in out
     frames = re.findall(r"^(\S+\.py):\d+: in", out, re.MULTILINE)
-    assert frames == ["test_it.py", "test_it.py"]
+    assert frames == 6 * ["test_it.py"]
     assert "NackError: set_parameter: refused by the device" in out
     assert "BenchError: control channel: dance: " in out
+    assert "no telemetry row named 'identificaton'; did you mean identification" in out
+    assert "no field of identification named 'runtme_s'; did you mean runtime_s" in out
+    assert "no field of precise_attitude named 'vald'; did you mean valid" in out
+    assert "set_mode.mod: no such field; did you mean mode?" in out
+    assert "starhil: profile 'idel': not found" in out
+    assert "--set run.sede=1: run.sede: unknown key; did you mean seed?" in out
+    assert "During handling" not in out
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [
+        ("--starhil-unit=cubstar", "ERROR: --starhil-unit: unit 'cubstar': not found; "),
+        ("--starhil-profile=idel", "ERROR: --starhil-profile: profile 'idel': not found; "),
+        ("--starhil-dialect=z", "argument --starhil-dialect: invalid choice: 'z'"),
+    ],
+)
+def test_a_wrong_option_ends_the_run_before_any_test(tmp_path, option, said):
+    out = run_pytest(tmp_path, FAILS, option)
+    assert said in out
+    assert "Traceback" not in out
+    assert "test_refused" not in out

@@ -66,6 +66,53 @@ def test_a_session_of_which_no_step_runs_fails(emulator, tmp_path):
     assert (ET.parse(junit).getroot().get("failures"), "every step is skipped" in done.stdout) == ("1", True)
 
 
+FAULTS = """
+[emulator]
+profile = "ideal"
+set = ["parameters.start_mode=lost_in_space"]
+
+[[step]]
+read = "precise_attitude"
+within_s = 30
+expect = { valid = true }
+
+[[step]]
+name = "cover the lens"
+control = "fault"
+with = { optical = { blocked_share = 1.0 } }
+
+[[step]]
+read = "precise_attitude"
+within_s = 20
+expect = { valid = false }
+
+[[step]]
+control = "clear_faults"
+
+[[step]]
+read = "precise_attitude"
+within_s = 20
+expect = { valid = true }
+
+[[step]]
+name = "a wrong key"
+control = "fault"
+with = { optical = { blocked_shar = 1.0 } }
+"""
+
+
+def test_a_session_injects_faults_into_the_emulator_that_it_started(emulator, tmp_path):
+    script = tmp_path / "faults.toml"
+    script.write_text(FAULTS)
+    done = starhil("session", script, "--start", "--serial", "auto", "--log", tmp_path, "--json")
+    result = json.loads(done.stdout)
+    assert [item["status"] for item in result["results"]] == 5 * ["passed"] + ["failed"]
+    assert result["results"][1]["detail"] == '{"faults": {"optical": {"blocked_share": 1.0}}}'
+    assert "unknown key 'blocked_shar'; did you mean blocked_share?" in result["results"][5]["detail"]
+    done = starhil("session", script, "--serial", emulator.ready["serial"], "--log", tmp_path, "--keep-going")
+    assert "only an emulator that the bench started has a control channel: use --start" in done.stdout
+
+
 def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
     (tmp_path / "mine.toml").write_text("[run]\nwrong = 1\n")
     script = tmp_path / "script.toml"
@@ -81,7 +128,7 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
         (
             "[[step]]\nread = 'quaternoin'\n",
             ["--start"],
-            "wrong.toml: step 1: read: unknown telemetry row 'quaternoin'",
+            "wrong.toml: step 1: read: no telemetry row named 'quaternoin'",
         ),
         ("[[step]]\nwait_s = 0\n", ["--serial", "/dev/no-such-port"], "/dev/no-such-port"),
         ("[[step]]\nwait_s = 0\n", ["--can", "socketcand:127.0.0.1:1/vcan0"], "cannot connect"),

@@ -353,7 +353,7 @@ def test_unknown_numbers_of_enumerations_stay_numbers_in_telemetry() -> None:
 def test_unknown_names_offer_near_ones() -> None:
     with pytest.raises(UnknownNameError, match="did you mean quaternion") as caught:
         ICD.telemetry["quaternio"]
-    assert str(caught.value).startswith("no telemetry named 'quaternio'")
+    assert str(caught.value).startswith("no telemetry row named 'quaternio'")
     with pytest.raises(UnknownNameError, match="icd list"):
         ICD.parameters["zzz"]
 

@@ -80,4 +80,12 @@ def test_pages_are_printed_by_name_or_as_they_are_linked() -> None:
     for page in ("profile", "profile.md", "docs/profile.md#camera"):
         status, out, _ = run_command_line("docs", page)
         assert (status, out.startswith("# Device profiles\n")) == (0, True)
-    assert run_command_line("docs", "nothing")[0] == 2
+    assert "page 'contrl': not found; did you mean control" in run_command_line("docs", "contrl")[2]
+
+
+def test_pages_of_the_api_are_printed_with_the_docstrings() -> None:
+    assert "api/hil_tests" in run_command_line("docs")[1]
+    status, out, _ = run_command_line("docs", "api/hil_tests.md")
+    assert (status, "eval-rst" in out) == (0, False)
+    assert "class ObcClient" in out
+    assert "wait_for(" in out

@@ -306,6 +306,24 @@ def test_an_image_that_cannot_be_decoded_is_said_and_the_next_one_is_shown(page)
     assert not page.locator("#no-frame").is_visible()
 
 
+def test_a_page_that_connects_to_another_run_shows_nothing_of_the_run_before(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    *attitude, image = page.evaluate(
+        """async () => {
+            const { store, sky } = starhil;
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            store.frame = () => {};
+            store.message(store.hello);
+            store.history(new Float64Array(0));
+            while (sky.decoding) await new Promise(requestAnimationFrame);
+            return ["ra", "dec", "roll", "validity"].map((id) => document.getElementById(id).textContent).concat([sky.shown]);
+        }"""
+    )
+    assert attitude == ["–", "–", "–", "–"]
+    assert image is None
+
+
 def test_a_wrong_token_and_another_origin_get_403(emulator):
     address = emulator.ready["view"]
     for url, headers in (

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem
+from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem, short
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
@@ -30,6 +30,14 @@ LINES = {
     "a 29-bit frame without CAN": ("nos3", CanFrame(0x08AA0401, b"\1"), ("part", "29-bit frame", "08AA0401#01")),
     "bytes without a serial line": ("oresat", b"\x1f\x7f", ("part", "bytes", "1F 7F")),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(1767225627.15, "1767225627.15"), (1e6, "1000000"), (0.7369893193244934, "0.736989"), (1e300, "1e+300"), (b"\1\xff", "01 FF"), (7, "7")],
+)  # fmt: skip
+def test_a_time_is_shown_to_its_microseconds_and_other_numbers_shortly(value, text):
+    assert short(value) == text
 
 
 @pytest.mark.parametrize("name", LINES)

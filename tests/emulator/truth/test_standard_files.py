@@ -18,7 +18,7 @@ import pytest
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.truth.file import read_orbit_file, read_truth_file
 from starhil.emulator.truth.source import SlewSegment, SlewTruth
-from starhil.emulator.truth.standard_frames import euler_turn, unix_ns
+from starhil.emulator.truth.standard_frames import euler_turns, unix_ns
 from starhil.emulator.truth.table import FileTruth
 from starid.attitude import Attitude
 from starid.earth import unix_time
@@ -344,7 +344,7 @@ def test_euler_angles_are_turns_about_the_turned_axes(sequence: str) -> None:
         turn[one, one] = turn[two, two] = math.cos(angle)
         turn[one, two], turn[two, one] = math.sin(angle), -math.sin(angle)
         matrix = turn @ matrix
-    assert euler_turn("", sequence, np.array(angles)).matrix == pytest.approx(matrix, abs=1e-15)
+    assert euler_turns("", sequence, np.array(angles)).inv().as_matrix() == pytest.approx(matrix, abs=1e-15)
 
 
 def test_frames_may_be_exchanged_and_rates_in_either(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from starhil.emulator.device.quantities import QUANTITIES
 from starhil.emulator.device.state_store import FileStore
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.emulator.errors import EmulatorError
+from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
@@ -185,6 +186,22 @@ def test_telemetry_that_nobody_has_subscribed_to_is_found(monkeypatch):
     select = {"do": "request", "link": "can", "row": ["", row.id, "telecommand"], "data": data}
     life = Life("cubestar", 1, ("can",), {}, ({"do": "wait", "s": 5.0}, select, {"do": "wait", "s": 5.0}))
     assert run_once(life).violation.endswith("without a subscription")
+
+
+def test_telemetry_that_is_streamed_to_a_former_address_is_found(monkeypatch):
+    icd = load_unit("cubestar")
+    command, stream = icd.telecommands["set_parameter"], icd.telecommands["set_unsolicited"]
+    to = command.encode({"parameter": icd.parameters["host_address"].id, "value": 7.0}).hex()
+    data = stream.encode({"telemetry": 160, "rate": 1.0}).hex()
+    steps = (request_on("can", command, to), request_on("can", stream, data), {"do": "wait", "s": 5.0})
+    life = Life("cubestar", 1, ("can",), {}, steps)
+    outcome = run_once(life)
+    assert (outcome.violation, outcome.readings > 3) == ("", True)
+    send = CanLink._send
+    monkeypatch.setattr(
+        CanLink, "_send", lambda link, reply, style: send(link, replace(reply, destination=1), style)
+    )
+    assert "to address 1, not 7" in run_once(life).violation
 
 
 def test_a_seed_gives_one_life_and_one_outcome():

@@ -58,6 +58,12 @@ def violation(monkeypatch, change, *steps, links=("can",), profile=None):
 
 READ, COMMAND = (request(IDENTIFICATION.id),), (request(UNKNOWN, "telecommand"),)
 TWO = {"do": "burst", "link": "can", "rows": [["", row.id, "telemetry"] for row in (IDENTIFICATION, VERSION)]}
+COUNTS = {
+    **TWO,
+    "rows": [
+        ["", ICD.telemetry[name].id, "telemetry"] for name in ("identification", "communication_status")
+    ],
+}
 STUCK = {"do": "fault", "fault": {"device": {"stuck": True}}}
 
 
@@ -84,9 +90,12 @@ WRONG_ANSWERS = {
     "refuses twice": (answer(lambda old: [old, old]), COMMAND, "can: 60: 2 answers to a refused request"),
     "ignores an unknown ID": (answer(lambda _: []), COMMAND, "can: 60: no answer, must be refused"),
     "answers without a request": (inject(frame(TELEMETRY, 128, bytes(8))), (), "can: telemetry of 128, 8 bytes"),
+    "streams to another OBC": (inject(replace(frame(UNSOLICITED, 128, bytes(8)), id=UNSOLICITED << 24 | 0x800405)), (), "can: unsolicited of 128, 8 bytes: 00 00 00 00 00 00 00 00 to address 5, not 1"),
+    "streams as another unit": (inject(replace(frame(UNSOLICITED, 128, bytes(8)), id=UNSOLICITED << 24 | 0x800501)), (), "can: malformed, 12 bytes: 0c 80 05 01"),
     "sends a file": (inject(frame(SEGMENT, 119, b"1234567\1"), frame(SEGMENT, 119, b"1234567\0")), (), "can: a packet of a file that nobody requested"),
     "sends an unknown row": (inject(frame(UNSOLICITED, NO_ROW, b"1")), (), f"can: unsolicited unsolicited of {NO_ROW}, 1 bytes"),
     "loses one of two answers": (lambda frames: frames[:1], (TWO,), "can: 1 answers to 2 requests"),
+    "answers the second of two with a wrong value": (lambda frames: [*frames[:-1], replace(frames[-1], data=b"\xff" * 6)] if len(frames) == 2 else frames, (COUNTS,), "communication_status."),
     "answers in another order": (lambda frames: frames[::-1], (TWO,), "where identification was next"),
     "speaks while it is stuck": (inject(frame(TELEMETRY, 128, bytes(8))), (STUCK,), "can: telemetry of 128"),
     "ends a message early": (answer(lambda old: [replace(old, id=old.id + (3 << 24), data=bytes(7) + b"\1")]), READ, "can: identification: malformed"),

@@ -122,7 +122,6 @@ export class Faults {
         if (!idle) chips.push(make("li", { text: `${LEVELS[level] || level}: ${name} ${shown(item)}` }));
       }
     }
-    this.count = chips.length;
     this.now.replaceChildren(...chips);
     this.store.emit("faults", chips.map((chip) => chip.textContent));
   }

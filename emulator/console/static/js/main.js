@@ -165,42 +165,43 @@ store.on("status", ({ status, unresponsive_since_s: since }) => {
   setText($("run"), duration(status.run_time_s));
 });
 
+// A number of the row that is shown; NaN if there is none.
+function shown(name) {
+  return store.position < 0 ? NaN : store.rows.at(store.position, name);
+}
+
 // The validity of the attitude, and its error or the age of the last valid one.
 function showValidity() {
-  const position = store.position;
-  if (position < 0) return;
-  const item = (name) => store.rows.at(position, name);
   const imageless = store.cursor === null && store.imageless;
-  const overdue = imageless && store.rows.isFrame(position);
-  const valid = !overdue && item("valid") === 1;
-  const reason = overdue ? "no new image" : store.reasons[item("reason")] || "invalid";
+  const overdue = imageless && !Number.isNaN(shown("frame"));
+  const valid = !overdue && shown("valid") === 1;
+  const reason = overdue ? "no new image" : store.reasons[shown("reason")] || "–";
   setText($("validity"), valid ? "valid" : reason.replaceAll("_", " "));
   $("validity").dataset.state = valid ? "good" : "bad";
   const last = valid ? null : store.lastValid;
   setText($("error-label"), last === null ? "cross / roll error ″" : "last valid");
-  setText($("error"), last === null ? `${fixed(item("error_cross"), 2, 6)} / ${fixed(item("error_roll"), 1, 6)}` : `${age((store.cursor ?? store.time) - last)} ago`);
+  setText($("error"), last === null ? `${fixed(shown("error_cross"), 2, 6)} / ${fixed(shown("error_roll"), 1, 6)}` : `${age((store.cursor ?? store.time) - last)} ago`);
   document.body.classList.toggle("imageless", imageless);
   showWhen();
 }
 
 store.on("shown", () => {
-  const position = store.position;
-  if (position < 0) return;
-  const item = (name) => store.rows.at(position, name);
-  const mode = store.hello.modes[item("mode")];
-  setText($("mode"), mode.replaceAll("_", " "));
-  $("mode").dataset.mode = mode;
-  showValidity();
-  setText($("ra"), degrees(item("ra"), 4));
-  setText($("dec"), degrees(item("dec"), 4));
-  setText($("roll"), degrees(signed(item("roll")), 4));
-  for (const name of ["qx", "qy", "qz", "qw"]) $("ra").dataset[name] = String(item(name));
-  setText($("stars"), `${fixed(item("matched"), 0, 3)} of ${fixed(item("detected"), 0, 3)}`);
-  if (store.cursor !== null) {
-    setText($("utc"), utc(item("unix_s")));
-    setText($("run"), duration(item("run_s")));
+  const mode = store.hello.modes[shown("mode")];
+  if (mode) {
+    setText($("mode"), mode.replaceAll("_", " "));
+    $("mode").dataset.mode = mode;
   }
-  showImageInfo(item);
+  showValidity();
+  setText($("ra"), degrees(shown("ra"), 4));
+  setText($("dec"), degrees(shown("dec"), 4));
+  setText($("roll"), degrees(signed(shown("roll")), 4));
+  for (const name of ["qx", "qy", "qz", "qw"]) $("ra").dataset[name] = String(shown(name));
+  setText($("stars"), `${fixed(shown("matched"), 0, 3)} of ${fixed(shown("detected"), 0, 3)}`);
+  if (store.cursor !== null) {
+    setText($("utc"), utc(shown("unix_s")));
+    setText($("run"), duration(shown("run_s")));
+  }
+  showImageInfo();
 });
 
 // The moment that is shown.
@@ -211,11 +212,14 @@ function showWhen() {
   else setText($("when"), store.image ? `image of ${age(store.time - store.image.time)} ago` : "");
 }
 
-function showImageInfo(item) {
+function showImageInfo() {
   const image = store.image;
-  if (!image) return;
+  if (!image) {
+    setText($("frame-info"), "–");
+    return;
+  }
   const head = image.head;
-  const apart = image.time - item("run_s");
+  const apart = image.time - shown("run_s");
   const note = store.cursor !== null && Math.abs(apart) > 0.5 ? ` (image ${fixed(apart, 1)} s apart)` : "";
   const late = head.late ? " late" : "";
   setText($("frame-info"), `frame ${fixed(head.row[store.rows.index.frame], 0)}${late}  rejected ${head.rejected}${note}`);
@@ -259,7 +263,10 @@ const KEYS = [
 for (const [, label, what] of KEYS) if (label) $("keys").querySelector("dl").append(make("dt", { text: label }), make("dd", { text: what }));
 $("keys").querySelector("dl").append(make("dt", { text: "F1 … F4" }), make("dd", { text: "telemetry, telecommands, wire, faults" }));
 $("keys").querySelector("dl").append(make("dt", { text: "Ctrl+Enter" }), make("dd", { text: "send the telecommand" }));
-$("help").addEventListener("click", () => $("keys").showModal());
+$("help").addEventListener("click", (event) => {
+  if (event.detail > 0) $("help").blur(); // otherwise the focus returns when the dialog is closed, and space opens it again
+  $("keys").showModal();
+});
 
 document.addEventListener("keydown", (event) => {
   if (event.ctrlKey && event.key === "Enter") {

@@ -109,15 +109,15 @@ export class Sky {
     if (this.decoding) return;
     const { image, hello, stepping } = this.store;
     if (!image) this.say(hello && hello.clock === "stepped" && !stepping ? "no image: the clock is stopped, step it to take one" : "no image");
-    if (!image || image === this.shown) return;
+    if (image === this.shown) return;
     this.decoding = true;
-    const bitmap = await createImageBitmap(image.blob).catch(() => null);
+    const bitmap = image && await createImageBitmap(image.blob).catch(() => null);
     this.decoding = false;
     if (this.bitmap) this.bitmap.close();
     this.bitmap = bitmap;
     this.shown = image;
     this.painted += bitmap ? 1 : 0;
-    this.say(bitmap ? "" : "this image cannot be decoded");
+    if (image) this.say(bitmap ? "" : "this image cannot be decoded");
     this.draw();
     if (this.store.image !== image) this.show();
   }
@@ -236,7 +236,7 @@ export class Sky {
     context.lineWidth = 1.4 * pen();
     const labels = [];
     const inks = { matched: colour("on-sky-matched"), unmatched: colour("on-sky-unmatched") };
-    const half = Math.max(2, size * 0.5);
+    const half = Math.max(2, size * 0.4);
     (head.detections || []).forEach(([x, y, magnitude], number) => {
       const hip = head.hips[number];
       const layer = hip ? "matched" : "unmatched";
@@ -245,11 +245,13 @@ export class Sky {
       const [px, py] = this.place(x, y);
       if (name && (magnitude < 2.6 || this.zoom > 2)) labels.push([name, px, py, inks[layer]]);
       context.strokeStyle = inks[layer];
+      context.globalAlpha = hip ? 1 : 0.75;
       context.beginPath();
       if (hip) context.arc(px, py, size, 0, 2 * Math.PI);
       else context.rect(px - half, py - half, 2 * half, 2 * half);
       context.stroke();
     });
+    context.globalAlpha = 1;
     this.drawLabels(context, labels, size);
     if (!this.layers.missing || !head.catalogue) return;
     context.strokeStyle = colour("on-sky-missing");

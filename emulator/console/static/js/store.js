@@ -113,6 +113,7 @@ export class Store {
       this.rows.push(numbers.subarray(start, start + width));
     }
     this.emit("rows");
+    this.emit("shown");
   }
 
   // A new page is sent the latest image, whose row is already in the history.
@@ -168,9 +169,9 @@ export class Store {
 
   // Time of the last valid attitude up to the row that is shown; null if there is none.
   get lastValid() {
-    let position = this.position;
-    while (position >= this.rows.start && this.rows.at(position, "valid") !== 1) position -= 1;
-    return position >= this.rows.start ? this.rows.at(position, "run_s") : null;
+    let { position } = this;
+    while (this.rows && position >= this.rows.start && this.rows.at(position, "valid") !== 1) position -= 1;
+    return this.rows && position >= this.rows.start ? this.rows.at(position, "run_s") : null;
   }
 
   // The image nearest to the shown time.
