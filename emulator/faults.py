@@ -78,6 +78,15 @@ class FaultRequest(Strict):
     can: WireFault | None = None
     """Faults of outgoing CAN frames, including CANopen."""
 
+    def of_bus(self, bus: str) -> WireFault | None:
+        """Return the faults of a bus, whose key is its name; None if they stay."""
+        fault: WireFault | None = getattr(self, bus)
+        return fault
+
+
+BUSES: Final = tuple(name for name in FaultRequest.model_fields if name not in ("optical", "device"))
+"""Names of the buses that faults can affect."""
+
 
 class Faults:
     """The currently injected faults, also of links that are opened later."""
@@ -96,9 +105,8 @@ class Faults:
         device = self._device
         if request.optical is not None:
             device.surroundings.faults = dict(request.optical)
-        faults = {"serial": request.serial, "can": request.can}
         for name, wire in self._wires:
-            fault = faults[name]
+            fault = request.of_bus(name)
             if fault is not None:
                 wire.settings = fault
         if request.device is not None:
@@ -130,8 +138,8 @@ class Faults:
             if request.device.upset is not None:
                 self._check_upset(request.device.upset)
         there = {name for name, _ in self._wires}
-        for name, fault in (("serial", request.serial), ("can", request.can)):
-            if fault is not None and name not in there:
+        for name in BUSES:
+            if request.of_bus(name) is not None and name not in there:
                 raise EmulatorError(
                     f"{name}: this run has no such link; start it with --{name}, or omit this fault"
                 )

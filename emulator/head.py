@@ -41,9 +41,9 @@ from starhil.emulator.symlink_lock import lock_symlink
 from starhil.emulator.tape import Recorder, Wiring
 from starhil.emulator.truth.truth import SensorTruth, Truth
 from starhil.protocol.can_framing import CanFrame
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import chosen_dialect
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
@@ -166,7 +166,9 @@ class Head:
         if symlink is not None:
             self._closers.append(lock_symlink(symlink).close)
         pace = None if config.pace and paced else False
-        return self._wiring.serial(lambda: open_serial(config.port, baud, symlink=symlink, paced=pace))
+        return self._wiring.serial(
+            "serial", lambda: open_serial(config.port, baud, symlink=symlink, paced=pace)
+        )
 
     def _can_transport(self, name: str, channel: str) -> Transport[CanFrame]:
         from starhil.protocol.transports.can import open_can
@@ -192,7 +194,7 @@ class Head:
         """Start the pipeline; `ready` waits for it."""
         if not isinstance(self.clock, SteppedClock):
             self._pump = ClockPump(self.device.scheduler, self.clock, self._recorder)
-        self._revival = PipelineRevival(self.imager, self.device, self.pipeline_ready)
+        self._revival = PipelineRevival(self.imager, self.device, self.pipeline_ready, self._record)
         self._warm_up_task = asyncio.create_task(self._warm_up())
 
     async def _warm_up(self) -> None:
@@ -201,8 +203,7 @@ class Head:
         try:
             warm = await self.imager.start()
             log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
-            if self._recorder is not None:
-                self._recorder.enter("ready")
+            self._record("ready")
             device.signals.mode_changed.connect(self._mode_changed)
             self.pipeline_ready(warm)
         except EmulatorError as error:
@@ -211,6 +212,10 @@ class Head:
             raise EmulatorError(f"profile {self.profile.source}: camera: {error}") from None
         if isinstance(self.clock, SteppedClock) or device.modes.mode is not Mode.BOOT:
             self._awake.set()
+
+    def _record(self, kind: str) -> None:
+        if self._recorder is not None:
+            self._recorder.enter(kind)
 
     def _mode_changed(self, transition: Transition) -> None:
         if transition.before is Mode.BOOT:

@@ -22,7 +22,7 @@ from starhil.emulator.tape import TRUTH_FILE, Recorder, Wiring
 from starhil.emulator.truth_log import TruthLog
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunOptions:
     """Options of a run that are not part of the profile."""
 

@@ -26,8 +26,7 @@ from starhil.emulator.truth.config import (
 )
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import find, remedy
-from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
+from starhil.protocol.names import DEFAULT_UNIT, bundled_units, find, not_found, remedy
 from starhil.protocol.validation_messages import problems
 from starhil.protocol.values import IcdError
 from starid.earth import unix_time
@@ -428,7 +427,11 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     except ValidationError as error:
         listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS)
         found += [(problem.location, str(problem)) for problem in listed]
-    for section, check in _checks(values, path.parent):
+    name = str(values.get("unit", DEFAULT_UNIT))
+    unit = _path_of_unit(name, path.parent)
+    if unit is None:
+        found.append((("unit",), f"unit: {not_found('unit', name)}"))
+    for section, check in _checks(values, unit):
         found += _problems_of_keys(section, values.get(section), check)
     if found or profile is None:
         named = ((_source_of(layers, location) or f"profile {path}", text) for location, text in found)
@@ -437,10 +440,10 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
 
 
 def _checks(
-    values: Mapping[str, Any], folder: Path
+    values: Mapping[str, Any], unit: Path | None
 ) -> Iterator[tuple[str, Callable[[dict[str, Any]], object]]]:
-    """Yield the sections whose keys are those of another class or of the unit, each with a check of its table."""
-    run, sky, unit = values.get("run"), values.get("sky"), values.get("unit", DEFAULT_UNIT)
+    """Yield the sections whose keys are those of another class or of the unit at a path, each with a check of its table."""
+    run, sky = values.get("run"), values.get("sky")
     if "sensor" in values:
         from starhil.emulator.sensor.model import SensorModel
 
@@ -457,12 +460,20 @@ def _checks(
         algorithm = run.get("algorithm", "geometric") if isinstance(run, dict) else "geometric"
         if algorithm in ALGORITHMS:
             yield "identifier", lambda table: check_options(algorithm, table)
-    if "parameters" in values and isinstance(unit, str):
+    if "parameters" in values and unit is not None:
         try:
-            known = load_unit(folder / find("unit", unit)).device_parameters
+            known = load_unit(unit).device_parameters
         except IcdError:
             return  # reported when the unit is loaded
         yield "parameters", lambda table: _check_parameters(known, table)
+
+
+def _path_of_unit(name: str, folder: Path) -> Path | None:
+    path = folder / find("unit", name)
+    try:
+        return path if path.exists() else None
+    except OSError:  # too long a name, for example
+        return None
 
 
 def _problems_of_keys(
@@ -473,7 +484,7 @@ def _problems_of_keys(
         try:
             check({key: value})
         except (EmulatorError, ProtocolError) as error:
-            yield from (((section, key), str(text)) for text in error.args)
+            yield from (((section, key), text) for text in error.problems)
 
 
 def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:

@@ -7,6 +7,7 @@ import importlib.metadata
 import json
 import shutil
 import tempfile
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
@@ -26,7 +27,7 @@ from starhil.emulator.guard import call_guarded
 from starhil.emulator.head import Head
 from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
-from starhil.emulator.pipeline.messages import PipelineReady
+from starhil.emulator.pipeline.messages import PipelineEnded, PipelineReady
 from starhil.emulator.profile import Profile
 from starhil.emulator.run import Run
 from starhil.emulator.tape import (
@@ -70,16 +71,62 @@ class _DeviationError(EmulatorError):
     """The device behaves differently, so that the recording cannot be played further."""
 
 
-class _Timed(Strict):
+class _Timed(Strict, ABC):
     """An entry of the tape."""
 
     ns: Annotated[int, Field(ge=0, lt=1 << 63)]
 
+    @abstractmethod
+    async def play(self, on: _Playing) -> None:
+        """Play the entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
 
-class _Plain(_Timed):
-    """An entry that consists of its time."""
 
-    do: Literal["event", "reply", "stored", "ready", "clear_faults", "end"]
+class _Event(_Timed):
+    """An event that was due."""
+
+    do: Literal["event"]
+
+    async def play(self, on: _Playing) -> None:
+        due = on.head.device.scheduler.pop_due(on.player.clock.now_ns())
+        if due is None:
+            raise _DeviationError("no event is due")
+        call_guarded("event", due.action, due.due_ns)
+
+
+class _Reply(_Timed):
+    """A reply of the pipeline, or what took its place because the pipeline had ended."""
+
+    do: Literal["reply"]
+    ended: str | None = None
+
+    async def play(self, on: _Playing) -> None:
+        await on.pipeline.deliver(None if self.ended is None else PipelineEnded(self.ended))
+
+
+class _PipelineState(_Timed):
+    """The pipeline was ready, also after a restart; it ended, or was given up."""
+
+    do: Literal["ready", "pipeline_lost", "pipeline_given_up"]
+
+    async def play(self, on: _Playing) -> None:
+        match self.do:
+            case "ready":
+                on.head.pipeline_ready(on.warm)
+            case "pipeline_lost":
+                on.head.device.pipeline_lost()
+            case "pipeline_given_up":
+                on.head.device.pipeline_given_up()
+
+
+class _Stored(_Timed):
+    """The end of a slow write."""
+
+    do: Literal["stored"]
+
+    async def play(self, on: _Playing) -> None:
+        if not on.player.writes:
+            raise _DeviationError("nothing is being written")
+        on.player.writes.popleft()()
 
 
 class _Item(_Timed):
@@ -104,12 +151,24 @@ class _Item(_Timed):
             raise ValueError(f"data: not that of the link {self.link}")
         return self
 
+    async def play(self, on: _Playing) -> None:
+        receive = on.player.receivers.get(self.link)
+        if receive is None:
+            raise _DeviationError(f"the link {self.link} is off")
+        on.player.pass_item(self.link, self.item, outgoing=False)
+        receive(self.item)
+
 
 class _Feed(_Timed):
     """A message of a simulator."""
 
     do: Literal["feed"]
     data: Annotated[str, Field(pattern=r"^[\x00-\xff]*$")]
+
+    async def play(self, on: _Playing) -> None:
+        if on.truth.feed is None:
+            raise _DeviationError("there is no live feed")
+        await on.truth.feed.process(self.data.encode("latin-1"))
 
 
 class _Truth(_Timed):
@@ -119,6 +178,9 @@ class _Truth(_Timed):
     config: TruthConfig
     start_s: Annotated[float, Field(ge=-1e9, le=1e9)]
 
+    async def play(self, on: _Playing) -> None:
+        await on.truth.set(self.config, self.start_s)
+
 
 class _Fault(_Timed):
     """New faults."""
@@ -126,8 +188,29 @@ class _Fault(_Timed):
     do: Literal["fault"]
     request: FaultRequest
 
+    async def play(self, on: _Playing) -> None:
+        on.head.faults.inject(self.request)
 
-Entry = _Plain | _Item | _Feed | _Truth | _Fault
+
+class _ClearFaults(_Timed):
+    """The end of all faults."""
+
+    do: Literal["clear_faults"]
+
+    async def play(self, on: _Playing) -> None:
+        on.head.faults.clear()
+
+
+class _End(_Timed):
+    """The end of the run."""
+
+    do: Literal["end"]
+
+    async def play(self, on: _Playing) -> None:
+        on.ended = True
+
+
+Entry = _Event | _Reply | _PipelineState | _Stored | _Item | _Feed | _Truth | _Fault | _ClearFaults | _End
 
 
 class _Line(RootModel[Annotated[Entry, Field(discriminator="do")]]):
@@ -191,9 +274,9 @@ class Player(Wiring):
         """Functions that end pending slow writes."""
         self._ends_at_once = ends_at_once
 
-    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (nothing is opened)
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (nothing is opened)
         """Return a serial line that is connected to the tape."""
-        return _PlayedSerial("serial", self)
+        return _PlayedSerial(name, self)
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002
         """Return a CAN bus that is connected to the tape."""
@@ -253,14 +336,14 @@ class PlayedImager:
 
     def __init__(self, inner: Imager) -> None:
         self._inner = inner
-        self._arrived: deque[Callable[[], None]] = deque()
+        self._arrived: deque[tuple[ReplyCallback, PipelineReply]] = deque()
         self.pending = 0
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Pass a request to the pipeline."""
 
         def arrived(reply: PipelineReply) -> None:
-            self._arrived.append(lambda: done(reply))
+            self._arrived.append((done, reply))
 
         self.pending += 1
         self._inner.submit(request, arrived)
@@ -269,14 +352,15 @@ class PlayedImager:
         """Wait until the pipeline is idle."""
         await self._inner.settle()
 
-    async def deliver(self) -> None:
-        """Deliver the next reply; _DeviationError if the device has sent fewer requests than in the recorded run."""
+    async def deliver(self, ended: PipelineEnded | None) -> None:
+        """Deliver the next reply, or `ended` in its place; _DeviationError if the device has sent fewer requests than in the recorded run."""
         if not self._arrived:
             await self._inner.settle()
         if not self._arrived:
             raise _DeviationError("it requests fewer frames than in the recorded run")
         self.pending -= 1
-        self._arrived.popleft()()
+        done, reply = self._arrived.popleft()
+        done(ended or reply)
 
 
 @dataclass
@@ -368,7 +452,10 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
                 text = _read(folder / SCENARIO_FILE)
                 scenario = _validated(Scenario, text, folder / SCENARIO_FILE)
                 head.device.scheduler.add(scenario.prepare(head, again.truth))
-            play = _Playing(again, head, player, await head.imager.start())
+            pipeline = player.pipeline
+            if pipeline is None:
+                raise EmulatorError("replay: the run has no pipeline")
+            play = _Playing(again, head, player, pipeline, await head.imager.start())
             recording = await play.entries(folder, report, ends=ends)
             to_the_end = not report.differences
             new_decoder = partial(Decoder, head.icd, head.serial_dialect)
@@ -383,75 +470,42 @@ async def replay(folder: Path, profile: Profile | None = None) -> ReplayReport:
 class _Playing:
     """Plays entries one by one."""
 
-    def __init__(self, run: Run, head: Head, player: Player, warm: PipelineReady) -> None:
-        self._truth = run.truth
-        self._head = head
-        self._player = player
-        self._warm = warm
+    def __init__(
+        self, run: Run, head: Head, player: Player, pipeline: PlayedImager, warm: PipelineReady
+    ) -> None:
+        self.truth = run.truth
+        self.head = head
+        self.player = player
+        self.pipeline = pipeline
+        self.warm = warm
+        self.ended = False
+        """Whether the entry `end` was played."""
 
     async def entries(self, folder: Path, report: ReplayReport, *, ends: bool) -> list[WireItem]:
         """Play a tape to its end, or to the entry at which the device deviates; return what passed the links until there."""
         recording: list[WireItem] = []
-        ended = not ends
-        stepped = self._player.stepped
+        stepped = self.player.stepped
         for where, entry in read_events(folder):
             if isinstance(entry, _Item):
                 outgoing = entry.do == "out"
                 recording.append(WireItem(entry.ns / NANOSECONDS, entry.link, outgoing, entry.item))
                 if outgoing:
                     continue
-            if isinstance(entry, _Plain) and entry.do == "end":
-                ended = True
-                continue
             stepped.set_ns(entry.ns)
             try:
-                await self.entry(entry)
+                await entry.play(self)
             except _DeviationError as deviation:
                 at = f"at {entry.ns / NANOSECONDS:.6f} s the device behaves differently"
                 report.differences.append(f"{where}: {at}: {deviation}")
                 return recording
             except (EmulatorError, ProtocolError, StaridError) as error:
                 raise EmulatorError(f"replay {where}: {error}") from None
-            report.entries += 1
-        if not ended:
+            report.entries += not self.ended
+        if ends and not self.ended:
             report.differences.append(
                 f"{folder / EVENTS_FILE}: truncated at {stepped.now_ns() / NANOSECONDS:.6f} s: the run was killed, or lines are missing"
             )
         return recording
-
-    async def entry(self, entry: Entry) -> None:
-        """Play one entry at the current time; _DeviationError if the device behaves differently, so that this is impossible."""
-        head, player, truth = self._head, self._player, self._truth
-        match entry:
-            case _Item():
-                receive = player.receivers.get(entry.link)
-                if receive is None:
-                    raise _DeviationError(f"the link {entry.link} is off")
-                player.pass_item(entry.link, entry.item, outgoing=False)
-                receive(entry.item)
-            case _Feed():
-                if truth.feed is None:
-                    raise _DeviationError("there is no live feed")
-                await truth.feed.process(entry.data.encode("latin-1"))
-            case _Truth():
-                await truth.set(entry.config, entry.start_s)
-            case _Fault():
-                head.faults.inject(entry.request)
-            case _Plain(do="event"):
-                due = head.device.scheduler.pop_due(player.clock.now_ns())
-                if due is None:
-                    raise _DeviationError("no event is due")
-                call_guarded("event", due.action, due.due_ns)
-            case _Plain(do="reply") if player.pipeline is not None:
-                await player.pipeline.deliver()
-            case _Plain(do="stored"):
-                if not player.writes:
-                    raise _DeviationError("nothing is being written")
-                player.writes.popleft()()
-            case _Plain(do="ready"):
-                head.pipeline_ready(self._warm)
-            case _Plain(do="clear_faults"):
-                head.faults.clear()
 
 
 def _compare_sent(

@@ -27,14 +27,19 @@ STEADY_S: Final = 60.0
 
 
 class PipelineRevival:
-    """Restarts the pipeline of a device."""
+    """Restarts the pipeline of a device; `record` writes an entry on the tape, if there is one."""
 
     def __init__(
-        self, imager: PipelineImager, device: Device, ready: Callable[[PipelineReady], None]
+        self,
+        imager: PipelineImager,
+        device: Device,
+        ready: Callable[[PipelineReady], None],
+        record: Callable[[str], None],
     ) -> None:
         self._imager = imager
         self._device = device
         self._ready = ready
+        self._record = record
         self._attempts = 0
         self._ready_at_s = 0.0
         self._lost = False
@@ -46,6 +51,7 @@ class PipelineRevival:
         if asyncio.get_running_loop().time() - self._ready_at_s > STEADY_S:
             self._attempts = 0
         self._lost = True
+        self._record("pipeline_lost")
         self._device.pipeline_lost()
         self._start_attempts()
 
@@ -73,6 +79,7 @@ class PipelineRevival:
                 len(PAUSES_S) + 1,
                 PIPELINE_ENDED,
             )
+            self._record("pipeline_given_up")
             self._device.pipeline_given_up()
 
     async def _restart(self) -> None:
@@ -88,6 +95,7 @@ class PipelineRevival:
             return
         self._ready_at_s = asyncio.get_running_loop().time()
         log.info("pipeline ready again: %.2f s", warm.seconds)
+        self._record("ready")
         self._ready(warm)
 
     async def close(self) -> None:

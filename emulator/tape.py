@@ -1,8 +1,8 @@
 """The tape of a run: all inputs of the device with their times, and all its output.
 
 An entry is an input that causes the model to compute: data on a link, an event that is due, a reply of the pipeline,
-a message of a feed, a command on the control channel, or the end of a write. The clock stops while an entry is
-processed, so that a run on the real clock can be repeated exactly on the stepped clock.
+a message of a feed, a command on the control channel, the end of a write, or the end and restart of the pipeline. The
+clock stops while an entry is processed, so that a run on the real clock can be repeated exactly on the stepped clock.
 
 A recording is a folder: `run.json` (profile and version), `events.jsonl` (entries and output, one JSON object per
 line, in order, the last one `end`), `truth.csv` (truth log), and other files that the run needs: `scenario.json`, `state/`.
@@ -21,6 +21,7 @@ from starhil.emulator.device.device import Background
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.output_file import Output, OutputFile
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
+from starhil.emulator.pipeline.messages import PipelineEnded
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import SerialTransport
@@ -46,8 +47,8 @@ class Wiring:
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
 
-    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
-        """Return the transport of the serial line."""
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (the name is for others)
+        """Return the transport of a link that carries bytes."""
         return make()
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:  # noqa: ARG002 (the name is for others)
@@ -129,9 +130,9 @@ class Recorder(Wiring):
             entry = {"ns": self.clock.now_ns(), "do": kind, **values}
             self.file.append(lambda: json.dumps(entry).encode() + b"\n")
 
-    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:
-        """Return the transport of the serial line, whose items are recorded."""
-        return _RecordedSerial(self._inner.serial(make), self)
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:
+        """Return the transport of a link that carries bytes, whose items are recorded."""
+        return _RecordedSerial(self._inner.serial(name, make), name, self)
 
     def can(self, name: str, make: Callable[[], Transport[CanFrame]]) -> Transport[CanFrame]:
         """Return the transport of a CAN link, whose items are recorded."""
@@ -202,8 +203,8 @@ class _RecordedTransport(Transport[Item]):
 class _RecordedSerial(_RecordedTransport[bytes], SerialTransport):
     """A serial line whose bytes are recorded."""
 
-    def __init__(self, inner: SerialTransport, recorder: Recorder) -> None:
-        super().__init__(inner, "serial", recorder)
+    def __init__(self, inner: SerialTransport, name: str, recorder: Recorder) -> None:
+        super().__init__(inner, name, recorder)
         self._port = inner
 
     def set_baud(self, baud: int) -> None:
@@ -223,7 +224,8 @@ class _RecordedImager:
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         def arrived(reply: PipelineReply) -> None:
-            self._recorder.enter("reply")
+            ended = {"ended": reply.text} if isinstance(reply, PipelineEnded) else {}
+            self._recorder.enter("reply", **ended)
             done(reply)
 
         self._inner.submit(request, arrived)

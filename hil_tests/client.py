@@ -23,7 +23,7 @@ from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import LinkFault, Reply
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 

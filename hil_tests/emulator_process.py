@@ -18,13 +18,17 @@ from typing import IO, Final, Self
 from urllib.parse import unquote
 
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
 """The first start on a machine compiles for minutes; later ones take about 3 s."""
 STOP_WITHIN_S: Final = 15.0
 PROGRESS: Final = "starting:"
 """Begin of the lines on stderr that report the progress of a slow start; they are shown."""
+BAD_INPUT: Final = 2
+"""Exit status of an emulator that rejects an option, its profile or its unit."""
+REJECTED: Final = "starhil: "
+"""Beginning of the lines of stderr that name the reasons."""
 SHOWN_LINES: Final = 5
 """Number of last lines of the emulator's stderr in an error message."""
 
@@ -168,9 +172,12 @@ class EmulatorProcess:
                 text = f"the emulator was not ready within {self._ready_within_s:g} s{self._last_errors()}"
                 raise EmulatorProcessError(text) from None
             if line is None:
-                status = self.process.wait()
+                status, last = self.process.wait(), self._last_errors()
+                rejected = [line.removeprefix(REJECTED) for line in self.errors if line.startswith(REJECTED)]
+                if status == BAD_INPUT and rejected:
+                    raise EmulatorProcessError(*rejected)
                 raise EmulatorProcessError(
-                    f"the emulator ended with status {status} before it was ready{self._last_errors()}"
+                    f"the emulator ended with status {status} before it was ready{last}"
                 )
             if line.startswith("ready"):
                 return parse_ready_line(line)

@@ -13,8 +13,7 @@ from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reque
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import LinkFault, Reply, Request
-from starhil.protocol.serial_interface import Receiver
+from starhil.protocol.messages import LinkFault, Receiver, Reply, Request
 from starhil.protocol.serial_stack import HostReceiver, build_serial_stack, chosen_dialect
 from starhil.protocol.transports import Transport, open_can, open_serial
 

@@ -80,7 +80,7 @@ def _failing_in_one_line() -> Iterator[None]:
     try:
         yield
     except OneLineError as error:
-        raise pytest.fail.Exception("\n".join(map(str, error.args)), pytrace=False) from None
+        raise pytest.fail.Exception("\n".join(error.problems), pytrace=False) from None
 
 
 class _Emulators:
@@ -216,6 +216,6 @@ def starhil_truth(starhil_control: ControlClient, starhil_emulator: EmulatorProc
     """Return the truth of the emulator: `point`, `set`, `attitude` and `error`."""
     from starhil.hil_tests.control import Truth
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.unit_folders import DEFAULT_UNIT
+    from starhil.protocol.names import DEFAULT_UNIT
 
     return Truth(starhil_control, load_unit(starhil_emulator.unit or DEFAULT_UNIT).conventions)

@@ -11,10 +11,10 @@ from collections import deque
 from typing import Final
 
 from starhil.hil_tests.load_figures import SerialLoad
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.image_transfer import MAP_PART_SIZE
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports import SerialTransport, open_serial
 

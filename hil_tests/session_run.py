@@ -30,12 +30,11 @@ from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.script import Control, Script, load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import find, not_found
-from starhil.protocol.serial_interface import Dialect
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT, find, not_found
 
 DEFAULT_FOLDER: Final = Path("out") / "session"
 STYLES: Final = {PASSED: ("✓", "green"), FAILED: ("✗", "bold red"), SKIPPED: ("-", "yellow")}

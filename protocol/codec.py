@@ -19,6 +19,7 @@ from typing import Any, Final, Literal
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import FieldKeys, Provenance, RowKeys
+from starhil.protocol.messages import RequestKind
 from starhil.protocol.names import remedy
 from starhil.protocol.values import (
     F32_MAX,
@@ -29,10 +30,9 @@ from starhil.protocol.values import (
     Value,
     limits_text,
     number_of,
-    to_f32,
+    representable,
 )
 
-RowKind = Literal["telecommand", "telemetry"]
 FieldKind = Literal["integer", "float", "enum", "flag", "bits", "bytes", "text", "unused"]
 
 STRUCT_CODES: Final = dict(
@@ -291,9 +291,7 @@ class Field(FieldKeys):
         return FieldError(f"{where}: {value!r} is outside {limits_text(low, high, self.unit)}", index=index)
 
     def _check_float(self, value: float, where: str, index: int) -> None:
-        low, high = self.physical_limits
-        if self.slot.type == "f32":
-            low, high = min(low, to_f32(low)), max(high, to_f32(high))
+        low, high = representable(*self.physical_limits, self.slot.type)
         if not low <= value <= high:
             raise self._outside(value, where, index)
 
@@ -365,7 +363,7 @@ class Row(RowKeys):
     """A telecommand or telemetry row: its keys, its layout, and the codec of its values."""
 
     provenance: Provenance = "ours"
-    kind: RowKind
+    kind: RequestKind
     size: int
     """Bytes of data."""
     fields: tuple[Field, ...]

@@ -19,6 +19,7 @@ start byte, which is the first byte of its header here.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from enum import StrEnum
 from typing import Final
 
 from starhil.protocol.envelope import Header
@@ -37,7 +38,15 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
-from starhil.protocol.serial_interface import Dialect
+
+
+class Dialect(StrEnum):
+    """Formats of serial replies."""
+
+    A = "a"
+    B = "b"
+    C = "c"
+
 
 _ID: Final = HeaderFieldModel(role="id", type="u8")
 REQUEST_HEADER: Final = (_ID,)

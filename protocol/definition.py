@@ -120,7 +120,7 @@ class InterfaceDefinition:
     @staticmethod
     def request(row: Row, data: bytes = b"", source: int = 0) -> Request:
         """Return the request for a row."""
-        return Request(RequestKind(row.kind), row.id, data, source, klass=row.klass)
+        return Request(row.kind, row.id, data, source, klass=row.klass)
 
     def request_of(self, row_id: int, klass: str | None = None, data: bytes = b"") -> Request:
         """Return a request by ID, which need not belong to a row, and by class if the unit has classes.

@@ -21,8 +21,7 @@ from starhil.protocol.icd_schema import (
     DeviceModelFile,
     QuantityModel,
 )
-from starhil.protocol.names import did_you_mean
-from starhil.protocol.unit_folders import UNITS_FOLDER
+from starhil.protocol.names import UNITS_FOLDER, did_you_mean
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.values import EnumDefinition, IcdError, Parameter
 

@@ -72,18 +72,8 @@ class Envelope(NamedTuple):
 class Header:
     """The fields before the data of a message.
 
-    Parameters
-    ----------
-    models
-        Fields as in the definition.
-    byte_order
-        Byte order of the unit.
-    classes
-        Name of the class of each code.
-    overhead
-        Sizes of `start`, `check` and `end`, which a length may include.
-    where
-        Field path for error messages.
+    `classes` are the names of the classes by code, `overhead` the sizes of `start`, `check` and `end`, which a length may
+    include, and `where` is the field path for error messages.
     """
 
     def __init__(

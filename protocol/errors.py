@@ -6,13 +6,15 @@ import os
 
 
 class OneLineError(Exception):
-    """An error whose arguments are its problems, each one line that names what and where.
+    """An error whose arguments are its problems; the text is one line with all of them."""
 
-    The text is one line, too, with the problems one after the other; controls in what they quote are escaped.
-    """
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """The problems, each one line that names what and where; controls in what they quote are escaped."""
+        return tuple(escape_controls(str(problem)) for problem in self.args)
 
     def __str__(self) -> str:
-        return escape_controls("; ".join(map(str, self.args)))
+        return "; ".join(self.problems)
 
 
 class ProtocolError(OneLineError):

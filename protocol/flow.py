@@ -44,21 +44,7 @@ SHARE_OF_DESCRIPTORS: Final = 8
 
 
 class ConnectionLimit:
-    """Rejects connections of a server that has too many; the first rejection is logged.
-
-    Parameters
-    ----------
-    server
-        Name of the server, for the log.
-    refusal
-        Sent to a peer that is rejected.
-
-    Attributes
-    ----------
-    size
-        Maximum number of connections. As `backlog` of the server it also limits the connections that asyncio
-        accepts in one turn of the loop.
-    """
+    """Rejects connections of a server that has too many, with `refusal`; the first rejection is logged."""
 
     def __init__(self, server: str, refusal: bytes = b"") -> None:
         self._server = server
@@ -68,6 +54,7 @@ class ConnectionLimit:
         unlimited = descriptors == resource.RLIM_INFINITY
         share = MAX_CONNECTIONS if unlimited else descriptors // SHARE_OF_DESCRIPTORS
         self.size = max(1, min(MAX_CONNECTIONS, share))
+        """Maximum number; as `backlog` of the server it also limits what asyncio accepts in one turn of the loop."""
 
     def admits(self, transport: asyncio.BaseTransport, connected: int) -> bool:
         """Return whether there is room besides the connected peers; close the connection if not."""
@@ -139,12 +126,7 @@ class FairQueue:
     """Queue of lines for one receiver, in which senders take turns, one line each.
 
     Lines of one sender stay in order. When the queue is full, the sender with the most waiting bytes loses
-    its oldest line.
-
-    Parameters
-    ----------
-    limit
-        Maximum number of waiting bytes.
+    its oldest line. `limit` is the maximum number of waiting bytes.
     """
 
     def __init__(self, limit: int) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import binascii
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, Generic, TypeVar, assert_never
 
@@ -166,9 +166,13 @@ class Slip(Framing):
         escaped = body.replace(self.escape, self._escaped_escape).replace(self.end, self._escaped_end)
         return self._before + escaped + self.end
 
-    def decode(self, frame: bytes) -> bytes | LinkFault:
-        """Return the body of the bytes between two end bytes."""
-        first, *rest = frame.split(self.escape)
+    def bodies(self, text: bytes) -> Iterator[bytes | LinkFault]:
+        """Yield the body of the bytes between two end bytes, if there are any, or its fault."""
+        if text:
+            yield self._unescaped(text)
+
+    def _unescaped(self, text: bytes) -> bytes | LinkFault:
+        first, *rest = text.split(self.escape)
         body = [first]
         for piece in rest:
             original = self._originals.get(piece[0]) if piece else None
@@ -180,51 +184,48 @@ class Slip(Framing):
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer for the messages between end bytes."""
-        return _SlipDeframer(receiving, self)
+        return _DelimitedDeframer(receiving, self, 2 * receiving.max_size)
 
 
-class _SlipDeframer(_Collector[_Message]):
-    def __init__(self, receiving: Receiving[_Message], framing: Slip) -> None:
+class _DelimitedDeframer(_Collector[_Message]):
+    """Divides the stream at each end; text longer than `limit` is reported once and skipped up to the next end."""
+
+    def __init__(self, receiving: Receiving[_Message], framing: Slip | Delimited, limit: int) -> None:
         super().__init__(receiving)
         self._framing = framing
-        self._frame = bytearray()
+        self._limit = limit
+        self._text = b""
         self._skipping = False
 
     @property
     def busy(self) -> bool:
-        return bool(self._frame) or self._skipping
+        return bool(self._text) or self._skipping
 
     def _consume(self, data: bytes) -> None:
-        *whole, rest = data.split(self._framing.end)
-        for piece in whole:
-            self._collect(piece)
-            self._decode_frame()
-        self._collect(rest)
-
-    def _collect(self, piece: bytes) -> None:
-        if self._skipping:
-            return
-        self._frame += piece
-        if len(self._frame) > 2 * self._max_size:
-            self._add(self._overlong())
-            self._frame.clear()
+        end = self._framing.end
+        *whole, self._text = (self._text + data).split(end)
+        for text in whole:
+            if len(text) > self._limit and not self._skipping:
+                self._add(self._overlong())
+            elif not self._skipping:
+                self._deliver(text)
+            self._skipping = False
+        if len(self._text) > self._limit:
+            if not self._skipping:
+                self._add(self._overlong())
             self._skipping = True
+            self._text = self._text[len(self._text) - len(end) + 1 :]
 
-    def _decode_frame(self) -> None:
-        frame = bytes(self._frame)
-        self._frame.clear()
-        self._skipping = False
-        if not frame:
-            return
-        body = self._framing.decode(frame)
-        if isinstance(body, bytes):
-            self._add(self._overlong() if len(body) > self._max_size else self._interpret(body))
-        else:
-            self._add(body)
+    def _deliver(self, text: bytes) -> None:
+        for body in self._framing.bodies(text):
+            if isinstance(body, LinkFault):
+                self._add(body)
+            else:
+                self._add(self._overlong() if len(body) > self._max_size else self._interpret(body))
 
     def _abandon(self) -> LinkFault | None:
-        size = len(self._frame)
-        self._frame.clear()
+        size = 0 if self._skipping else len(self._text)
+        self._text = b""
         self._skipping = False
         return self._incomplete(size) if size else None
 
@@ -556,68 +557,23 @@ class Delimited(Framing):
                 )
         return self.start + text + self.end
 
-    def decode(self, text: bytes) -> bytes | LinkFault:
-        """Return the body of the text between start and end."""
-        if not self._hex:
-            return text
+    def bodies(self, text: bytes) -> Iterator[bytes | LinkFault]:
+        """Yield the body of the text before an end, and the faults of what does not belong to it."""
+        before, start, text = text.rpartition(self.start) if self.start else (b"", b"", text)
+        if not start and self.start:
+            yield LinkFault(FaultKind.UART_PROTOCOL, "message without its start")
+            return
+        if before:
+            yield LinkFault(FaultKind.UART_PROTOCOL, f"byte {before[0]:02X} outside a message")
         try:
-            return binascii.unhexlify(text)
+            yield binascii.unhexlify(text) if self._hex else text
         except binascii.Error:
-            return LinkFault(FaultKind.UART_PROTOCOL, f"{text[:8]!r} is not hexadecimal")
+            yield LinkFault(FaultKind.UART_PROTOCOL, f"{text[:8]!r} is not hexadecimal")
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer for the text before each end."""
-        return _DelimitedDeframer(
-            receiving, self, 2 * receiving.max_size if self._hex else receiving.max_size
-        )
-
-
-class _DelimitedDeframer(_Collector[_Message]):
-    def __init__(self, receiving: Receiving[_Message], framing: Delimited, max_text: int) -> None:
-        super().__init__(receiving)
-        self._framing = framing
-        self._max_text = max_text + len(framing.start)
-        self._text = bytearray()
-        self._skipping = False
-
-    @property
-    def busy(self) -> bool:
-        return bool(self._text) or self._skipping
-
-    def _consume(self, data: bytes) -> None:
-        self._text += data
-        *whole, rest = bytes(self._text).split(self._framing.end)
-        self._text = bytearray(rest)
-        for line in whole:
-            if not self._skipping:
-                self._decode_text(line)
-            self._skipping = False
-        if len(rest) > self._max_text:
-            if not self._skipping:
-                self._add(self._overlong())
-            self._skipping = True
-            self._text = bytearray(rest[len(rest) - len(self._framing.end) + 1 :])
-
-    def _decode_text(self, line: bytes) -> None:
-        if len(line) > self._max_text:
-            self._add(self._overlong())
-            return
-        before, start, text = (
-            line.rpartition(self._framing.start) if self._framing.start else (b"", b"", line)
-        )
-        if not start and self._framing.start:
-            self._fault(FaultKind.UART_PROTOCOL, "message without its start")
-            return
-        if before:
-            self._fault(FaultKind.UART_PROTOCOL, f"byte {before[0]:02X} outside a message")
-        body = self._framing.decode(text)
-        self._add(self._interpret(body) if isinstance(body, bytes) else body)
-
-    def _abandon(self) -> LinkFault | None:
-        size = 0 if self._skipping else len(self._text)
-        self._text.clear()
-        self._skipping = False
-        return self._incomplete(size) if size else None
+        longest = 2 * receiving.max_size if self._hex else receiving.max_size
+        return _DelimitedDeframer(receiving, self, longest + len(self.start))
 
 
 class FirstByteDeframer(Deframer[_Message]):

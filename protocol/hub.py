@@ -207,14 +207,8 @@ class _Client(TurnProtocol):
 class CanHub:
     """The server: after `await start()`, clients may connect to `host:port` until `await close()`.
 
-    Parameters
-    ----------
-    host, port:
-        Address to listen on; with port 0, `port` is the free port chosen by `start`.
-    log:
-        Candump log of all frames.
-    now:
-        Clock for timestamps (s since 1970).
+    With port 0, `start` chooses a free one. `log` is a candump log of all frames, `now` the clock for timestamps (s since
+    1970).
     """
 
     def __init__(

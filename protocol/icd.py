@@ -17,7 +17,7 @@ from typing import Any, Final, TypeVar
 from pydantic import ValidationError
 
 from starhil.protocol import icd_schema as schema
-from starhil.protocol.codec import Row, RowKind
+from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.definition import (
     OTHER_ERROR,
@@ -29,12 +29,11 @@ from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
-from starhil.protocol.messages import ErrorCode
-from starhil.protocol.names import did_you_mean
+from starhil.protocol.messages import ErrorCode, RequestKind
+from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.text_messages import words
-from starhil.protocol.unit_folders import DEFAULT_UNIT, UNITS_FOLDER, find_unit
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
 from starhil.protocol.values import (
@@ -231,8 +230,8 @@ class _Reader:
         self._attempt(self._set_unit)
         self.byte_order = conventions.byte_order
         self._add_parameters()
-        telecommands = self._build_rows("telecommand")
-        telemetry = self._build_rows("telemetry")
+        telecommands = self._build_rows(RequestKind.TELECOMMAND)
+        telemetry = self._build_rows(RequestKind.TELEMETRY)
         for row in self._rows.values():
             self._attempt(self._check_answers, row)
         self._attempt(self._check_errors, errors_file, errors, conventions)
@@ -405,7 +404,7 @@ class _Reader:
 
     # --- rows ---
 
-    def _build_rows(self, kind: RowKind) -> list[Row]:
+    def _build_rows(self, kind: RequestKind) -> list[Row]:
         """Return the rows of a kind, those that include others last."""
         models: list[tuple[Path, schema.RowModel]] = []
         for file, tables in self._files:
@@ -418,7 +417,7 @@ class _Reader:
             self._attempt(self._add_rows, kind, file, model, done)
         return done
 
-    def _add_rows(self, kind: RowKind, file: Path, model: schema.RowModel, done: list[Row]) -> None:
+    def _add_rows(self, kind: RequestKind, file: Path, model: schema.RowModel, done: list[Row]) -> None:
         try:
             built = list(self._expand_row(kind, f"{file}: {kind} {model.name}", model))
         except IcdError:
@@ -433,9 +432,9 @@ class _Reader:
                 self._row_files[row.name] = file
                 done.append(row)
 
-    def _class_of(self, kind: RowKind, model: schema.RowModel, where: str) -> str:
+    def _class_of(self, kind: RequestKind, model: schema.RowModel, where: str) -> str:
         """Return the class of a row; record an error and return none if it is wrong."""
-        of_kind = [item.name for item in self._classes.values() if item.kind.value == kind]
+        of_kind = [item.name for item in self._classes.values() if item.kind is kind]
         if model.klass is None:
             if (len(of_kind) > 1 or (self._classes and not of_kind)) and CLASS not in self._broken:
                 self._record(
@@ -447,8 +446,8 @@ class _Reader:
             text = f"{where}: no class named {model.klass!r}{did_you_mean(model.klass, self._classes)}"
             self._record(MissingNameError(text, model.klass))
             return ""
-        if found.kind.value != kind:
-            self._record(IcdError(f"{where}: class {model.klass} is for {found.kind.value}, not for {kind}"))
+        if found.kind is not kind:
+            self._record(IcdError(f"{where}: class {model.klass} is for {found.kind}, not for {kind}"))
         return model.klass
 
     def _check_unique(self, row: Row, where: str) -> None:
@@ -473,7 +472,7 @@ class _Reader:
         widths += [int(item.type[1:]) for item in header if item.role == "id"]
         return (1 << widths[0]) - 1 if widths else HIGHEST_ID
 
-    def _expand_row(self, kind: RowKind, where: str, model: schema.RowModel) -> Iterator[Row]:
+    def _expand_row(self, kind: RequestKind, where: str, model: schema.RowModel) -> Iterator[Row]:
         provenance = model.provenance or self._unit.provenance
         if provenance is None:
             raise IcdError(f"{where}: needs `provenance`, here or in [unit]")

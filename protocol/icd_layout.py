@@ -17,9 +17,10 @@ from typing import Any, Final, Protocol
 
 from pydantic import ValidationError
 
-from starhil.protocol.codec import Field, FieldKind, Row, RowKind, Slot
+from starhil.protocol.codec import Field, FieldKind, Row, Slot
 from starhil.protocol.conventions import Order
 from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance, RepeatModel
+from starhil.protocol.messages import RequestKind
 from starhil.protocol.validation_messages import wording
 from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError, Scalar
 
@@ -59,7 +60,12 @@ class Layout:
     """
 
     def __init__(
-        self, definitions: Definitions, where: str, kind: RowKind, provenance: Provenance, number: int | None
+        self,
+        definitions: Definitions,
+        where: str,
+        kind: RequestKind,
+        provenance: Provenance,
+        number: int | None,
     ) -> None:
         self._definitions = definitions
         self._where = where

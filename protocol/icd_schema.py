@@ -252,17 +252,11 @@ class QuantityModel(DefinitionModel):
     doc: str
 
 
-class ArgumentModel(DefinitionModel):
+class ArgumentModel(QuantityModel):
     """An argument of an action."""
 
-    name: str
-    type: Literal["bool", "int", "float", "text", "bytes"]
-    enum: str | None = None
-    unit: str = ""
-    count: Annotated[int, Field(ge=1)] | None = None
     default: Scalar | None = None
     required: bool = False
-    doc: str
 
 
 class ActionModel(DefinitionModel):

@@ -6,62 +6,41 @@ check. Messages of several formats are distinguished by their first byte.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import Final, TypeVar
 
 from starhil.protocol.checks import Check
-from starhil.protocol.conventions import Order
 from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.framings import BodySizeError, Deframer, FirstByteDeframer, Framing, Receiving
-from starhil.protocol.link_schema import FixedFraming, FramingModel, HeaderFieldModel
+from starhil.protocol.link_schema import FixedFraming, FramingModel
 from starhil.protocol.messages import FaultKind, LinkFault
 from starhil.protocol.values import IcdError
 
 _Message = TypeVar("_Message")
 
 
+@dataclass(frozen=True, eq=False)
 class MessageFormat:
-    """Framing, check and header of messages.
+    """Framing, check and header of messages, and the classes of messages that have this format; none: all others."""
 
-    Parameters
-    ----------
-    framing, model
-        The framing and its keys.
-    check
-        The check.
-    models
-        Fields of the header.
-    byte_order
-        Byte order of the unit.
-    codes
-        Name of the class of each code in the header.
-    where
-        Field path of the header for error messages.
-    classes
-        Classes whose messages have this format; empty: all that have no other.
-    """
+    framing: Framing
+    model: FramingModel
+    """Keys of the framing."""
+    check: Check
+    header: Header
+    classes: Sequence[str] = ()
 
-    def __init__(
-        self,
-        framing: Framing,
-        model: FramingModel,
-        check: Check,
-        models: Sequence[HeaderFieldModel],
-        byte_order: Order,
-        codes: Mapping[int, str],
-        where: str,
-        classes: Sequence[str] = (),
-    ) -> None:
-        self.framing: Final = framing
-        self.check: Final = check
-        self.kind: Final = model.kind
-        self.classes: Final = tuple(classes)
-        self._klass = classes[0] if len(classes) == 1 else ""
-        self.request_size: Final = model.request_size if isinstance(model, FixedFraming) else None
+    @property
+    def request_size(self) -> int | None:
         """Bytes of each request, if all have the same size."""
-        overhead = {"start": len(framing.start), "check": check.size, "end": len(framing.end)}
-        self.header: Final = Header(models, byte_order, codes, overhead, where)
+        return self.model.request_size if isinstance(self.model, FixedFraming) else None
+
+    @cached_property
+    def _klass(self) -> str:
+        """The class of all messages, if there is only one."""
+        return self.classes[0] if len(self.classes) == 1 else ""
 
     def close(self, header: bytes, data: bytes) -> bytes:
         """Return header, data and check of a message."""
@@ -147,13 +126,15 @@ class Formats:
             raise IcdError(f"{where}: a format after one without `classes` fits no message")
         starts: dict[int | None, str] = {}
         for form in self.all if len(self.all) > 1 else ():
-            if form.kind not in ("length", "fixed", "delimited"):
-                raise IcdError(f"{where}: framing {form.kind} cannot stand beside another; set `direction`")
+            if form.model.kind not in ("length", "fixed", "delimited"):
+                raise IcdError(
+                    f"{where}: framing {form.model.kind} cannot stand beside another; set `direction`"
+                )
             start = _first_byte(form)
             if start in starts:
                 same = "no start" if start is None else f"a start with {start:02X}"
                 raise IcdError(f"{where}: several framings have {same}; their first bytes must differ")
-            starts[start] = form.kind
+            starts[start] = form.model.kind
 
     def of(self, klass: str) -> MessageFormat:
         """Return the format of the messages of a class."""

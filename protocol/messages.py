@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum, IntEnum
-from typing import Final
+from enum import Enum, IntEnum, StrEnum
+from typing import Final, Protocol, TypeVar
 
 from starhil.protocol.errors import ProtocolError
+
+Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
+Message_co = TypeVar("Message_co", covariant=True)
 
 FIRST_TELEMETRY_ID: Final = 128
 """IDs from this one on are telemetry, lower IDs are telecommands."""
@@ -37,8 +41,8 @@ class ErrorCode(IntEnum):
     PASSTHROUGH_TARGET = 10
 
 
-class RequestKind(Enum):
-    """Kinds of requests that an OBC sends."""
+class RequestKind(StrEnum):
+    """Kinds of rows, and of the requests that an OBC sends."""
 
     TELECOMMAND = "telecommand"
     TELEMETRY = "telemetry"
@@ -152,6 +156,23 @@ class LinkFault:
 
     kind: FaultKind
     detail: str
+
+
+class Receiver(Protocol[Arriving_contra, Message_co]):
+    """The receiving side of a link."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether a message is incomplete, so that `flush` may become due."""
+        ...
+
+    def feed(self, item: Arriving_contra, now: float, /) -> Sequence[Message_co | LinkFault]:
+        """Return the messages and faults that an item completes; `now` is the time of arrival, s."""
+        ...
+
+    def flush(self, now: float) -> list[LinkFault]:
+        """Drop an incomplete message that has timed out; return the faults."""
+        ...
 
 
 def check_receiver_limits(max_size: int, timeout_s: float) -> None:

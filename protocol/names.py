@@ -1,4 +1,4 @@
-"""Names of what ships with the package: profiles, scenarios, sessions, units; and what is said of an unknown name."""
+"""What ships with the package by name: profiles, scenarios, sessions, units; and similar names for an unknown one."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
+from starhil.protocol.values import IcdError
+
 _MIN_SIMILARITY: Final = 0.55
 """Similarity above which a known name is suggested for an unknown one (`difflib`)."""
 
@@ -14,6 +16,15 @@ Kind: TypeAlias = Literal["profile", "scenario", "session", "unit"]
 
 CONFIGS: Final = Path(__file__).resolve().parent.parent / "configs"
 """Folder `configs` of the installation or checkout."""
+
+UNITS_FOLDER: Final = CONFIGS / "units"
+"""Folder of the bundled units."""
+
+DEFAULT_UNIT: Final = "cubestar"
+"""Name of the unit that is emulated unless another is chosen."""
+
+SKELETON: Final = CONFIGS / "new_unit.toml"
+"""Template that `starhil unit new` copies."""
 
 
 def bundled(kind: Kind) -> dict[str, Path]:
@@ -35,6 +46,22 @@ def not_found(kind: Kind, name: str | Path) -> str:
     known = bundled(kind)
     hint = did_you_mean(Path(name).stem, known)
     return f"{kind} {str(name)!r}: not found; give a path, or one of: {', '.join(known)}{hint}"
+
+
+def bundled_units() -> list[str]:
+    """Return the names of the bundled units."""
+    return list(bundled("unit"))
+
+
+def find_unit(name_or_folder: str | Path) -> Path:
+    """Return the path of a unit: a bundled unit by name, or an existing folder or TOML file.
+
+    Raises IcdError, whose text suggests similar names.
+    """
+    path = find("unit", name_or_folder)
+    if path.exists():
+        return path
+    raise IcdError(f"{not_found('unit', name_or_folder)}; `starhil unit new FOLDER` creates one")
 
 
 def remedy(name: str, known: Iterable[str]) -> str:

@@ -35,12 +35,7 @@ _ASCII: Final = str.maketrans({"°": "deg", "µ": "u", "μ": "u", "×": "x", "�
 class Scope:
     """The names in one scope of an export, each with what it belongs to.
 
-    Parameters
-    ----------
-    language
-        The language, for error messages.
-    reserved
-        Names that the exported file or the language itself uses.
+    `reserved` are names that the exported file or the language itself uses.
     """
 
     def __init__(self, language: str, reserved: Iterable[str] = ()) -> None:

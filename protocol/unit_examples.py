@@ -15,9 +15,9 @@ from starhil.protocol.icd import read_definition
 from starhil.protocol.icd_bindings import unbound
 from starhil.protocol.link_schema import CustomFraming
 from starhil.protocol.messages import Reply, ReplyKind, Request
+from starhil.protocol.names import find_unit
 from starhil.protocol.plugin import guarded
 from starhil.protocol.serial_stack import SerialStack, build_serial_stack, chosen_dialect
-from starhil.protocol.unit_folders import find_unit
 from starhil.protocol.values import IcdError, Value
 
 HOST_ADDRESS, DEVICE_ADDRESS = 1, 4

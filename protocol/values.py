@@ -155,6 +155,11 @@ def to_f32(value: float) -> float:
     return float(struct.unpack("<f", struct.pack("<f", value))[0])
 
 
+def representable(low: float, high: float, type_: str) -> tuple[float, float]:
+    """Return limits widened to values that the type can represent: the f32 nearest to a limit may be outside it."""
+    return (min(low, to_f32(low)), max(high, to_f32(high))) if type_ == "f32" else (low, high)
+
+
 def number_of(value: Value, where: str, *, index: int = 0) -> int | float:
     """Return the value if it is a number; raise FieldError otherwise."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
@@ -257,12 +262,9 @@ class Parameter(ParameterKeys):
             if not math.isfinite(number) or number != int(number):
                 raise FieldError(f"{self.name}: {number!r} is not a whole number")
             number = int(number)
-            low, high = self.minimum, self.maximum
         else:
             number = float(number)
-            single = self.type == "f32"
-            low = min(self.minimum, to_f32(self.minimum)) if single else self.minimum
-            high = max(self.maximum, to_f32(self.maximum)) if single else self.maximum
+        low, high = representable(self.minimum, self.maximum, self.type)
         if not low <= number <= high:
             limits = limits_text(self.minimum, self.maximum, self.unit)
             raise FieldError(f"{self.name}: {number:g} is outside {limits}")

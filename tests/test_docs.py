@@ -34,7 +34,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import HubThread, private_can_bus
 from starhil.hil_tests.raw_traffic import format_frame, parse_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
-from starhil.protocol.canopen import build_dictionary
+from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.export import export
 from starhil.protocol.icd import load_unit
 from starid.attitude import Attitude

@@ -13,7 +13,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import DeviceAddress, Seed, SerialDialect, Unit, checked_dialect
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 from starid.cli.options import AsJson, one_of
 from starid.cli.output import Column, output_help, prepare_output, print_table, progress
 
@@ -188,7 +188,7 @@ class TargetOptions:
     def target(self) -> Target:
         """Return the links."""
         from starhil.emulator.cli.bench_bus import Target
-        from starhil.protocol.serial_interface import Dialect
+        from starhil.protocol.cubespace import Dialect
 
         dialect = Dialect(checked_dialect(self.dialect) or "b")
         return Target(self.can, self.serial, self.canopen, self.device_address, self.baud, dialect)

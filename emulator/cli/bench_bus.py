@@ -18,8 +18,8 @@ from starhil.hil_tests.jitter import event_timer_jitter, heartbeat_jitter, sync_
 from starhil.hil_tests.load_figures import CanLoad, Jitter, SerialLoad
 from starhil.hil_tests.realtime import set_realtime_priority
 from starhil.hil_tests.serial_load import load_serial
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.serial_interface import Dialect
 
 UPDATE_RATE_HZ = 10.0
 NODE = 44

@@ -12,7 +12,7 @@ import typer
 
 from starhil.emulator.cli.option_groups import with_option_groups
 from starhil.emulator.cli.options import BenchOptions, Settings, checked_dialect
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 from starid.cli.options import AsJson
 from starid.cli.output import output_help
 

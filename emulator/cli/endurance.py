@@ -57,7 +57,7 @@ class PlanOptions:
 
     def plan(self) -> Iterator[tuple[str, int, int, str]]:
         """Generate unit, seed, steps and kind of each life; a kind has a period, in which its last life is of it."""
-        from starhil.protocol.unit_folders import bundled_units
+        from starhil.protocol.names import bundled_units
 
         units = self.unit or sorted(bundled_units())
         kinds = {"rendered": (self.rendered, RENDERED_STEPS), "long": (self.long, LONG_STEPS)}

@@ -10,7 +10,7 @@ import typer
 
 from starhil.emulator.cli.options import Unit
 from starhil.emulator.cli.output import print_text, writing
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 from starid.cli.options import AsJson
 from starid.cli.output import output_help
 

@@ -168,11 +168,11 @@ class AroundOptions:
             if path is not None:
                 prepare_output(path, option)
         return RunOptions(
-            self.truth_log,
-            self.overwrite,
-            self.control,
-            self.control_token or "",
-            self.scenario,
+            truth_log=self.truth_log,
+            overwrite=self.overwrite,
+            control=self.control,
+            control_token=self.control_token or "",
+            scenario=self.scenario,
             record=folder,
             view=self.view,
             view_token=self.view_token or "",
@@ -274,7 +274,7 @@ async def _serve(make: Callable[[], Emulator]) -> int:
 
 def _absolute_folder(unit: str) -> str:
     """Return a folder from the command line as an absolute path; a profile would resolve it differently."""
-    from starhil.protocol.unit_folders import bundled_units, find_unit
+    from starhil.protocol.names import bundled_units, find_unit
 
     return unit if unit in bundled_units() else str(find_unit(unit).absolute())
 
@@ -288,8 +288,8 @@ def _one_path(paths: list[Path] | None, *, mcap: bool) -> Path | None:
     return found[0] if found else None
 
 
-def _as_toml(value: str | int) -> str:
+def _as_toml(value: str | float) -> str:
     """Write a value as TOML."""
-    if isinstance(value, int):
+    if isinstance(value, (int, float)):
         return str(value)
     return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'

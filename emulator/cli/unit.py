@@ -10,7 +10,7 @@ import typer
 
 from starhil.emulator.cli.options import names_of
 from starhil.emulator.cli.output import print_text
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 from starid.cli.options import AsJson
 
 group = typer.Typer(
@@ -36,7 +36,7 @@ UnitArgument = Annotated[
 def list_units(as_json: AsJson = False) -> None:
     """List the bundled units."""
     from starhil.protocol.icd import load_unit
-    from starhil.protocol.unit_folders import bundled_units
+    from starhil.protocol.names import bundled_units
 
     units = {name: load_unit(name) for name in bundled_units()}
     if as_json:
@@ -65,7 +65,7 @@ def new(
 ) -> None:
     """Create a unit: a commented definition that already runs, as a starting point."""
     from starhil.emulator.errors import EmulatorError, explained
-    from starhil.protocol.unit_folders import SKELETON
+    from starhil.protocol.names import SKELETON
     from starid.files import write_atomically
 
     if folder.exists() and (not folder.is_dir() or any(folder.glob("*.toml"))):

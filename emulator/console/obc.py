@@ -12,9 +12,9 @@ from typing import Any, Final, Literal, Protocol
 
 from starhil.emulator.errors import EmulatorError
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import escape_controls
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError, Value
 
 Bus = Literal["can", "canopen", "serial"]

@@ -15,8 +15,8 @@ from starhil.protocol.canopen.cob import SDO_RECEIVE
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.sdo_client import requests_of, row_transfer
 from starhil.protocol.codec import Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 
 KEPT_ITEMS: Final = 20_000

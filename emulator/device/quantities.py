@@ -67,6 +67,8 @@ def getter_of(name: str) -> Getter:
 def _declare(name: str, kind: type, doc: str, function: Callable[..., Value | None], **keys: Any) -> None:
     keys |= {"name": name, "type": "text" if kind is str else kind.__name__, "doc": doc}
     declared = QuantityModel.model_validate(keys)
+    if name in QUANTITIES:
+        raise ValueError(f"quantity {name} is declared twice")
     QUANTITIES[name] = Quantity(declared, function)
 
 

@@ -95,7 +95,7 @@ class MemoryWiring(Wiring):
         self._port = port
         self._buses = buses
 
-    def serial(self, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
+    def serial(self, name: str, make: Callable[[], SerialTransport]) -> SerialTransport:  # noqa: ARG002 (no port is opened)
         """Return the serial line."""
         return self._port
 

@@ -16,8 +16,7 @@ from starhil.emulator.device.requests import Requests
 from starhil.emulator.device.scheduler import Event
 from starhil.emulator.links.wire_faults import Damage, WireFaults
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.messages import ErrorCode, LinkFault, Reply, Request
-from starhil.protocol.serial_interface import Receiver
+from starhil.protocol.messages import ErrorCode, LinkFault, Receiver, Reply, Request
 from starhil.protocol.transports.base import Transport
 
 Item = TypeVar("Item")
@@ -58,7 +57,7 @@ class BusLink(ABC, Generic[Item]):
         self.transport: Final = transport
         self.heard: Final = Heard()
         """Requests of the OBC."""
-        self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
+        self.wire: WireFaults[Item] = WireFaults(self._transmit, damage, device.clock, device.scheduler, seed)
         """Outgoing side of the link, with its faults."""
         self._timer: Event | None = None
 
@@ -76,6 +75,10 @@ class BusLink(ABC, Generic[Item]):
     @abstractmethod
     def _receive(self, item: Item) -> None:
         """Process an item that has arrived."""
+
+    def _transmit(self, item: Item) -> None:
+        """Pass an item, after its faults, to the transport."""
+        self.transport.send(item)
 
     def _now(self) -> float:
         """Return the simulation time, seconds, which also applies to time-outs of messages."""

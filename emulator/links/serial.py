@@ -9,8 +9,8 @@ from typing import ClassVar, Final
 
 from starhil.emulator.device.requests import Requests
 from starhil.emulator.links.base import DeviceLink
-from starhil.protocol.messages import Reply, Request
-from starhil.protocol.serial_interface import Dialect, Receiver
+from starhil.protocol.cubespace import Dialect
+from starhil.protocol.messages import Receiver, Reply, Request
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports.paced import SerialTransport
 

@@ -12,10 +12,10 @@ from starhil.emulator.links.base import Link
 from starhil.emulator.signals import Signal
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanHostReceiver, CanId, MessageType
 from starhil.protocol.codec import Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import HostReceiver, build_serial_stack
 from starhil.protocol.values import Value
 

@@ -20,12 +20,12 @@ from typing import Any, Final
 
 from starhil.emulator.pipeline.imager import PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import (
-    Failure,
     FrameRequest,
     FrameResult,
     ImageRequest,
     ImageResult,
     MatchedStar,
+    PipelineEnded,
     PipelineReady,
     PipelineSetup,
     Quaternion,
@@ -97,7 +97,7 @@ class ErrorModelImager:
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Answer a request."""
         if not self._running:
-            done(Failure("error model: not running"))
+            done(PipelineEnded("error model: not running"))
         elif isinstance(request, ImageRequest):
             done(self._image(request.edge))
         else:

@@ -23,6 +23,7 @@ from starhil.emulator.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
+    PipelineEnded,
     PipelineReady,
     PipelineSetup,
     with_length,
@@ -103,7 +104,7 @@ class WorkerImager:
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Send a request to the worker, for a preview too if anything shows the images."""
         if self._writer is None:
-            done(Failure("pipeline worker: not running"))
+            done(PipelineEnded("pipeline worker: not running"))
             return
         if self.watchers and isinstance(request, FrameRequest):
             request = replace(request, preview=True)
@@ -160,7 +161,7 @@ class WorkerImager:
         was_ready = started.done() and not started.cancelled() and started.exception() is None
         self._start_failed(text)
         while self._waiting:
-            self._deliver_reply(Failure(text))
+            self._deliver_reply(PipelineEnded(text))
         if was_ready:
             log.error("%s", text)
             self.ended.emit(text)

@@ -247,3 +247,7 @@ class Failure:
     """Message that a request, or the start of the pipeline, failed."""
 
     text: str
+
+
+class PipelineEnded(Failure):
+    """The pipeline has ended without a reply to the request."""

@@ -39,8 +39,8 @@ from starhil.hil_tests.run_feed import RunFeed, console_address
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import DEFAULT_UNIT
 from starhil.protocol.serial_stack import chosen_dialect
-from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starhil.protocol.values import IcdError
 
 if TYPE_CHECKING:
@@ -313,7 +313,8 @@ def _canopen_probe(request: ConformanceRequest, can: str, stack: ExitStack) -> C
 def _eds_text(request: ConformanceRequest) -> str:
     path = request.eds
     if path is None:
-        from starhil.protocol.canopen import build_dictionary, build_eds
+        from starhil.protocol.canopen.device_dictionary import build_dictionary
+        from starhil.protocol.canopen.eds import build_eds
 
         return build_eds(build_dictionary(load_unit(request.unit or DEFAULT_UNIT)))
     try:

@@ -19,7 +19,7 @@ from starhil.hil_tests.judge.rows import SIZES, Field, Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import find_unit
+from starhil.protocol.names import find_unit
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Value, enc
 from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.values import IcdError, MessageError, Parameter, to_f32
+from starhil.protocol.values import IcdError, MessageError, Parameter, representable
 
 Key = tuple[int, int]
 
@@ -181,7 +181,7 @@ def _parameter(name: str, key: Key, parameter: Parameter) -> Placement:
     item = variable(
         name, *key, DATA_TYPES[parameter.type], "rw", int(default) if whole else default, mappable=True
     )
-    set_limits(item, *_representable_limits(parameter.type, parameter.minimum, parameter.maximum))
+    set_limits(item, *representable(parameter.minimum, parameter.maximum, parameter.type))
     item.unit = parameter.unit
     item.description = parameter.doc
     if parameter.enum is not None:
@@ -487,10 +487,5 @@ def _describe(member: ODVariable, fields: list[Field]) -> None:
     if first.enum is not None:
         member.value_descriptions = dict(first.enum.names)
     elif first.minimum is not None or first.maximum is not None:
-        limits = first.physical_limits if first.kind == "float" else first.raw_limits
-        set_limits(member, *_representable_limits(first.slot.type, *limits))
-
-
-def _representable_limits(kind: str, low: float, high: float) -> tuple[float, float]:
-    """Widen limits to values that the type can represent: the nearest f32 may be just outside."""
-    return (min(low, to_f32(low)), max(high, to_f32(high))) if kind == "f32" else (low, high)
+        low, high = first.physical_limits if first.kind == "float" else first.raw_limits
+        set_limits(member, *representable(low, high, first.slot.type))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from enum import IntEnum
-from typing import Final, Protocol
+from typing import Final
 
 from starhil.protocol.canopen.cob import LSS_SLAVE
 from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind
@@ -59,32 +59,25 @@ class Command(IntEnum):
     INQUIRE_NODE_ID = 0x5E
 
 
-class LssHost(Protocol):
-    """Functions of the node that the LSS slave calls."""
-
-    def activate_node_id(self, node_id: int) -> None:
-        """Leave the unconfigured state with a node ID."""
-
-    def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
-        """Change the bit rate: silence for `delay_s` before and after."""
-
-
 class LssSlave:
     """Answers the LSS master, which may set the allowed bit rates, bit/s.
 
-    `store` saves node ID and bit rate, and raises `ProtocolError` if that fails.
+    `store` saves node ID and bit rate, and raises `ProtocolError` if that fails. `on_node_id` and `on_bit_rate` are
+    called with a node ID, or a bit rate and a delay in s, that the node must change to.
     """
 
     def __init__(
         self,
         context: Context,
-        host: LssHost,
+        on_node_id: Callable[[int], None],
+        on_bit_rate: Callable[[int, float], None],
         store: Callable[[int, int], None],
         bit_rate: int,
         allowed_bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
     ) -> None:
         self._context = context
-        self._host = host
+        self._on_node_id = on_node_id
+        self._on_bit_rate = on_bit_rate
         self._store = store
         self._allowed = allowed_bit_rates
         self.pending_node_id = context.node_id
@@ -134,7 +127,7 @@ class LssSlave:
     def _to_waiting(self) -> None:
         self.configuring = False
         if self._context.node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
-            self._host.activate_node_id(self.pending_node_id)
+            self._on_node_id(self.pending_node_id)
 
     def _switch_selective(self, command: int, number: int) -> None:
         """Select this node after four frames in order, each with one number of its identity."""
@@ -207,7 +200,7 @@ class LssSlave:
             else:
                 self._send(command, bytes([OUT_OF_RANGE]))
         elif command == Command.ACTIVATE_BIT_TIMING:
-            self._host.activate_bit_rate(self.pending_bit_rate, int.from_bytes(data[1:3], "little") * 1e-3)
+            self._on_bit_rate(self.pending_bit_rate, int.from_bytes(data[1:3], "little") * 1e-3)
         elif command == Command.STORE:
             result = OK
             try:

@@ -90,7 +90,14 @@ class CanopenSlave:
         if stored is not None:
             context.node_id, bit_rate = stored
         self.bit_rate = bit_rate
-        self.lss = LssSlave(context, self, self.store.save_lss, bit_rate, bit_rates)
+        self.lss = LssSlave(
+            context,
+            self._activate_node_id,
+            self._activate_bit_rate,
+            self.store.save_lss,
+            bit_rate,
+            bit_rates,
+        )
         self.emergency = EmergencyProducer(context)
         self.sdo = SdoServer(dictionary, sdo_timeout_s)
         self.sync = SyncService(context, self.emergency)
@@ -206,12 +213,12 @@ class CanopenSlave:
         events, self._context.events = self._context.events, []
         return events
 
-    def activate_node_id(self, node_id: int) -> None:
+    def _activate_node_id(self, node_id: int) -> None:
         """Leave the unconfigured state (LSS)."""
         self._context.node_id = node_id
         self._initialise(application=False)
 
-    def activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
+    def _activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
         """Stop sending, switch the bit rate after `delay_s`, and resume after another `delay_s` (LSS)."""
         now = self._context.now
         self._pending_bit_rate = bit_rate

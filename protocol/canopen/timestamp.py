@@ -26,12 +26,6 @@ def decode_time_of_day(data: bytes) -> float | None:
     return EPOCH_UNIX_S + int.from_bytes(data[4:], "little") * DAY_S + milliseconds / 1000
 
 
-def encode_time_of_day(unix_s: float) -> bytes:
-    """Return the TIME_OF_DAY of a Unix time, s, to the nearest millisecond."""
-    days, milliseconds = divmod(round((unix_s - EPOCH_UNIX_S) * 1000), DAY_MS)
-    return milliseconds.to_bytes(4, "little") + days.to_bytes(2, "little")
-
-
 class TimeConsumer:
     """Reports each TIME message as an event whose value is the Unix time in s."""
 

@@ -23,7 +23,7 @@ from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.describe import meaning, number
 from starhil.protocol.export.templates import fill
-from starhil.protocol.messages import ErrorCode, ReplyKind, RequestKind
+from starhil.protocol.messages import ErrorCode, ReplyKind
 from starhil.protocol.quoting import Scope, dbc_string
 from starhil.protocol.values import EnumDefinition, IcdError
 
@@ -88,7 +88,7 @@ def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Ite
     )
     long = row.size > MAX_FRAME_DATA
     telemetry = row.kind == "telemetry"
-    request = REQUEST_TYPES[RequestKind(row.kind)][long]
+    request = REQUEST_TYPES[row.kind][long]
     reply = REPLY_TYPES[ReplyKind.TELEMETRY if telemetry else ReplyKind.ACK][long and telemetry]
     asked, answered = _id(request, *to_device), _id(reply, *to_host)
     if telemetry:

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from starhil.protocol.can_framing import MessageType
 from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.templates import text_of
 from starhil.protocol.link_schema import (
@@ -22,7 +23,6 @@ from starhil.protocol.link_schema import (
     SerialLinkModel,
 )
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import Section
 
@@ -105,7 +105,7 @@ def _classes(icd: InterfaceDefinition) -> Section:
         return "" if number is None else f"{number:02X}h"
 
     rows = (
-        (item.name, item.kind.value, code(item.code), code(item.reply_code), code(item.unsolicited_code))
+        (item.name, item.kind, code(item.code), code(item.reply_code), code(item.unsolicited_code))
         for item in icd.classes
     )
     return _section("classes", rows)

@@ -46,14 +46,8 @@ OpenBus = Callable[[], can.BusABC]
 class PythonCanTransport(ReconnectingTransport[CanFrame]):
     """Frames over a python-can bus.
 
-    Parameters
-    ----------
-    description:
-        Specification of the bus.
-    open_bus:
-        Opens the bus; runs in a thread, since it may block.
-    echoes:
-        Whether the bus returns sent frames (udp_multicast); the transport removes these echoes.
+    `open_bus` runs in a thread, since it may block. If the bus `echoes`, i.e. returns sent frames (udp_multicast), the
+    transport removes these echoes.
     """
 
     kind = "CAN"

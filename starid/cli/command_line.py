@@ -196,7 +196,7 @@ def run(
     words
         Arguments of the program.
     errors
-        Errors whose arguments are problems, each one line for the user.
+        Errors whose text is one line for the user, or that have several such lines as `problems`.
     """
     show_every_character()
     try:
@@ -204,7 +204,7 @@ def run(
             args=list(words), prog_name=program, standalone_mode=False
         )
     except errors as error:
-        exit_for_bad_input(program, *map(str, error.args))
+        exit_for_bad_input(program, *getattr(error, "problems", (str(error),)))
     except ModuleNotFoundError as error:
         if error.name not in LAB_PACKAGES:
             raise

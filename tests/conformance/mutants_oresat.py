@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.unit_folders import find_unit
+from starhil.protocol.names import find_unit
 from tests.conformance.mutant_seams import Damage, incoming, only_acknowledged, outgoing
 from tests.conformance.simulated import SimulatedUnit
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import SerialStack
 from tests.conformance.mutant_seams import (
     enter,

@@ -33,11 +33,12 @@ from starhil.hil_tests.conformance.link_probe import ProbeTimes
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import settings_of
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import DEFAULT_UNIT
 from starhil.protocol.transports.base import Transport
 from starhil.protocol.transports.paced import PacedWriter
-from starhil.protocol.unit_folders import DEFAULT_UNIT
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
 from tests.protocol.canopen.conftest import import_eds

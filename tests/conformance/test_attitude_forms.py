@@ -13,7 +13,7 @@ from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import serial_suite
 from starhil.hil_tests.judge.definition import read_unit
-from starhil.protocol.unit_folders import find_unit
+from starhil.protocol.names import find_unit
 from starid.attitude import Attitude
 from tests.conformance.links import LINKS, ROWS
 from tests.conformance.simulated import SimulatedUnit

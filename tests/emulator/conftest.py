@@ -31,7 +31,7 @@ from starhil.emulator.profile import Profile
 from starhil.emulator.truth.source import FixedTruth, TruthSource
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind
-from starhil.protocol.unit_folders import DEFAULT_UNIT
+from starhil.protocol.names import DEFAULT_UNIT
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA
 from tests.emulator.runs import DirectImager, FakeImager, FirstHead

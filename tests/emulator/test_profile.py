@@ -162,6 +162,8 @@ def test_overrides_are_toml_or_text():
     [
         ("[run]\nsede = 1\n", "run.sede: unknown key; did you mean seed?"),
         ("[rum]\nseed = 1\n", "rum: unknown key; did you mean run?"),
+        (f'unit = "{"a" * 300}"\n', "unit: unit 'aaa"),
+        ('unit = "cubstar"\n', "unit: unit 'cubstar': not found; give a path, or one of: cubestar"),
         ("[run]\nseed = -1\n", "run.seed: must be at least 0 (given: -1)"),
         ("[run]\nseed = '1'\n", "run.seed: must be a whole number (given: '1')"),
         ("[links.can]\naddress = 255\n", "links.can.address"),

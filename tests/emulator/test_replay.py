@@ -12,6 +12,7 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
+from starhil.emulator.pipeline.messages import PipelineEnded, PipelineReady
 from starhil.emulator.profile import Profile, load_profile
 from starhil.emulator.replay import prepare_recording, read_run, replay
 from starhil.emulator.tape import EVENTS_FILE, RUN_FILE, SCENARIO_FILE, TRUTH_FILE
@@ -19,7 +20,7 @@ from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from tests.emulator.cli.command_line import run_command_line
-from tests.emulator.runs import Control
+from tests.emulator.runs import CAMERA, Control
 from tests.emulator.truth.simulators import Stub42, blocks_of_42
 
 PARAMETERS = {"start_mode": "lost_in_space", "update_rate": 5.0}
@@ -115,6 +116,23 @@ def test_can_frames_and_canopen_are_repeated(record):
     assert report.sent["canopen"] >= 1
 
 
+def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
+    """The gap between two frames passes after the request, while other entries arrive."""
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd)
+        await client.start()
+        async with Control(emulation) as control:
+            for fault in ({"delay_s": 0.02}, {}):
+                await control.do("fault", can=fault)
+                for _ in range(5):
+                    await client.telemetry("precise_attitude")
+        await client.close()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": "virtual:gaps", "frame_gap_s": 0.003}}
+    assert report_of(record(scenario, clock="real", links=links)).differences == []
+
+
 def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
     async def scenario(emulation, _line):
         client = AsyncObcClient(
@@ -143,6 +161,53 @@ def test_a_simulator_is_not_needed_for_the_replay(record, clock):
     folder = record(scenario, clock=clock, truth={"kind": "42", "role": "server", "port": 0})
     assert report_of(folder).differences == []
     assert "0.279" in (folder / "truth.csv").read_text()
+
+
+@pytest.mark.parametrize("clock", ["real", "stepped"])
+def test_a_run_whose_pipeline_dies_and_is_restarted_is_repeated(record, clock):
+    async def scenario(emulation, _line):
+        imager, device = emulation.imager, emulation.device
+        handle = imager._handle
+
+        async def restart():
+            imager._handle = handle
+            return PipelineReady(CAMERA, 5, 0.0)
+
+        await talk(emulation, 3)
+        imager.restart = restart
+        imager._handle = lambda _request: PipelineEnded("killed")
+        imager.ended.emit("killed")
+        assert device.modes.mode.value == "error"
+        async with asyncio.timeout(WITHIN_S):
+            while not device.warm:
+                await asyncio.sleep(0.05)
+        client = AsyncObcClient(
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+        )
+        await client.start()
+        await client.command("set_mode", mode="standby")
+        await client.command("set_mode", mode="lost_in_space")
+        await client.close()
+        await talk(emulation, device.cycle.published + 3)
+
+    folder = record(scenario, run={"clock": clock})
+    kinds = [json.loads(line)["do"] for line in (folder / EVENTS_FILE).read_text().splitlines()]
+    assert kinds.count("pipeline_lost") == 1
+    assert kinds.count("ready") == 2
+    assert report_of(folder).differences == []
+
+
+def test_a_frame_that_fails_with_the_pipeline_fails_in_the_replay(record):
+    async def scenario(emulation, _line):
+        await emulation.stepper.step(2.0)
+        handle, emulation.imager._handle = emulation.imager._handle, lambda _request: PipelineEnded("killed")
+        await emulation.stepper.step(0.2)
+        emulation.imager._handle = handle
+        await emulation.stepper.step(2.0)
+
+    folder = record(scenario)
+    assert "processing_error" in (folder / TRUTH_FILE).read_text()
+    assert report_of(folder).differences == []
 
 
 def test_a_scenario_is_part_of_the_recording(record, tmp_path):

@@ -15,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Request
-from starhil.protocol.serial_interface import Dialect
 from starid.attitude import Attitude
 from tests.emulator.cli.command_line import log_lines, run_command_line
 from tests.protocol.composed_links import CUBESPACE, CUBESTAR

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from starhil.emulator.errors import EmulatorError
-from starhil.hil_tests.errors import BenchError, ScriptError
+from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
 from starid.errors import StaridError
 
@@ -30,16 +30,16 @@ class Target:
     seeds: Callable[[], list[bytes]]
 
     def runner(self, folder: Path) -> Run:
-        """Return the function of bytes; a documented error is fine if it is one line for each of its problems."""
+        """Return the function of bytes; a documented error is fine if it is one line, and each of its problems is."""
         run = self.make(folder)
 
         def guarded(data: bytes) -> None:
             try:
                 run(data)
             except DOCUMENTED as error:
-                lines = str(error).splitlines()
-                if len(lines) != (len(error.args) if isinstance(error, ScriptError) else 1):
-                    raise AssertionError(f"an error of {len(lines)} lines") from error
+                for text in (str(error), *getattr(error, "problems", ())):
+                    if len(text.splitlines()) != 1:
+                        raise AssertionError(f"not one line: {text!r}") from error
 
         return guarded
 

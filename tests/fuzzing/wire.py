@@ -29,9 +29,9 @@ from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.names import bundled_units
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
-from starhil.protocol.unit_folders import bundled_units
 from tests.emulator.conftest import Bench
 from tests.fuzzing.target import DOCUMENTED, NESTED, TARGETS, Run, Target, chunks, target
 from tests.protocol.canopen.conftest import Bench as CanopenBench

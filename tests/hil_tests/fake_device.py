@@ -7,11 +7,11 @@ import threading
 from dataclasses import dataclass, field
 
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import file_checksum
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.transports import open_can, open_serial
 

@@ -42,6 +42,7 @@ def emulator(*lines: str, within_s: float = 30.0) -> EmulatorProcess:
     [
         (["import sys; sys.exit('no sky today')"], "ended with status 1 before it was ready: no sky today"),
         (["import sys; [print(n, file=sys.stderr) for n in range(9)]"], "status 0 before it was ready: 4 | 5 | 6 | 7 | 8"),
+        (["import sys; print('starhil: a', 'log', 'starhil: b', sep='\\n', file=sys.stderr); sys.exit(2)"], "a; b"),
         ([FOREVER], "the emulator was not ready within 0.5 s"),
     ],
 )  # fmt: skip

@@ -14,10 +14,10 @@ from starhil.hil_tests.jitter import unsolicited_jitter
 from starhil.hil_tests.load_figures import CanLoad, SerialLoad, Spread
 from starhil.hil_tests.serial_load import load_serial
 from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, encode_reply_frames
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.hub import CanHub
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.transports import CanTransport, SerialTransport, open_can, open_serial
 from tests.protocol.composed_links import CUBESPACE
 

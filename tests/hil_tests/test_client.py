@@ -11,10 +11,10 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.images import list_files
 from starhil.hil_tests.raw_traffic import send_and_listen
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import UnknownNameError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError
 from tests.hil_tests.fake_device import EDGE, FakeDevice, bmp_file
 

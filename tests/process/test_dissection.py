@@ -8,7 +8,8 @@ import canopen
 import pytest
 
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 from tests.candump import read_candump
 from tests.process.test_sessions import starhil

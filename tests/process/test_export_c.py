@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from starhil.hil_tests.client import ObcClient
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.export import export_folder
 from starhil.protocol.export.packets import key_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.serial_interface import Dialect
 from tests.protocol.c_driver import COMPILER, FLAGS, CDriver, c_words, hex_or_none
 from tests.protocol.composed_links import CUBESTAR
 from tests.protocol.test_export_c import KINDS

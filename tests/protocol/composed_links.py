@@ -35,7 +35,7 @@ def shape(
         "name": "",
         "klass": klass,
         "id": identifier,
-        "kind": kind.value,
+        "kind": kind,
         "request": "",
         "answers": answers,
     }

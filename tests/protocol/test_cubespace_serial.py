@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from starhil.protocol.cubespace import BURST_SIZE
+from starhil.protocol.cubespace import BURST_SIZE, Dialect
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.serial_stack import SerialStack
 from tests.protocol.composed_links import CUBESPACE, shape, stack_of
 

@@ -28,10 +28,10 @@ from starhil.protocol.export.describe import anchor, example_text, field_cells
 from starhil.protocol.export.packets import key_bits, key_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
+from starhil.protocol.names import DEFAULT_UNIT, bundled_units
 from starhil.protocol.quoting import cosmos_state
 from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.unit_examples import exchanges
-from starhil.protocol.unit_folders import DEFAULT_UNIT, bundled_units
 from starhil.protocol.values import Value, to_f32
 
 ICD = load_unit()
@@ -556,7 +556,7 @@ def test_an_unknown_format_is_rejected() -> None:
 
 
 def test_a_changed_row_changes_every_export(tmp_path: Path) -> None:
-    from starhil.protocol.unit_folders import find_unit
+    from starhil.protocol.names import find_unit
 
     for file in find_unit("cubestar").glob("*.toml"):
         (tmp_path / file.name).write_text(

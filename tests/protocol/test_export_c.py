@@ -11,10 +11,10 @@ import pytest
 
 from starhil.protocol.can_framing import CanFrame, CanHostReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.values import FieldError
 from tests.emulator.units.clients import Emulated, with_unit
 from tests.protocol.c_driver import CDriver, c_words, hex_or_none

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.export.cosmos_plugin import answer_id
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from tests.protocol.composed_links import CUBESPACE, CUBESTAR
 from tests.protocol.cosmos_plugin import Plugin
 from tests.protocol.test_export import packets

@@ -20,11 +20,11 @@ from starhil.protocol.can_framing import (
     encode_reply_frames,
     encode_request_frames,
 )
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.image_transfer import parse_burst_packet
 from starhil.protocol.messages import ErrorCode, FaultKind, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from starhil.protocol.socketcand import CommandSplitter, format_frame, format_send, parse_frame, parse_send
 from tests.protocol.composed_links import CUBESPACE, stack_of
 

@@ -14,7 +14,7 @@ from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import UnknownNameError
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
-from starhil.protocol.unit_folders import find_unit
+from starhil.protocol.names import find_unit
 from starhil.protocol.values import FieldError, IcdError, LengthError, MessageError, Value, to_f32
 
 ICD = load_unit()

@@ -10,8 +10,8 @@ import pytest
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import FaultKind, LinkFault, Reply, ReplyKind, Request
+from starhil.protocol.names import bundled_units
 from starhil.protocol.serial_stack import SerialStack, build_serial_stack
-from starhil.protocol.unit_folders import bundled_units
 from starhil.protocol.values import MessageError
 from tests.protocol.mutations import mutated
 

@@ -6,9 +6,9 @@ import pytest
 
 from starhil.protocol.device_model import device_model
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import SKELETON, bundled_units
 from starhil.protocol.plugin import quantity
 from starhil.protocol.unit_examples import check_unit, exchanges
-from starhil.protocol.unit_folders import SKELETON, bundled_units
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import FieldError, IcdError
 

@@ -12,24 +12,14 @@ from starhil.protocol.export.describe import meaning
 from starhil.protocol.export.packets import key_of
 from starhil.protocol.export.templates import fill
 from starhil.protocol.quoting import Scope, c_comment, c_member, c_string, identifier, one_line
-from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, Value, to_f32
+from starhil.protocol.values import INTEGER_RANGES, EnumDefinition, Value, representable
 
 MAP: Final = "map"
 """Name of every enumeration that a field has by its `map`."""
 
 
 class RowCode:
-    """Writes the C code of the rows of a definition.
-
-    Parameters
-    ----------
-    icd
-        The definition.
-    prefix
-        Beginning of every declared name.
-    scope
-        Names that the rest of the code uses; those of the rows are claimed in it.
-    """
+    """Writes the C code of the rows of a definition; every declared name begins with `prefix`, and is claimed in `scope`."""
 
     def __init__(self, icd: InterfaceDefinition, prefix: str, scope: Scope) -> None:
         self._prefix = prefix
@@ -179,9 +169,7 @@ def _check(row: Row, field: Field) -> str:
 
 
 def _check_float(row: Row, field: Field, value: str) -> str:
-    low, high = field.physical_limits
-    if field.type == "f32":
-        low, high = min(low, to_f32(low)), max(high, to_f32(high))
+    low, high = representable(*field.physical_limits, field.type)
     if row.kind == "telemetry":  # which may carry what is no number
         tests = [f"{value} < {low!r}"] * (field.minimum is not None)
         return " || ".join(tests + [f"{value} > {high!r}"] * (field.maximum is not None))

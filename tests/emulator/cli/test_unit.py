@@ -18,7 +18,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import bundled_units
+from starhil.protocol.names import bundled_units
 
 
 def unit(*words: str):

@@ -148,6 +148,23 @@ def test_a_covered_lens_is_flagged_within_three_frames_and_the_attitude_recovers
     wait_for_text(page, "#active", "no fault")
 
 
+def test_in_error_mode_no_attitude_is_shown_and_the_last_image_has_its_age(page):
+    track(page)
+    page.wait_for_function("() => starhil.sky.painted > 0")
+    page.evaluate("starhil.link.control({ do: 'fault', device: { error: 'sensor' } })")
+    wait_for_text(page, "#mode", "error: sensor")
+    wait_for_text(page, "#validity", "no images")
+    wait_for_text(page, "#error-label", "last valid")
+    assert {page.locator(f"#{name}").text_content() for name in ("ra", "dec", "roll")} == {"–"}
+    page.wait_for_function(
+        "() => /^image of [1-9][0-9]* s ago$/.test(document.getElementById('when').textContent)"
+    )
+    stage = page.locator(".stage").evaluate("element => getComputedStyle(element).filter")
+    assert stage == "grayscale(1)"
+    page.wait_for_function("() => starhil.charts.to > starhil.store.now + 1")  # the plots go on
+    assert send(page, "set_mode", mode="standby").startswith("accepted in ")
+
+
 def test_a_wrong_parameter_shows_the_refusal(page):
     assert send(page, "set_update_rate", rate=500) == "refused: invalid_parameter"
     problem = page.locator("#telecommand-form .problem").text_content()

@@ -4,9 +4,9 @@ import pytest
 
 from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from tests.protocol.composed_links import CUBESPACE
 
 ICD = load_unit()

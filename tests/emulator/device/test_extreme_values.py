@@ -16,7 +16,7 @@ from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import LINK_PARAMETERS, Profile, load_profile
 from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import bundled_units
+from starhil.protocol.names import bundled_units
 from starhil.protocol.values import MessageError
 from starid.errors import StaridError
 from tests.emulator.conftest import ORION

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from starhil.emulator.profile import Profile
-from starhil.protocol.unit_folders import bundled_units
+from starhil.protocol.names import bundled_units
 
 HOT = {
     "thermal": {

@@ -22,7 +22,8 @@ from starhil.emulator.links.canopen import (
     rows_reporting,
 )
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import FileStorage, NmtState, ParameterStorage
+from starhil.protocol.canopen.context import NmtState
+from starhil.protocol.canopen.storage import FileStorage, ParameterStorage
 from starhil.protocol.icd import load_unit
 from starhil.protocol.transports.base import Transport
 

@@ -13,7 +13,7 @@ from starhil.emulator.links.serial import JUNK_BYTES, SerialDamage, SerialLink
 from starhil.emulator.links.wire_faults import WireFault, WireFaults
 from starhil.emulator.pipeline.messages import ImageRequest, ImageResult
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import ParameterStorage, StorageError
+from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import Request
 from starhil.protocol.serial_stack import build_serial_stack

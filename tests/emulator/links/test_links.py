@@ -19,8 +19,8 @@ from starhil.protocol.can_framing import (
     MessageType,
     encode_request_frames,
 )
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.messages import ErrorCode, LinkFault, Reply, ReplyKind, Request
-from starhil.protocol.serial_interface import Dialect
 from tests.emulator.wire import Wire
 from tests.process.reference import bodies_in
 from tests.protocol.composed_links import CUBESPACE, CUBESTAR

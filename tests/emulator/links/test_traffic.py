@@ -6,9 +6,9 @@ import pytest
 
 from starhil.emulator.links.traffic import CONSOLE_ADDRESS, MAX_ADDRESSES, Decoder, Traffic, WireItem, short
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, ReplyKind, Request, RequestKind
-from starhil.protocol.serial_interface import Dialect
 from tests.protocol.composed_links import CUBESPACE
 
 ICD = load_unit()

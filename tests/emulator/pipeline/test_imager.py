@@ -7,7 +7,14 @@ import pytest
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.pipeline.imager import WorkerImager
-from starhil.emulator.pipeline.messages import Failure, FrameResult, ImageRequest, PipelineReady, with_length
+from starhil.emulator.pipeline.messages import (
+    Failure,
+    FrameResult,
+    ImageRequest,
+    PipelineEnded,
+    PipelineReady,
+    with_length,
+)
 from starhil.emulator.pipeline.worker_process import WorkerThread
 from starhil.emulator.pipeline_setup import pipeline_setup
 from starhil.emulator.profile import Profile
@@ -93,7 +100,7 @@ def test_a_pipeline_that_ends_fails_pending_requests_and_can_be_restarted(make_i
         while not losses:
             await asyncio.sleep(0.01)
         imager.submit(REQUEST, answers.append)
-        assert [type(answer) for answer in answers] == [Failure, Failure]
+        assert [type(answer) for answer in answers] == [PipelineEnded, PipelineEnded]
         await imager.restart()
         imager.submit(REQUEST, answers.append)
         await imager.settle()
@@ -116,7 +123,7 @@ def test_requests_fail_in_their_order_before_the_death_of_the_worker_is_noticed(
 
     silent = f"{WORKER}send(PipelineReady({CAMERA}, 5, 0.0))\nreceive()\nreceive()\n"
     run(lambda: WorkerImager(SETUP, worker(silent)), scenario)
-    assert answers == [("first", Failure), ("second", Failure)]
+    assert answers == [("first", PipelineEnded), ("second", PipelineEnded)]
 
 
 def test_a_failure_handler_that_fails_keeps_no_request_pending(make_imager, caplog):

@@ -9,7 +9,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import NackError
-from starhil.protocol.unit_folders import UNITS_FOLDER
+from starhil.protocol.names import UNITS_FOLDER
 from tests.emulator.units.clients import Emulated, arcseconds_between, true_matrix, with_unit
 
 NODE = 0x2C

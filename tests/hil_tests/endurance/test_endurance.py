@@ -23,7 +23,7 @@ from starhil.hil_tests.endurance.shrink import kind_of, shortened
 from starhil.hil_tests.endurance.truth import Error, Motion
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import bundled_units
+from starhil.protocol.names import bundled_units
 
 LIVES, STEPS = 4, 150
 READ_MODE = {"do": "request", "link": "serial", "row": ["", 160, "telemetry"]}

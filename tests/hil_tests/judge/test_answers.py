@@ -12,7 +12,7 @@ from starhil.hil_tests.judge.definition import read_unit
 from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.unit_folders import bundled_units
+from starhil.protocol.names import bundled_units
 
 CUBESTAR = read_unit("cubestar")
 PACKET = bytes(range(22))

@@ -8,7 +8,8 @@ import canopen
 import pytest
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 
 NODE = 0x2C

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.canopen import (
-    AbortCode,
-    DeviceDictionary,
-    SdoAbortError,
-    build_dictionary,
-    check_status,
-)
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.application import check_status
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError

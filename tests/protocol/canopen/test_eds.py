@@ -14,7 +14,8 @@ import dcf
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
-from starhil.protocol.canopen import build_dictionary, build_eds
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.canopen import AbortCode, ErrorRegister
+from starhil.protocol.canopen.abort import AbortCode
+from starhil.protocol.canopen.emergency import ErrorRegister
 
 CODE = 0xFF01
 

@@ -12,7 +12,7 @@ import canopen
 import pytest
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import build_eds
+from starhil.protocol.canopen.eds import build_eds
 
 FRAME = bytes(number * 7 & 0xFF for number in range(937 * 937))
 PATIENCE_S = 20.0

@@ -6,7 +6,8 @@ from unittest.mock import Mock
 
 import pytest
 
-from starhil.protocol.canopen import NmtState, ParameterStorage, StorageError
+from starhil.protocol.canopen.context import NmtState
+from starhil.protocol.canopen.storage import ParameterStorage, StorageError
 
 VENDOR, PRODUCT, REVISION, SERIAL = 0, 0x53544152, 0x10000, 1
 IDENTITY = (VENDOR, PRODUCT, REVISION, SERIAL)

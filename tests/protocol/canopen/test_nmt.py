@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.canopen import CanopenSlave, NmtState, build_dictionary
+from starhil.protocol.canopen.context import NmtState
+from starhil.protocol.canopen.device_dictionary import build_dictionary
+from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
 

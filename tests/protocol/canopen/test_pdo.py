@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.protocol.canopen import AbortCode, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 
 OFF = 0x8000_0000
 NO_RTR = 0x4000_0000

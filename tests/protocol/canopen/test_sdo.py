@@ -8,7 +8,8 @@ from unittest.mock import Mock
 import canopen
 import pytest
 
-from starhil.protocol.canopen import AbortCode, Deferred, SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.dictionary import Deferred
 
 ATTITUDE = "00 20 a0"  # 2000h:160, precise_attitude as a whole
 SERIAL_DIALECT = "20 60 24"  # 6020h:36

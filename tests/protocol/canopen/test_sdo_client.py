@@ -5,13 +5,10 @@ from __future__ import annotations
 import pytest
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import (
-    AbortCode,
-    CanopenSlave,
-    SdoAbortError,
-    build_dictionary,
-)
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.sdo_client import download, requests_of, row_transfer
+from starhil.protocol.canopen.slave import CanopenSlave
 from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError
 from tests.protocol.canopen.stand_in import StandInApplication

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.canopen import AbortCode, NmtState
+from starhil.protocol.canopen.abort import AbortCode
+from starhil.protocol.canopen.context import NmtState
 
 IMAGE = bytes(number * 31 & 0xFF for number in range(100))
 IMAGE_MUX = "406001"

@@ -8,7 +8,7 @@ import pytest
 
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_folders import bundled_units
+from starhil.protocol.names import bundled_units
 from tests.protocol.canopen.conftest import NODE, Bench
 from tests.protocol.test_fuzz import INPUTS, SEED
 

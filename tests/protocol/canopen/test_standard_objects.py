@@ -5,7 +5,9 @@ from __future__ import annotations
 import canopen
 import pytest
 
-from starhil.protocol.canopen import AbortCode, DeviceDictionary, build_dictionary, build_eds
+from starhil.protocol.canopen.abort import AbortCode
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError

@@ -12,7 +12,8 @@ from unittest.mock import Mock
 
 import pytest
 
-from starhil.protocol.canopen import AbortCode, FileStorage, ParameterStorage, SdoAbortError, StorageError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
+from starhil.protocol.canopen.storage import FileStorage, ParameterStorage, StorageError
 
 SAVE = b"save"
 LOAD = b"load"
@@ -221,7 +222,7 @@ def test_a_failed_save_keeps_the_old_file(tmp_path, monkeypatch):
 WRITER = """
 import sys
 from pathlib import Path
-from starhil.protocol.canopen import FileStorage
+from starhil.protocol.canopen.storage import FileStorage
 storage = FileStorage(Path(sys.argv[1]))
 number = 0
 while True:
