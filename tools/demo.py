@@ -6,7 +6,6 @@ Prints a table of attitude errors and writes images; the exit status is 0 only i
 from __future__ import annotations
 
 import argparse
-import csv
 import subprocess
 import sys
 import time
@@ -22,6 +21,7 @@ from rich.table import Table
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.load_figures import percentile
+from starid.arrays import Array
 from starid.attitude import Attitude
 
 CROSS_LIMIT_ARCSEC = 60.0
@@ -36,50 +36,39 @@ SESSIONS = {"serial": "demo_serial", "can": "demo_can"}
 class Comparison:
     """Errors of the measured attitude in one session; arrays have one entry per frame."""
 
-    time_s: np.ndarray[Any, np.dtype[np.float64]]
-    cross_arcsec: np.ndarray[Any, np.dtype[np.float64]]
-    roll_arcsec: np.ndarray[Any, np.dtype[np.float64]]
-    rate_deg_s: np.ndarray[Any, np.dtype[np.float64]]
-    reply_ms: np.ndarray[Any, np.dtype[np.float64]]
-    latency_ms: np.ndarray[Any, np.dtype[np.float64]]
+    cross_arcsec: Array
+    roll_arcsec: Array
+    rate_deg_s: Array
+    reply_ms: Array
+    latency_ms: Array
     invalid: int
 
 
-def read_csv(path: Path) -> list[dict[str, str]]:
-    """Read the rows of a CSV file by column name."""
-    with path.open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
+def read_csv(path: Path) -> np.ndarray[Any, Any]:
+    """Read the rows of a CSV file, whose fields are its columns."""
+    rows = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8", comments=None)
+    return np.atleast_1d(rows)
 
 
-def compare(samples: list[dict[str, str]], truth: list[dict[str, str]]) -> Comparison:
+def compare(samples: np.ndarray[Any, Any], truth: np.ndarray[Any, Any]) -> Comparison:
     """Compare the samples of the OBC with the emulator's truth log, frame by frame."""
-    by_frame = {int(row["frame"]): row for row in truth}
-    rows: dict[int, tuple[float, ...]] = {}
-    invalid = 0
-    for sample in samples:
-        if sample["valid"] not in ("True", "true", "1"):
-            invalid += 1
-            continue
-        frame = int(sample["frame_counter"])
-        true_row = by_frame[frame]
-        measured = Attitude.from_quaternion([float(sample[f"q_{axis}"]) for axis in "xyzw"])
-        error = measured.error_to(
-            Attitude.from_quaternion([float(true_row[f"true_q{axis}"]) for axis in "xyzw"])
+    valid = samples[samples["valid"] == 1]
+    seen = valid[np.unique(valid["frame_counter"], return_index=True)[1]]
+    true = truth[np.searchsorted(truth["frame"], seen["frame_counter"])]
+    errors = [
+        Attitude.from_quaternion([measured[f"q_{axis}"] for axis in "xyzw"]).error_to(
+            Attitude.from_quaternion([row[f"true_q{axis}"] for axis in "xyzw"])
         )
-        rate = float(np.linalg.norm([float(sample[f"rate_{axis}"]) for axis in "xyz"]))
-        rows.setdefault(
-            frame,
-            (
-                float(sample["time_of_exposure"]),
-                error.cross_boresight_arcsec,
-                error.roll_arcsec,
-                rate,
-                float(sample["latency_ms"]),
-                float(sample["latency"]),
-            ),
-        )
-    columns = np.array(list(rows.values()), float).reshape(-1, 6).T
-    return Comparison(*columns, invalid=invalid)
+        for measured, row in zip(seen, true, strict=True)
+    ]
+    return Comparison(
+        np.array([error.cross_boresight_arcsec for error in errors]),
+        np.array([error.roll_arcsec for error in errors]),
+        np.linalg.norm([seen[f"rate_{axis}"] for axis in "xyz"], axis=0),
+        seen["latency_ms"],
+        seen["latency"],
+        len(samples) - len(valid),
+    )
 
 
 def run_session(link: str, channel: str, out: Path, truth_log: Path) -> bool:
@@ -95,7 +84,7 @@ def run_session(link: str, channel: str, out: Path, truth_log: Path) -> bool:
 def within_limits(found: Comparison) -> bool:
     """Whether every sample of a session was valid and within the error limits."""
     return (
-        len(found.time_s) > 0
+        len(found.cross_arcsec) > 0
         and found.invalid == 0
         and bool(found.cross_arcsec.max() <= CROSS_LIMIT_ARCSEC)
         and bool(found.roll_arcsec.max() <= ROLL_LIMIT_ARCSEC)
@@ -110,7 +99,7 @@ def report(comparisons: dict[str, Comparison], console: Console) -> bool:
         title="Errors of the attitude of the ideal sensor, as read by the OBC",
     )
     figures: dict[str, Callable[[Comparison], str]] = {
-        "frames": lambda found: str(len(found.time_s)),
+        "frames": lambda found: str(len(found.cross_arcsec)),
         "samples without a valid attitude": lambda found: str(found.invalid),
         "body rate, median, deg/s": lambda found: f"{np.median(found.rate_deg_s):.3f}",
         "boresight error, median, arcsec": lambda found: f"{np.median(found.cross_arcsec):.2f}",

@@ -79,7 +79,7 @@ from starhil.hil_tests.conformance.pdo_setup import (
     set_up,
     writable,
 )
-from starhil.hil_tests.judge.canopen import multiplexer
+from starhil.hil_tests.judge.canopen import HEARTBEAT, SDO_REQUEST, SDO_RESPONSE, multiplexer
 
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""
@@ -88,7 +88,7 @@ SHOWN_STEPS: Final = 4
 """Number of steps before a failed one in its message."""
 IDENTITY: Final = ("vendor", "product", "revision", "serial")
 """Parts of 1018h, from sub-index 1 on."""
-COB_IDS: Final = {"request": 0x600, "response": 0x580, "heartbeat": 0x700}
+COB_IDS: Final = {"request": SDO_REQUEST, "response": SDO_RESPONSE, "heartbeat": HEARTBEAT}
 """CAN IDs to which the node ID is added."""
 
 Ask = Callable[[bytes, float], bytes | None]
@@ -179,7 +179,7 @@ def sdo(probe: CanopenProbe) -> Ask:
     """Return how requests are sent to the SDO server."""
 
     def ask(data: bytes, timeout_s: float) -> bytes | None:
-        return probe.ask(data, timeout_s) if data else probe.wait_for(0x580 + probe.node, timeout_s)
+        return probe.ask(data, timeout_s) if data else probe.wait_for(SDO_RESPONSE + probe.node, timeout_s)
 
     return ask
 
@@ -251,7 +251,7 @@ class _Master:
         self._probe.expect_silence(int(can_id, 16), f"frame with CAN ID 0x{can_id}", float(for_s))
 
     def guard(self, wanted: str = "") -> None:
-        can_id = 0x700 + self._probe.node
+        can_id = HEARTBEAT + self._probe.node
         self._probe.send(can_id, remote=True)
         if wanted:
             seen = self._probe.expect(can_id, "answer to node guarding").hex()

@@ -15,7 +15,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseSkipped, check, check_equal
-from starhil.hil_tests.judge.canopen import multiplexer
+from starhil.hil_tests.judge.canopen import SYNC, multiplexer
 
 EMCY: Final = CaseArea[CanopenProbe]("canopen.emcy", "CiA 301 7.5.2.3", intrusive=True)
 
@@ -51,7 +51,7 @@ class ProvokedError:
     def cause(self) -> None:
         """Cause the error; with a watched node it occurs 50 ms later."""
         if self._by_sync:
-            self._probe.send(0x080, b"\x01")
+            self._probe.send(SYNC, b"\x01")
         else:
             self._probe.send_watched_heartbeat()
 
@@ -63,7 +63,7 @@ class ProvokedError:
     def clear(self) -> None:
         """Clear the error."""
         if self._by_sync:
-            self._probe.send(0x080)
+            self._probe.send(SYNC)
         else:
             self._probe.send_watched_heartbeat()
 

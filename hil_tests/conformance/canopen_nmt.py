@@ -16,6 +16,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, check, check_equal
+from starhil.hil_tests.judge import canopen
 
 NMT: Final = CaseArea[CanopenProbe]("canopen.nmt", "CiA 301 7.3.2.2", intrusive=True)
 ERROR_CONTROL: Final = CaseArea[CanopenProbe]("canopen.error-control", "CiA 301 7.2.8.3.2", intrusive=True)
@@ -111,7 +112,7 @@ add_dialogues(ERROR_CONTROL, ERROR_CONTROL_DIALOGUES)
 @NMT.case("boot-up-once", "one boot-up message per reset", "CiA 301 7.2.8.3.3")
 def boot_up_once(probe: CanopenProbe) -> None:
     probe.reset_communication()
-    data = probe.wait_for(0x700 + probe.node, 0.2, lambda data: data == b"\0")
+    data = probe.wait_for(canopen.HEARTBEAT + probe.node, 0.2, lambda data: data == b"\0")
     check(data is None, "one boot-up message", "two")
 
 
@@ -119,7 +120,7 @@ def boot_up_once(probe: CanopenProbe) -> None:
 def heartbeat(probe: CanopenProbe) -> None:
     probe.set(0x1017, 0, 100, 2)
     probe.drain()
-    found = probe.count(0x700 + probe.node, 0.75)
+    found = probe.count(canopen.HEARTBEAT + probe.node, 0.75)
     check(len(found) >= 6, "six heartbeats in 0.75 s", len(found))
     check(all(data == b"\x7f" for _, data in found), "heartbeats 7f", [data.hex() for _, data in found])
     mean = (found[5][0] - found[0][0]) / 5
@@ -190,13 +191,13 @@ def sync_length(probe: CanopenProbe) -> None:
     emergency = probe.emergency_id()
     probe.quiet()
     probe.drain()
-    probe.send(0x080, b"\x01")
+    probe.send(canopen.SYNC, b"\x01")
     probe.expect_emergency(emergency, 0x8240)
-    probe.send(0x080)
+    probe.send(canopen.SYNC)
     probe.expect_emergency(emergency, 0)
     if 0x1019 in probe.od:
         probe.set(0x1019, 0, 10, 1)
-        probe.send(0x080)
+        probe.send(canopen.SYNC)
         probe.expect_emergency(emergency, 0x8240)
 
 
@@ -212,10 +213,10 @@ def sync_producer(probe: CanopenProbe) -> None:
     if code:
         check_equal(code, Abort.VALUE, "abort")
         return
-    found = probe.count(0x080, 0.15)
+    found = probe.count(canopen.SYNC, 0.15)
     check(5 <= len(found) <= 8, "SYNC every 20 ms", f"{len(found)} in 150 ms")
     if 0x1019 in probe.od:
         check_equal([data[0] for _, data in found[:5]], [1, 2, 3, 1, 2], "counters")
     probe.expect_refusal(0x1005, 0, NO_RTR | 0x81, 4, Abort.VALUE)
     probe.command_and_settle(STOP)
-    probe.expect_silence(0x080, "SYNC in STOPPED")
+    probe.expect_silence(canopen.SYNC, "SYNC in STOPPED")

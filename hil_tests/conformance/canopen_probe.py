@@ -14,7 +14,13 @@ from starhil.hil_tests.conformance.case import CaseFailed, CaseSkipped, check_eq
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge.canopen import (
     ABORT,
+    EMERGENCY,
     EXPEDITED,
+    HEARTBEAT,
+    NMT,
+    SDO_REQUEST,
+    SDO_RESPONSE,
+    SDO_SIZE,
     AbortedError,
     BadResponseError,
     Entry,
@@ -27,9 +33,6 @@ from starhil.hil_tests.raw_traffic import format_frame
 
 T = TypeVar("T")
 
-NMT: Final = 0x000
-SYNC: Final = 0x080
-TIME: Final = 0x100
 LSS_FROM_SLAVE: Final = 0x7E4
 LSS_TO_SLAVE: Final = 0x7E5
 
@@ -135,7 +138,7 @@ class CanopenProbe:
         if booting:
             self.drain()
             self.command(RESET_COMMUNICATION)
-        mine = {base + self.node for base in (0x080, 0x580, 0x700)}
+        mine = {base + self.node for base in (EMERGENCY, SDO_RESPONSE, HEARTBEAT)}
         for _ in range(3):
             self.send_request(upload_request(0x1000, 0))
             if self.wait_for(mine, max(ANSWER_S, BOOT_S / 3) if booting else ANSWER_S) is not None:
@@ -262,13 +265,13 @@ class CanopenProbe:
         """Send an SDO request, padded to 8 bytes; return the answer, or None."""
         data = bytes.fromhex(request) if isinstance(request, str) else request
         self.send_request(data)
-        return self.wait_for(0x580 + self.node, timeout_s)
+        return self.wait_for(SDO_RESPONSE + self.node, timeout_s)
 
     def send_request(self, data: bytes) -> None:
         """Send an SDO request, padded to 8 bytes."""
         if data[0] >> 5 in {1, 2} or data[0] & 0xE3 == 0xA0 or data[0] & 0xE1 == 0xC0:
             self._multiplexer = data[1:4]
-        self.send(0x600 + self.node, data.ljust(8, b"\0"))
+        self.send(SDO_REQUEST + self.node, data.ljust(SDO_SIZE, b"\0"))
 
     def abandon_transfer(self) -> None:
         """Abort the last transfer, so that it does not continue into the next case."""
@@ -352,11 +355,11 @@ class CanopenProbe:
         """Return the state in the next heartbeat, after frames in transit have arrived."""
         self.wait_for(NOBODY, SETTLING_S)
         self.drain()
-        return self.expect(0x700 + self.node, "heartbeat", 1.0)[0]
+        return self.expect(HEARTBEAT + self.node, "heartbeat", 1.0)[0]
 
     def send_watched_heartbeat(self) -> None:
         """Send a heartbeat of the watched node, in OPERATIONAL."""
-        self.send(0x700 + WATCHED_NODE, b"\x05")
+        self.send(HEARTBEAT + WATCHED_NODE, b"\x05")
 
     def reset_communication(self) -> None:
         """Reset the communication to its stored values and wait for the boot-up message."""
@@ -371,14 +374,14 @@ class CanopenProbe:
         """
         self.abandon_transfer()
         self.command(RESET_COMMUNICATION)
-        if self.wait_for(0x700 + self.node, 3.0 if self._boots else 0.1, _is_boot_up) is None:
+        if self.wait_for(HEARTBEAT + self.node, 3.0 if self._boots else 0.1, _is_boot_up) is None:
             self._boots = False
             self.command(PRE_OPERATIONAL)
         self.drain()
 
     def expect_boot_up(self) -> None:
         """Fail unless the boot-up message arrives; heartbeats in transit are ignored."""
-        self.expect(0x700 + self.node, "boot-up message 00", 5.0, _is_boot_up)
+        self.expect(HEARTBEAT + self.node, "boot-up message 00", 5.0, _is_boot_up)
 
     def quiet(self) -> None:
         """Switch off the heartbeat and all PDOs, so that only the case causes traffic."""

@@ -17,7 +17,7 @@ from starhil.hil_tests.conformance.canopen_dialogue import (
 )
 from starhil.hil_tests.conformance.canopen_probe import Abort, CanopenProbe, check_abort, is_integer, size_of
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
-from starhil.hil_tests.judge.canopen import multiplexer, upload_request
+from starhil.hil_tests.judge.canopen import SDO_RESPONSE, multiplexer, upload_request
 
 SDO: Final = CaseArea[CanopenProbe]("canopen.sdo", "CiA 301 7.2.4.3.17")
 SDO_BLOCK: Final = CaseArea[CanopenProbe]("canopen.sdo-block", "CiA 301 7.2.4.3.17")
@@ -168,7 +168,7 @@ def _segments(probe: CanopenProbe, request: bytes, block: int) -> list[bytes]:
     probe.send_request(request)
     found: list[bytes] = []
     while len(found) < block:
-        frame = probe.expect(0x580 + probe.node, f"segment {len(found) + 1} of the block")
+        frame = probe.expect(SDO_RESPONSE + probe.node, f"segment {len(found) + 1} of the block")
         check_equal(frame[0] & 0x7F, len(found) + 1, "segment number")
         found.append(frame)
         if frame[0] & 0x80:
@@ -191,7 +191,7 @@ def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: boo
         if found[-1][0] & 0x80:
             break
     probe.send_request(request)
-    end = probe.expect(0x580 + probe.node, "end of the block upload")
+    end = probe.expect(SDO_RESPONSE + probe.node, "end of the block upload")
     check(end[0] & 0xE3 == 0xC1, "end C1h to DDh", end)
     unused = end[0] >> 2 & 7
     data = data[: len(data) - unused]
@@ -200,7 +200,7 @@ def upload_blocks(probe: CanopenProbe, item: ODVariable, block: int, *, crc: boo
     if with_crc:
         check_equal(int.from_bytes(end[1:3], "little"), crc_hqx(data, 0), "CRC")
     probe.send_request(b"\xa1")
-    probe.expect_silence(0x580 + probe.node, "answer to the end of an upload", 0.05)
+    probe.expect_silence(SDO_RESPONSE + probe.node, "answer to the end of an upload", 0.05)
     return data
 
 

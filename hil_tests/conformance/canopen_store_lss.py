@@ -16,6 +16,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     CanopenProbe,
 )
 from starhil.hil_tests.conformance.case import CaseArea, CaseFailed, CaseSkipped, check, check_equal
+from starhil.hil_tests.judge.canopen import HEARTBEAT, SDO_REQUEST
 
 STORE: Final = CaseArea[CanopenProbe]("canopen.store", "CiA 301 7.5.2.11", intrusive=True)
 LSS: Final = CaseArea[CanopenProbe]("canopen.lss", "CiA 305 states", intrusive=True)
@@ -152,7 +153,11 @@ def node_id(probe: CanopenProbe) -> None:
     try:
         probe.node = new
         probe.expect_boot_up()
-        check_equal(probe.number(0x1200, 1) if 0x1200 in probe.od else 0x600 + new, 0x600 + new, "1200h:01h")
+        check_equal(
+            probe.number(0x1200, 1) if 0x1200 in probe.od else SDO_REQUEST + new,
+            SDO_REQUEST + new,
+            "1200h:01h",
+        )
     finally:
         _select(probe)
         _lss(probe, bytes([0x11, old]))
@@ -211,7 +216,7 @@ def fastscan(probe: CanopenProbe) -> None:
     probe.command(RESET_COMMUNICATION)
     try:
         probe.drain()
-        check(probe.wait_for(0x700 + old, 0.2) is None, "no boot-up message without a node ID", "one")
+        check(probe.wait_for(HEARTBEAT + old, 0.2) is None, "no boot-up message without a node ID", "one")
         check_equal(_lss(probe, "4c"), b"\x50" + bytes(7), "answer to identify non-configured")
         found = _scan(probe)
         check_equal(found, identity, "identity")

@@ -18,6 +18,7 @@ from starhil.hil_tests.conformance.canopen_probe import (
     size_of,
 )
 from starhil.hil_tests.conformance.case import CaseSkipped
+from starhil.hil_tests.judge.canopen import SYNC
 
 RPDO: Final = 0x1400
 TPDO: Final = 0x1800
@@ -123,4 +124,4 @@ def pdo_id(index: int, node: int) -> int:
 
 def send_sync(probe: CanopenProbe, counter: int | None = None) -> None:
     """Send a SYNC, with a counter if one is given."""
-    probe.send(0x080, b"" if counter is None else bytes([counter]))
+    probe.send(SYNC, b"" if counter is None else bytes([counter]))

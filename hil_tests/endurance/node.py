@@ -22,8 +22,6 @@ from starhil.protocol.codec import Field
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import Value
 
-EMERGENCY: Final = 0x080
-HEARTBEAT: Final = 0x700
 DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes of the error mode (docs/canopen.md)."""
 STATES: Final = frozenset({0x00, 0x04, 0x05, 0x7F})
@@ -85,9 +83,11 @@ class Node:
         if entries is not None:
             self._keep(frame, entries)
             return 1
-        if frame.id == EMERGENCY + node and len(frame.data) == 8:
+        if frame.id == canopen.EMERGENCY + node and len(frame.data) == 8:
             self._judge_emergency(int.from_bytes(frame.data[:2], "little"), oracle)
-        elif frame.id != HEARTBEAT + node or len(frame.data) != 1 or frame.data[0] & 0x7F not in STATES:
+        elif (
+            frame.id != canopen.HEARTBEAT + node or len(frame.data) != 1 or frame.data[0] & 0x7F not in STATES
+        ):
             raise Violation(
                 f"canopen: a frame {frame.id:03X}h {frame.data.hex()} that the unit does not define"
             )
@@ -122,15 +122,9 @@ class Node:
 
 def _mapped(icd: InterfaceDefinition, unit: Unit) -> Mapping[str, _Mapped]:
     """Return the entries that carry a field, by their names in the mapping of a definition: `INDEX.NAME` or `INDEX`."""
-    sources = {
-        f"{placed.index:04x}.{packed.name or packed.source.partition('.')[2]}": packed
-        for placed in unit.canopen.object
-        for packed in placed.packed
-    }
     found: dict[str, _Mapped] = {}
     for entry in canopen.entries(unit, unit.canopen):
-        packed = sources.get(entry.name)
-        if packed is not None:
+        if (packed := entry.packed) is not None:
             row_name, _, name = packed.source.partition(".")
         elif entry.row is not None and entry.slot is not None:
             row_name, name = entry.row.name, entry.slot.name

@@ -325,32 +325,32 @@ class Obc:
             await self._request(link, row, content)
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
-        """Send the first part of a request, as a client that goes away, and let another client come."""
+        """Send the first part of a request, as a client that goes away, which a bus must not see answered."""
         if link in self._oracle.disturbed:
             return
         known = self._icd.rows_by_key[row[0], row[1]]
         content = bytes(known.size) if known.kind == "telecommand" else b""
         self._ports[link].cut(Request(known.id, content, known.klass, known.kind == "telemetry"), share)
+        if link != "serial":
+            await self.pass_time(TIME_OUT_S)
+            return
         if self._fixed_framing:  # any bytes are a request
             self._oracle.forget()
         await self.settle(link)
 
     async def junk(self, link: str, data: str = "", frames: Sequence[tuple[int, str]] = ()) -> None:
-        """Send input that is not a request for this unit; nothing may answer."""
+        """Send input that is not a request for this unit; nothing may answer frames on a bus."""
         if link in self._oracle.disturbed:
             return
-        if link == "serial":
+        port = self._ports[link]
+        if isinstance(port, (CanPort, CanopenPort)):
+            for can_id, content in frames:
+                port.send_to_others(can_id, bytes.fromhex(content))
+            await self.pass_time(TIME_OUT_S)
+        else:
             self._unit.deliver(link, bytes.fromhex(data))
             self._oracle.forget()  # some framings find a request in any bytes
-        for can_id, content in frames:
-            if link == "canopen":  # an SDO of another node
-                other = 0x580 + (can_id & 0xFF)
-                if other != 0x600 + getattr(self._ports[link], "node", 0):
-                    self._unit.deliver(link, CanFrame(other, bytes.fromhex(content), extended=False))
-                continue
-            if can_id & 0xFF not in (0, getattr(self._ports[link], "device", 0)):
-                self._unit.deliver(link, CanFrame(can_id, bytes.fromhex(content)))
-        await self.settle(link)
+            await self.settle(link)
 
     async def set_state(self, link: str, command: int) -> None:
         """Send an NMT command to the node."""

@@ -81,6 +81,11 @@ class CanPort:
         for frame in frames[: int(share * len(frames))]:
             self._deliver(frame)
 
+    def send_to_others(self, can_id: int, data: bytes) -> None:
+        """Send a frame, unless it is for the unit or for all units."""
+        if can_id & 0xFF not in (0, self.device):
+            self._deliver(CanFrame(can_id, data))
+
     def answers(self) -> list[Heard]:
         """Return what has arrived; a frame of another source, or an answer to another OBC, is malformed."""
 
@@ -141,6 +146,12 @@ class CanopenPort:
 
     def cut(self, request: Request, share: float) -> None:
         """Send nothing: the next transfer of a client aborts an incomplete one."""
+
+    def send_to_others(self, can_id: int, data: bytes) -> None:
+        """Send an SDO request or response of another node, one of 256 by the CAN ID given."""
+        sdo = canopen.SDO_RESPONSE + (can_id & 0xFF)
+        if sdo != canopen.SDO_REQUEST + self.node:
+            self._deliver(CanFrame(sdo, data, extended=False))
 
     def _read(self, entry: canopen.Entry) -> bytes:
         data = canopen.upload(self._exchange, entry.index, entry.subindex)

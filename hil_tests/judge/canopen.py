@@ -139,6 +139,8 @@ class Entry:
         Telemetry row, and the slot that the entry reads.
     command, part
         Telecommand that a write executes, and the part of its data that is written; None: all of it.
+    packed
+        Model of an entry that has a field of `packed.source` in another type.
     """
 
     index: int
@@ -149,6 +151,7 @@ class Entry:
     slot: Field | None = None
     command: Row | None = None
     part: Field | None = None
+    packed: Any = None
 
     @property
     def mapping(self) -> int:
@@ -182,7 +185,7 @@ def entries(unit: Unit, layout: Any) -> Iterator[Entry]:
                 yield Entry(index, parameter.id, f"{at}.{parameter.name}", _bytes_of(parameter.type))
         for number, packed in enumerate(placed.packed, 1):
             name = packed.name or packed.source.partition(".")[2]
-            yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type))
+            yield Entry(index, number, f"{at}.{name}", _bytes_of(packed.type), packed=packed)
 
 
 def whole_row(index: int, subindex: int, row: Row) -> Entry:

@@ -152,7 +152,11 @@ class SerialLine:
             measure = (
                 partial(envelope.size, asked=asked) if echo is None else partial(_size_of_echo, len(echo))
             )
-            taken = framing.take(self.received, measure)
+            try:
+                taken = framing.take(self.received, measure)
+            except ValueError:
+                taken = Taken(bytes(self.received), junk=True)
+                self.received.clear()
             if taken is None:
                 break
             answer = self._answer(envelope, taken, asked, echo)

@@ -1,7 +1,7 @@
 """Framings of the serial line: where a message begins and ends.
 
 A framing writes a body (header, data, check) as bytes on the line, and takes the first message out of what was
-received. It takes only what the unit should send: anything else is returned as junk, to the last byte received.
+received. It takes only what the unit should send: anything else is junk, to the last byte received.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ class Framing(Protocol):
         """Return a body as bytes on the line."""
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:
-        """Remove the first message; return None if it is incomplete."""
+        """Remove the first message; return None if it is incomplete. Raises ValueError if the bytes are none."""
 
 
-def junk(received: bytearray) -> Taken:
-    """Take everything received as junk."""
-    taken = Taken(bytes(received), junk=True)
-    received.clear()
-    return taken
+def check_start(received: bytearray, start: bytes) -> None:
+    """Raise ValueError unless the bytes begin with a mark, as far as they go."""
+    begun = bytes(received[: len(start)])
+    if begun != start[: len(begun)]:
+        raise ValueError(f"begins with {begun.hex()}, not {start.hex()}")

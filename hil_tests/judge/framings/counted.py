@@ -9,7 +9,7 @@ Start and end may be empty. There is no escaping: the marks may occur in the bod
 
 from __future__ import annotations
 
-from starhil.hil_tests.judge.framings import Measure, Taken, junk
+from starhil.hil_tests.judge.framings import Measure, Taken, check_start
 
 
 class Counted:
@@ -25,17 +25,12 @@ class Counted:
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:
         """Remove a message that must begin at once."""
-        begun = bytes(received[: len(self.start)])
-        if begun != self.start[: len(begun)]:
-            return junk(received)
-        try:
-            size = measure(bytes(received[len(self.start) :]))
-        except ValueError:
-            return junk(received)
+        check_start(received, self.start)
+        size = measure(bytes(received[len(self.start) :]))
         if size is None or len(received) < len(self.start) + size + len(self.end):
             return None
         line = bytes(received[: len(self.start) + size + len(self.end)])
         if line[len(self.start) + size :] != self.end:
-            return junk(received)
+            raise ValueError(f"no end {self.end.hex()} after {size} bytes")
         del received[: len(line)]
         return Taken(line[len(self.start) : len(self.start) + size])

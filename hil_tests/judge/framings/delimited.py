@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from starhil.hil_tests.judge.framings import Measure, Taken, junk
+from starhil.hil_tests.judge.framings import Measure, Taken, check_start
 
 
 class Delimited:
@@ -26,9 +26,7 @@ class Delimited:
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:  # noqa: ARG002 -- the end is marked
         """Remove a message that must begin at once."""
-        begun = bytes(received[: len(self.start)])
-        if begun != self.start[: len(begun)]:
-            return junk(received)
+        check_start(received, self.start)
         end = received.find(self.end, len(self.start))
         if end < 0:
             return None

@@ -9,7 +9,7 @@ In CubeSpace's generation 2 the start byte names the kind of the message: 07, 0F
 
 from __future__ import annotations
 
-from starhil.hil_tests.judge.framings import Measure, Taken, junk
+from starhil.hil_tests.judge.framings import Measure, Taken
 
 
 class Escaped:
@@ -30,7 +30,7 @@ class Escaped:
     def take(self, received: bytearray, measure: Measure) -> Taken | None:  # noqa: ARG002 -- the end is marked
         """Remove a message that must begin at once."""
         if received[0] != self._escape or (len(received) > 1 and received[1] not in self._starts):
-            return junk(received)
+            raise ValueError(f"begins with {bytes(received[:2]).hex()}")
         body, position = bytearray(), 2
         while position < len(received):
             byte = received[position]
@@ -43,7 +43,7 @@ class Escaped:
                     del received[: position + 1]
                     return Taken(bytes(body), start)
                 if received[position] != self._escape:
-                    return junk(received)
+                    raise ValueError(f"{self._escape:02x} before {received[position]:02x}")
             body.append(byte)
             position += 1
         return None

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from starhil.hil_tests.judge.framings import Measure, Taken, junk
+from starhil.hil_tests.judge.framings import Measure, Taken, check_start
 
 
 class Stuffed:
@@ -32,15 +32,10 @@ class Stuffed:
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:
         """Remove a message that must begin at once; a byte of the range that is not stuffed makes it junk."""
-        begun = bytes(received[: len(self.start)])
-        if begun != self.start[: len(begun)]:
-            return junk(received)
+        check_start(received, self.start)
         body, position = bytearray(), len(self.start)
         while True:
-            try:
-                size = measure(bytes(body))
-            except ValueError:
-                return junk(received)
+            size = measure(bytes(body))
             if size is not None and len(body) >= size:
                 break
             pair = bytes(received[position : position + 2])
@@ -50,15 +45,14 @@ class Stuffed:
                 body.append(self._originals[pair])
                 position += 2
             elif pair[0] in self._pairs:
-                return junk(received)
+                raise ValueError(f"{pair[0]:02x} is not stuffed")
             else:
                 body.append(pair[0])
                 position += 1
         whole = position + len(self.end)
         if len(received) < whole:
             return None
-        ends_well = bytes(received[position:whole]) == self.end
-        if not ends_well:
-            return junk(received)
+        if bytes(received[position:whole]) != self.end:
+            raise ValueError(f"no end {self.end.hex()} after {size} bytes")
         del received[:whole]
         return Taken(bytes(body))

@@ -126,6 +126,34 @@ def test_what_an_unresponsive_unit_sends_is_a_violation(monkeypatch, speaks_at, 
     assert violation(monkeypatch, speak, STUCK, step).startswith(expected)
 
 
+LONG = max(ICD.telecommands.values(), key=lambda row: row.size)
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        {"do": "junk", "link": "can", "frames": [[4 << 24 | 128 << 16 | 0x0109, ""]]},
+        {"do": "cut", "link": "can", "row": ["", LONG.id, "telecommand"], "share": 0.5},
+    ],
+    ids=["of another unit", "incomplete"],
+)
+def test_an_answer_to_what_is_no_request_of_the_unit_is_a_violation(monkeypatch, step):
+    waiting = []
+    deliver = UnitUnderTest.deliver
+
+    def deliver_and_answer(unit, link, item):
+        deliver(unit, link, item)
+        waiting.append(frame(TELEMETRY, 128, bytes(8)))
+
+    def with_answers(frames):
+        answers = list(waiting)
+        waiting.clear()
+        return [*frames, *answers]
+
+    monkeypatch.setattr(UnitUnderTest, "deliver", deliver_and_answer)
+    assert violation(monkeypatch, with_answers, step).startswith("can: telemetry of 128, 8 bytes")
+
+
 VALID = next(row for row in ICD.telemetry.values() if any(f.value == "attitude.valid" for f in row.fields))
 
 
