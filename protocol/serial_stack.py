@@ -50,6 +50,8 @@ from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
 
 NO_PLUGIN: Final = Plugin()
+LINK_FORMAT: Final = FormatModel()
+"""The framing and check of the link itself."""
 
 
 class _Classes:
@@ -152,23 +154,24 @@ class SerialStack:
             raise IcdError(
                 f"{where}: framing cubespace has its own formats; it cannot be combined with others"
             )
-        for name in item.classes or ():
+        self._check_classes(item.classes, where)
+
+    def _check_classes(self, names: Sequence[str] | None, where: str) -> None:
+        for name in names or ():
             if name not in self.classes.by_name:
                 known = ", ".join(self.classes.by_name) or "none"
                 raise IcdError(f"{where}: no class named {name!r} (known: {known})")
 
     def _format(
-        self, name: str, models: Sequence[HeaderFieldModel], item: FormatModel | None = None
+        self, name: str, models: Sequence[HeaderFieldModel], item: FormatModel = LINK_FORMAT
     ) -> MessageFormat:
-        framing, check, classes = self.link.framing, self.link.check, list[str]()
-        if item is not None:
-            framing, check, classes = item.framing or framing, item.check or check, item.classes or []
+        framing, check = item.framing or self.link.framing, item.check or self.link.check
         frames = build_framing(framing, self._plugin.framings)
         checks = build_check(check, self.byte_order, self._plugin.checks)
         overhead = {"start": len(frames.start), "check": checks.size, "end": len(frames.end)}
         codes = self.classes.requests if name == "request_header" else self.classes.replies
         header = Header(models, self.byte_order, codes, overhead, f"link.serial.{name}")
-        return MessageFormat(frames, framing, checks, header, classes)
+        return MessageFormat(frames, framing, checks, header, item.classes or ())
 
     @property
     def framing(self) -> Framing:
@@ -203,31 +206,25 @@ class SerialStack:
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
-            for name in (name for item in header.fields for name in item.classes or ()):
-                if name not in self.classes.by_name:
-                    known = ", ".join(self.classes.by_name) or "none"
-                    raise IcdError(f"link.serial.{where}_header: no class named {name!r} (known: {known})")
+            for item in header.fields:
+                self._check_classes(item.classes, f"link.serial.{where}_header")
             formats = self.request_formats if where == "request" else self.reply_formats
             if any(form.model.kind == "length" for form in formats.all) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
         if self.request_header.counts:
             raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
-        texts = list(self.text_formats)
-        if self.texts.acknowledge is not None or self.texts.refusal is not None:
-            texts.append(self.replies)
-        for form in texts:
+        text_replies = [self.replies] if self.link.acknowledge or self.link.refusal else []
+        for form in (*self.text_formats, *text_replies):
             if form.model.kind in ("length", "fixed"):
                 raise IcdError(
                     f"link.serial: texts need a framing with an end, such as delimited, not {form.model.kind}"
                 )
         if "id" not in self.request_header.roles and len(self.text_formats) < len(self.request_formats.all):
             raise IcdError("link.serial.request_header: needs a field with role id")
-        for role in ("source", "destination"):
-            header, other = (
-                (self.reply_header, "reply") if role == "source" else (self.request_header, "request")
-            )
+        directions = ("source", "reply", self.reply_header), ("destination", "request", self.request_header)
+        for role, where, header in directions:
             if role in header.roles:
-                raise IcdError(f"link.serial.{other}_header: role {role} belongs to the other direction")
+                raise IcdError(f"link.serial.{where}_header: role {role} belongs to the other direction")
 
     def row(self, klass: str, row_id: int) -> Row | None:
         """Return the row of a message; the class matters only if the link carries one."""

@@ -86,9 +86,10 @@ def earth_and_sun(unix_s: float) -> tuple[Array, Array, Array]:
 
     Barycentric, ICRS, m and m/s (`erfa.epv00`).
     """
-    import erfa
+    from erfa import ufunc
 
-    heliocentric, barycentric = erfa.epv00(*terrestrial_time(unix_s))
+    # without the warning of `erfa.epv00` that the error grows outside 1900 to 2100: a device's clock may show any date
+    heliocentric, barycentric, _ = ufunc.epv00(*terrestrial_time(unix_s))
     position, velocity = in_metres(barycentric)
     return position, velocity, position - in_metres(heliocentric)[0]
 

@@ -57,7 +57,7 @@ class BusLink(ABC, Generic[Item]):
         self.transport: Final = transport
         self.heard: Final = Heard()
         """Requests of the OBC."""
-        self.wire: WireFaults[Item] = WireFaults(transport.send, damage, device.clock, device.scheduler, seed)
+        self.wire: WireFaults[Item] = WireFaults(self._transmit, damage, device.clock, device.scheduler, seed)
         """Outgoing side of the link, with its faults."""
         self._timer: Event | None = None
 
@@ -75,6 +75,10 @@ class BusLink(ABC, Generic[Item]):
     @abstractmethod
     def _receive(self, item: Item) -> None:
         """Process an item that has arrived."""
+
+    def _transmit(self, item: Item) -> None:
+        """Pass an item, after its faults, to the transport."""
+        self.transport.send(item)
 
     def _now(self) -> float:
         """Return the simulation time, seconds, which also applies to time-outs of messages."""

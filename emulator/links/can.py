@@ -100,20 +100,22 @@ class CanLink(DeviceLink[CanFrame, int]):
         return int(self._device.parameters["can_address"])
 
     def _send(self, reply: Reply, style: int) -> None:
-        frames = encode_reply_frames(reply, style)
-        if self._gap_s <= 0.0:
-            for frame in frames:
-                self.wire.send(frame)
-            return
-        self._waiting.extend(frames)
-        if self._next is None:
-            self._send_next()
+        for frame in encode_reply_frames(reply, style):
+            self.wire.send(frame)
 
-    def _send_next(self) -> None:
+    def _transmit(self, item: CanFrame) -> None:
+        if self._gap_s <= 0.0:
+            super()._transmit(item)
+            return
+        self._waiting.append(item)
+        if self._next is None:
+            self._transmit_next()
+
+    def _transmit_next(self) -> None:
         self._next = None
         if self._waiting:
-            self.wire.send(self._waiting.popleft())
-            self._next = self._loop.call_later(self._gap_s, self._send_next)
+            super()._transmit(self._waiting.popleft())
+            self._next = self._loop.call_later(self._gap_s, self._transmit_next)
 
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:

@@ -210,10 +210,10 @@ def _cubics_of(slot: int) -> Vector:
 
 def _series(first: float, rest: float) -> tuple[Vector, Vector]:
     """Barycentric places (9,) of Earth, Sun and Moon at a terrestrial time, m, and their motion in a slot's length."""
-    import erfa
+    from erfa import moon98, ufunc
 
-    heliocentric, barycentric = (in_metres(pv) for pv in erfa.epv00(first, rest))
-    moon = in_metres(erfa.moon98(first, rest))
+    heliocentric, barycentric = (in_metres(pv) for pv in ufunc.epv00(first, rest)[:2])
+    moon = in_metres(moon98(first, rest))
     place, velocity = (
         np.concatenate([earth, earth - about_sun, earth + about_earth])
         for earth, about_sun, about_earth in zip(barycentric, heliocentric, moon, strict=True)

@@ -18,7 +18,7 @@
     Position and velocity in GCRS (Earth-centred, axes of ICRS), metres and metres per second. Optional, but only
     together.
 ``unix_s``
-    Date, as Unix time. Optional; default: the date of the run.
+    Date from 1970 to 2100, as Unix time. Optional; default: the date of the run.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import MAX_RATE_DEG_S, Vector
 from starid.attitude import Attitude
+from starid.earth import LATEST_UNIX_S
 
 NORM_TOLERANCE: Final = 0.01
 """Largest error of the length of a quaternion that is attributed to rounding."""
@@ -99,7 +100,7 @@ class JsonFormat:
             checked_attitude("q", quaternion, self.convention),
             checked_rate("rate", None if rate is None else np.radians(rate)),
             None if position is None or velocity is None else OrbitState(position, velocity),
-            unix_s,
+            checked_date("unix_s", unix_s),
         )
 
     def answer(self, run_time_s: float, fault: str) -> bytes:
@@ -122,6 +123,13 @@ def checked_rate(key: str, rate_rad_s: Vector | None) -> Vector | None:
     if rate_rad_s is not None and not np.degrees(np.abs(rate_rad_s).max()) <= MAX_RATE_DEG_S * (1.0 + 1e-12):
         raise FeedError(f"{key} exceeds {MAX_RATE_DEG_S:g} degrees per second")
     return rate_rad_s
+
+
+def checked_date(key: str, unix_s: float | None) -> float | None:
+    """Return a date as Unix time; FeedError if the sky is not computed for it."""
+    if unix_s is not None and not 0.0 <= unix_s <= LATEST_UNIX_S:
+        raise FeedError(f"{key} is not a date from 1970 to 2100")
+    return unix_s
 
 
 def _optional(message: dict[str, Any], key: str, count: int) -> Vector | None:

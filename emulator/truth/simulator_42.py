@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from starhil.emulator.truth.feed_message import FeedMessage, checked_attitude, checked_rate
+from starhil.emulator.truth.feed_message import FeedMessage, checked_attitude, checked_date, checked_rate
 from starhil.emulator.truth.feed_rates import FeedError
 from starhil.emulator.truth.orbit import OrbitState
 from starhil.emulator.truth.source import Vector
@@ -79,7 +79,7 @@ class Format42:
             checked_attitude(f"{body}.qn", quaternion, "attitude"),
             checked_rate(f"{body}.wn", rate),
             None if position is None or velocity is None else OrbitState(position, velocity),
-            time_ns / 1e9,
+            checked_date("TIME", time_ns / 1e9),
         )
 
     def _orbit_is_missing(self, values: dict[str, str]) -> None:
@@ -93,7 +93,7 @@ class Format42:
                 "truth feed: 42 sends no orbit, so there is neither Earth nor aberration: %s", _PREFIXES
             )
 
-    def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)
+    def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 accepts one answer)
         """Return the answer expected by 42."""
         return ACKNOWLEDGE
 

@@ -116,6 +116,23 @@ def test_can_frames_and_canopen_are_repeated(record):
     assert report.sent["canopen"] >= 1
 
 
+def test_frames_that_are_sent_with_gaps_and_delays_are_repeated(record):
+    """The gap between two frames passes after the request, while other entries arrive."""
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(CanHostLink("virtual:gaps"), emulation.icd)
+        await client.start()
+        async with Control(emulation) as control:
+            for fault in ({"delay_s": 0.02}, {}):
+                await control.do("fault", can=fault)
+                for _ in range(5):
+                    await client.telemetry("precise_attitude")
+        await client.close()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": "virtual:gaps", "frame_gap_s": 0.003}}
+    assert report_of(record(scenario, clock="real", links=links)).differences == []
+
+
 def test_a_unit_without_dialects_is_repeated_at_its_own_bit_rate(record):
     async def scenario(emulation, _line):
         client = AsyncObcClient(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 
 import erfa
 import numpy as np
@@ -165,3 +166,11 @@ def test_a_tracker_corrects_aberration_from_frame_to_frame():
 def test_an_impossible_velocity_is_rejected(velocity):
     with pytest.raises(StaridError, match="observer_velocity"):
         Identifier().identify(np.zeros((0, 2)), np.zeros(0), observer_velocity=velocity)
+
+
+def test_the_velocity_of_the_earth_is_given_without_a_warning_at_any_date():
+    """A device's clock may show any date; the library warns outside 1900 to 2100."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        speeds = [np.linalg.norm(earth_velocity(unix_s)) for unix_s in (-3.0e9, 1.7e9, 5.0e9)]
+    assert speeds == pytest.approx([29.8e3] * 3, abs=600.0)

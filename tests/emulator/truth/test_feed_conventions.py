@@ -132,6 +132,12 @@ def test_an_invalid_mount_is_rejected(keys, said):
         MountConfig.model_validate(keys)
 
 
+@pytest.mark.parametrize("unix_s", [-1.0, 4.2e9, 1.0e14])
+def test_a_date_for_which_there_is_no_sky_is_rejected(unix_s):
+    with pytest.raises(FeedError, match="unix_s is not a date from 1970 to 2100"):
+        JsonFormat().decode(json.dumps({"q": [0.0, 0.0, 0.0, 1.0], "unix_s": unix_s}))
+
+
 @pytest.mark.parametrize("kind", ["fixed", "rate", "live", "42"])
 def test_every_kind_of_truth_takes_a_mount(kind):
     keys = {"rate_deg_s": [0.0, 0.0, 0.0]} if kind == "rate" else {}

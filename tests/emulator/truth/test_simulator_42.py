@@ -59,6 +59,7 @@ def test_time_counts_from_the_first_block_to_the_nanosecond_over_the_turn_of_a_y
     ("old", "new", "said"),
     [
         (b"TIME", b"TAME", "no line TIME"),
+        (b"TIME 20", b"TIME 21", "TIME is not a date from 1970 to 2100"),
         (b"[ENDMSG]", b"", r"without \[ENDMSG\]"),
         (b"qn = ", b"qm = ", r"no SC\[0\].qn; give 42 the prefixes"),
         (b"wn = ", b"wm = ", r"no SC\[0\].B\[0\].wn"),

@@ -194,7 +194,7 @@ def import_eds(text: str, node_id: int) -> canopen.ObjectDictionary:
 
 def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
     """Put the slave of a package (the original, or a mutant) on a simulated bus, with the tester at its other end."""
-    dictionary = package.build_dictionary(load_unit())
+    dictionary = package.device_dictionary.build_dictionary(load_unit())
 
     class RestlessApplication(StandInApplication):
         """Each look at the attitude finds a new one, so that values of two samples cannot be taken for one."""
@@ -208,8 +208,8 @@ def simulated_probe(package=starhil.protocol.canopen) -> CanopenProbe:
             return super().telemetry(row)
 
     dictionary.application = RestlessApplication(dictionary.icd, package)
-    slave = package.CanopenSlave(dictionary, NODE)
-    eds = package.build_eds(dictionary)
+    slave = package.slave.CanopenSlave(dictionary, NODE)
+    eds = package.eds.build_eds(dictionary)
     return CanopenProbe(SimulatedBus(slave), NODE, import_eds(eds, NODE), eds)
 
 

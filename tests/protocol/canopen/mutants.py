@@ -238,6 +238,9 @@ def load(mutant: Mutant | None) -> types.ModuleType:
     finder = _Finder(texts)
     sys.meta_path.insert(0, finder)
     try:
-        return importlib.import_module(ALIAS)
+        package = importlib.import_module(ALIAS)
+        for name in texts.keys() - {"__init__"}:
+            importlib.import_module(f"{ALIAS}.{name}")
+        return package
     finally:
         sys.meta_path.remove(finder)

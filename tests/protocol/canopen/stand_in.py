@@ -60,7 +60,8 @@ class StandInApplication:
     def image(self, name: str) -> GreyImage:
         """Return the preset image."""
         if name not in self.images:
-            raise self._package.SdoAbortError(self._package.AbortCode.NO_DATA, name)
+            abort = self._package.abort
+            raise abort.SdoAbortError(abort.AbortCode.NO_DATA, name)
         return self.images[name]
 
     def take_image(self, name: str) -> None:
