@@ -376,7 +376,7 @@ class Oracle:
     def _check_in_error(self, where: str, _field: Field, value: Value) -> None:
         possible = self.modes & {"error"} if value else self.modes - {"error"}
         if not possible:
-            raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
+            raise Violation(f"{where}: {value!r}, but only {', '.join(sorted(self.modes))} is possible")
         self.modes = possible
 
     def _expected(self, quantity: str, field: Field) -> tuple[float, float] | None:
