@@ -500,10 +500,18 @@ def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) 
 
 
 def camera_of(name_or_path: str) -> Camera:
-    """Return the camera of a profile (entry point `starid.cameras`, for `starid identify --profile`)."""
-    from starid.camera import Camera
+    """Return the camera of a profile (entry point `starid.cameras`, for `starid identify --profile`).
 
-    return Camera.from_dict(load_profile(name_or_path).camera.values())
+    Raises StaridError, the only error of which `starid` makes one line, where `load_profile` raises its own.
+    """
+    from starid.camera import Camera
+    from starid.errors import StaridError
+
+    try:
+        profile = load_profile(name_or_path)
+    except EmulatorError as error:
+        raise StaridError(str(error)) from None
+    return Camera.from_dict(profile.camera.values())
 
 
 def _source_of(layers: Sequence[Layer], location: Sequence[object]) -> str:

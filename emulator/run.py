@@ -4,7 +4,7 @@
 
     Run ── clock     time, which stands still at the end of the boot until the pipelines of all heads are ready
      ├──── wiring    ports, pipelines and slow writes as they are, recorded, or played from a recording
-     ├──── truth     where the body points; sees each head through its mount
+     ├──── truth     where the body points; each head is mounted on it
      ├──── stepper   advances the stepped clock; other clocks advance by themselves
      └──── heads ──┬─ imager ── worker process
                    ├─ device ── cycle, modes, parameters, images, …, joined by device/signals.py

@@ -1,8 +1,8 @@
 """Locks on symlinks and other names, held by one running emulator each.
 
 A lock is an abstract Unix socket. The kernel releases it when the process ends, and reports the process ID to another
-process that connects to it. Abstract sockets belong to a network namespace, so emulators in different containers do
-not see each other's locks.
+process that connects to it. Abstract sockets belong to a network namespace, so emulators in different containers
+do not share locks.
 """
 
 from __future__ import annotations

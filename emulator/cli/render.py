@@ -154,7 +154,7 @@ def command(
 
 
 def _scene(profile: str | None) -> tuple[Camera, SensorModel, SkyView, StarCatalog]:
-    """Return with what, and what, the device of a profile sees; by default those of camera and sensor, and no sky."""
+    """Return camera, sensor, sky and catalogue of a profile; without one, the defaults and an empty sky."""
     from starhil.emulator.sensor.model import SensorModel
     from starhil.emulator.sky.objects import SkyObjects
     from starhil.emulator.sky.view import Sky, SkyView

@@ -9,7 +9,7 @@
     subscriptions ──row_due──► requests    requests ──unsolicited──► links
     faults ──faults_changed──► recording
 
-Two parts that know nothing of the device have a signal of their own: `Scheduler.added` wakes a sleeping pump, and
+Two parts that do not depend on the device have signals elsewhere: `Scheduler.added` wakes a sleeping pump, and
 `PipelineImager.ended` starts the pipeline again.
 
 The sender changes its own state before it reports. Observers are called in the order in which the parts were made:

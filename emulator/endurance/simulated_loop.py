@@ -7,7 +7,7 @@ import selectors
 from typing import Any, Final
 
 WORKER_WAIT_S: Final = 0.001
-"""Wall time between two looks at a pipeline in a thread, seconds."""
+"""Wall time between two checks of a pipeline in a thread, seconds."""
 
 
 class _SimulatedSelector(selectors.SelectSelector):

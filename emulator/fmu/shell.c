@@ -73,7 +73,7 @@ static void end(struct unit *unit)
 {
     if (unit->process > 0) {
         (void)close(unit->link);
-        while (waitpid(unit->process, NULL, 0) < 0 && errno == EINTR) { /* a signal of the host */
+        while (waitpid(unit->process, NULL, 0) < 0 && errno == EINTR) {
         }
     }
     unit->link = -1;
@@ -82,7 +82,10 @@ static void end(struct unit *unit)
 
 static int exchange(struct unit *unit)
 {
-    ssize_t size = send(unit->link, &unit->values, sizeof unit->values, MSG_NOSIGNAL);
+    ssize_t size;
+    do {
+        size = send(unit->link, &unit->values, sizeof unit->values, MSG_NOSIGNAL);
+    } while (size < 0 && errno == EINTR); /* a signal of the host */
     if (size > 0) {
         do {
             size = recv(unit->link, &unit->values, sizeof unit->values, 0);

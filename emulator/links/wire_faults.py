@@ -67,7 +67,6 @@ class WireFaults(Generic[Item]):
         seed: int,
     ) -> None:
         self.settings = WireFault()
-        self.dropped = self.corrupted = 0
         self.listener: Callable[[Item], None] | None = None
         """Called with each item that is sent."""
         self._transmit = send
@@ -92,10 +91,8 @@ class WireFaults(Generic[Item]):
         if rng.random() < settings.junk:
             self._send_or_hold([self._damage.junk(rng)], settings)
         if rng.random() < settings.drop:
-            self.dropped += 1
             return
         if rng.random() < settings.corrupt:
-            self.corrupted += 1
             item = self._damage.corrupt(item, rng)
         self._send_or_hold(self._damage.split(item, settings.split) if settings.split else [item], settings)
 

@@ -93,7 +93,7 @@ class Format42:
                 "truth feed: 42 sends no orbit, so there is neither Earth nor aberration: %s", _PREFIXES
             )
 
-    def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 knows one answer)
+    def answer(self, run_time_s: float, fault: str) -> bytes:  # noqa: ARG002 (42 accepts one answer)
         """Return the answer expected by 42."""
         return ACKNOWLEDGE
 

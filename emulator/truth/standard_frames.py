@@ -65,7 +65,7 @@ def icrs_to(where: str, frame: str) -> Rotation:
 
 
 def is_inertial(frame: str) -> bool:
-    """Whether a frame is one of those that `icrs_to` knows."""
+    """Whether a frame is one of those of `icrs_to`."""
     return frame.upper() in (*ICRS_NAMES, *J2000_NAMES)
 
 

@@ -1,7 +1,7 @@
 """The truth of a run: its source, the mount of the sensors, and the socket and lock-step of a live feed.
 
-All heads of a run are mounted on one body. `Truth` describes the body, and each head sees it through a
-`SensorTruth`, which applies the mount of the head. The source can be replaced at any time, with everything that
+All heads of a run are mounted on one body. `Truth` describes the body, and `SensorTruth` a head: it applies the mount
+of the head. The source can be replaced at any time, with everything that
 belongs to it:
 
 - `set` reads the files of a configuration, opens the socket of a live feed, and then replaces the source. The
@@ -28,7 +28,7 @@ from starid.attitude import Attitude
 
 @dataclass(frozen=True)
 class TruthHost:
-    """The run, as its truth sees it."""
+    """What a truth source uses of its run."""
 
     clock: Clock
     clock_name: str

@@ -105,7 +105,7 @@ class ConformanceResult:
 
     outcomes: list[Outcome]
     facts: dict[str, str]
-    """For reports: `date`, versions of `starhil` and of the `definition`, `links`, and `device on LINK`: its identity."""
+    """For reports: `date`, versions of `starhil` and of the `definition`, `links`, `truth`, and `device on LINK`: its identity."""
     interruption: Interrupted | None = None
     """The signal that interrupted the run, if any."""
 
@@ -124,6 +124,7 @@ def _facts(request: ConformanceRequest, unit: Unit) -> dict[str, str]:
         "date": datetime.now(UTC).isoformat(timespec="seconds"),
         "starhil": version("starhil"),
         "definition": f"{unit.name} {unit.version}",
+        "truth": "the emulator's" if request.start else request.truth or "not given",
     }
 
 

@@ -256,6 +256,7 @@ def _read_back(command: Row, row: Row, part: slice, marks: bytes, probe: LinkPro
 
 def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
     """Yield a case for each row that the unit sends without a request, if a request can cause its event."""
+    reset = next((row for row in unit.telecommands.values() if row.action == "reset"), None)
     for row in unit.telemetry.values():
         if isinstance(row.unsolicited, float):
             title = f"{row.name} is sent {row.unsolicited:g} times a second without a request"
@@ -263,6 +264,10 @@ def _unsolicited(unit: Unit) -> Iterator[Case[LinkProbe]]:
         elif row.unsolicited is not None and not CAUSED.isdisjoint(row.unsolicited):
             title = f"{row.name} is sent without a request after {' or '.join(row.unsolicited)}"
             yield case_in("unsolicited", row.name, title, partial(_reported, row), row, intrusive=True)
+        elif row.unsolicited is not None and "start" in row.unsolicited and reset is not None:
+            title = f"{row.name} is sent without a request after {reset.name}"
+            run = partial(_reported_at_start, row, reset)
+            yield case_in("unsolicited", row.name, title, run, row, intrusive=True)
 
 
 def _of_row(row: Row, answers: list[Answer]) -> list[Answer]:
@@ -301,6 +306,15 @@ def _reported(row: Row, probe: LinkProbe) -> None:
         check_equal(seen[0], SEARCHING, "mode in the first message")
         changes = all(one != other for one, other in pairwise(seen))
         check(changes, "another mode in each message", seen)
+
+
+def _reported_at_start(row: Row, reset: Row, probe: LinkProbe) -> None:
+    _check_carried(probe)
+    end = probe.now() + probe.times.boot_s
+    answers = probe.receive_unsolicited(SUBSCRIBED_S, partial(probe.send_command, reset, reset.encode()))
+    while not (found := _of_row(row, answers)) and probe.now() < end:
+        answers = probe.receive_unsolicited(SUBSCRIBED_S)
+    check(bool(found), f"{row.name} within {probe.times.boot_s:g} s of {reset.name}", "none")
 
 
 def _check_carried(probe: LinkProbe) -> None:

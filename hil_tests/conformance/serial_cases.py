@@ -89,10 +89,7 @@ def _highest_id(unit: Unit) -> int:
 
 def _asked(probe: SerialProbe, times: int = 1) -> bytes:
     """Return the bytes of a request for the lively row, which is expected to be answered."""
-    requests = [probe.line.numbered(probe.unit.request(probe.lively)) for _ in range(times)]
-    for request in requests:
-        probe.line.expect(request)
-    return b"".join(probe.line.encode(request) for request in requests)
+    return b"".join(probe.line.post(probe.unit.request(probe.lively)) for _ in range(times))
 
 
 def _answered(probe: SerialProbe, times: int = 1) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 from starhil.hil_tests.endurance.life import Life
+from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.can_framing import encode_request_frames
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.messages import Request, RequestKind
@@ -38,9 +39,7 @@ def session_of(life: Life, icd: InterfaceDefinition, violation: str) -> str:
                 if step["link"] == "serial":
                     sent = [build_serial_stack(icd).encode_request(request).hex(" ")]
                 else:
-                    sent = [
-                        f"{frame.id:08X}#{frame.data.hex()}" for frame in encode_request_frames(request, 1, 4)
-                    ]
+                    sent = [format_frame(frame) for frame in encode_request_frames(request, 1, 4)]
                 lines += ["", "[[step]]", name, f'link = "{step["link"]}"', f"send = {json.dumps(sent)}"]
             case _:
                 lines += ["", f"# step {number}, not possible in a session: {json.dumps(step)}"]

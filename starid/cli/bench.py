@@ -11,7 +11,8 @@ from typing import Annotated, Any, Final
 import typer
 
 from starid.cli.options import AsJson
-from starid.cli.output import Column, print_table, progress
+from starid.cli.output import Column, prepare_folder, print_table, progress
+from starid.errors import StaridError
 
 
 def _entry(name: str, digits: int) -> Callable[[Any], str]:
@@ -50,7 +51,7 @@ def command(
         ),
     ] = "geometric",
     frames: Annotated[int, typer.Option(min=1, help="Scenes per row.")] = 300,
-    seed: Annotated[int, typer.Option(help="Random seed.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
     row: Annotated[
         list[str] | None,
         typer.Option(
@@ -60,7 +61,9 @@ def command(
     ] = None,
     budget: Annotated[
         float,
-        typer.Option(help="Processor time of a solver per row, seconds; the rest of the row is skipped."),
+        typer.Option(
+            min=0.0, help="Processor time of a solver per row, seconds; the rest of the row is skipped."
+        ),
     ] = 120.0,
     raw: Annotated[
         bool, typer.Option("--raw", help="Use the answers of published algorithms without verification.")
@@ -78,14 +81,18 @@ def command(
 
     if output is not None:
         import_module("matplotlib")  # before the work
+        prepare_folder(output, "-o")
     everyone = solvers.strip() == "all"
+    own = ALL if everyone else _names(solvers)
+    if not (own or _names(peers)):
+        raise StaridError("bench --solvers: name at least one, such as geometric, or all")
     usual = LEADERBOARD if everyone else STANDARD
     report = progress()
     answer = run(
         frames,
         seed,
         peers=_names(peers),
-        own=ALL if everyone else _names(solvers),
+        own=own,
         rows=list(usual if not row else ROWS if "all" in row else PAPERS if "papers" in row else row),
         budget_s=budget,
         raw=raw,

@@ -100,7 +100,11 @@ def _show(catalog: StarCatalog, rows: int, *, as_json: bool) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title=f"{len(records)} stars, epoch J{catalog.epoch:g}", box=SIMPLE, pad_edge=False)
+    table = Table(
+        title=f"{len(records)} star{'s' * (len(records) != 1)}, epoch J{catalog.epoch:g}",
+        box=SIMPLE,
+        pad_edge=False,
+    )
     for head, _ in _TABLE.values():
         table.add_column(head, justify="right", no_wrap=True)
     for record in records[:rows]:

@@ -18,6 +18,7 @@ from starid.errors import StaridError
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+    from rich.console import Console
 
     from starid.camera import Camera, Model
     from starid.catalog import StarCatalog
@@ -173,7 +174,10 @@ def _solve(
         width_deg = read_number(fov)
     except ValueError:
         raise StaridError(f"identify --fov: must be degrees or {ANY_FIELD}, not {fov!r}") from None
-    camera = Camera.from_fov(width_deg, pixels.shape[1], pixels.shape[0], _MODELS[model])
+    try:
+        camera = Camera.from_fov(width_deg, pixels.shape[1], pixels.shape[0], _MODELS[model])
+    except StaridError as error:
+        raise StaridError(str(error).replace("camera fov_deg", "identify --fov")) from None
     return solve_image(
         pixels,
         camera,
@@ -340,14 +344,21 @@ def _marked(pixels: Any, result: ImageSolution) -> Any:
 
 
 def _show(report: dict[str, Any], annotated: Path | None) -> None:
-    """Print the result as text."""
-    from rich.box import SIMPLE
+    """Print the result as text, and the file with the image."""
     from rich.console import Console
+
+    console = Console(file=report_stream(annotated), soft_wrap=True)
+    _print_solution(report, console)
+    if annotated is not None:
+        console.print(f"written: {annotated}", markup=False)
+
+
+def _print_solution(report: dict[str, Any], console: Console) -> None:
+    from rich.box import SIMPLE
     from rich.table import Table
 
     from starid.attitude import turn_text
 
-    console = Console(file=report_stream(annotated), soft_wrap=True)
     if not report["valid"]:
         console.print(
             f"{report['image']}: not identified ({report['reason']}); {report['stars_detected']} stars found; "

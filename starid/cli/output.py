@@ -67,6 +67,24 @@ def prepare_output(path: Path, option: str) -> Path:
     return path
 
 
+def prepare_folder(path: Path, option: str) -> None:
+    """Create a folder for results, so that an invalid path fails before the work starts.
+
+    Raises
+    ------
+    StaridError
+        The folder cannot be created, or the path is a file.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise StaridError(f"{path}: is not a folder; name one with {option}") from None
+    except OSError as error:
+        raise StaridError(
+            f"{path}: cannot be created ({error.strerror}); choose another folder with {option}"
+        ) from None
+
+
 def report_stream(output: Path | None) -> TextIO:
     """Return the stream for the report of a command: stderr if its output file is stdout, or else stdout."""
     from starid.files import is_stdout

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from starid.cli.options import AsJson
+from starid.cli.output import prepare_folder
 
 
 def command(
@@ -52,6 +53,7 @@ def command(
         return
     chosen = select(names or [], quick=quick)
     import_module("matplotlib")  # before the work
+    prepare_folder(output, "-o")
     start = time.perf_counter()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), disable=as_json or not sys.stderr.isatty()) as bar:

@@ -68,7 +68,7 @@ def read_image(path: str | Path, *, allow_colour: bool = False) -> GreyImage:
         if not allow_colour:
             raise StaridError(
                 f"image {source}: has {pixels.shape[2]} channels, but star sensor images are grey; "
-                "convert it or allow colour"
+                "convert it, allow colour (--allow-colour), or give its field of view (--fov)"
             )
         pixels = grey_of(pixels)
     if pixels.dtype not in (np.uint8, np.uint16):

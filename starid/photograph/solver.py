@@ -112,7 +112,7 @@ def solve_image(
     if (width, height) != (nominal.width, nominal.height):
         raise StaridError(
             f"image of {width}×{height} pixels: the camera has {nominal.width}×{nominal.height}; "
-            "give the profile of the camera that took it, or its field of view"
+            "give --fov auto, its field of view with --fov, or the camera that took it with --profile"
         )
     sky = load_catalog() if catalog is None else catalog
     if fov_tolerance > 0.0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -31,11 +32,11 @@ def stack_of(unit: SimulatedUnit) -> SerialStack:
     return stack
 
 
-def bodies(change: Callable[[bytes, SerialStack], bytes]) -> Damage:
-    """Change the bodies of the frames that the device sends."""
+def bodies(change: Callable[[bytes, SerialStack], bytes], klass: str = "") -> Damage:
+    """Change the bodies of the frames that the device sends, in the format of a class."""
 
     def damage(unit: SimulatedUnit) -> None:
-        framing = stack_of(unit).replies.framing
+        framing = stack_of(unit).reply_formats.of(klass).framing
         encode = framing.encode
         framing.encode = lambda body: encode(change(body, stack_of(unit)))  # type: ignore[method-assign]
 
@@ -207,8 +208,76 @@ def setting_forgotten(
     return handle(request)
 
 
+def similar_texts(unit: SimulatedUnit) -> None:
+    """Look at the first four letters of a request only."""
+    stack = stack_of(unit)
+    known = {text[:4]: row for text, row in stack._by_text.items()}
+
+    class Similar(dict[str, Row]):
+        def get(self, text: str, default: Any = None) -> Any:
+            return known.get(text[:4], default)
+
+    stack._by_text = Similar()
+
+
+def fields_permuted(*names: str) -> Damage:
+    """Send each of these fields in the place of the one before it, and the first in that of the last."""
+
+    def changed(data: bytes, row: Row) -> bytes:
+        places = [
+            slice(item.offset, item.offset + item.size) for item in (row.named_fields[name] for name in names)
+        ]
+        moved = bytearray(data)
+        for place, source in zip(places, (*places[1:], places[0]), strict=True):
+            moved[place] = data[source]
+        return bytes(moved)
+
+    return telemetry_data(changed)
+
+
+def conjugated(data: bytes, row: Row) -> bytes:
+    """Turn the sign of the vector part."""
+    turned = bytearray(data)
+    for name in ("q1", "q2", "q3"):
+        turned[row.named_fields[name].offset] ^= 0x80
+    return bytes(turned)
+
+
+def ping_answered(device: Device, request: Request, handle: Callable[[Request], list[Reply]]) -> list[Reply]:
+    found = handle(request)
+    return found or [Reply(ReplyKind.ACK, request.id, klass=request.klass)]
+
+
+def st200() -> Iterator[UnitMutant]:
+    """Mutants of a unit with texts, and a record in another format than they."""
+    one, attitude, command = "framing.one", "attitude.record", "commands.set_keep_alive"
+
+    def unstuffed(data: bytes) -> list[bytes]:
+        return [re.sub(rb"\xf0([\x00-\x0f])", lambda found: bytes((0xF0 | found[1][0],)), data)]
+
+    found: dict[str, tuple[str, Damage]] = {
+        "the check is wrong": (one, bodies(lambda body, _stack: body[:-1] + bytes((body[-1] ^ 1,)), "record")),
+        "no check is sent": (one, bodies(lambda body, _stack: body[:-1], "record")),
+        "the check does not cover the start mark": (one, bodies(lambda body, stack: body[:-1] + stack.reply_formats.of("record").check.compute(body[:-1]), "record")),
+        "the start mark is wrong": (one, outgoing(lambda data: [data.replace(b"\xf1", b"\xf2", 1)])),
+        "replies are not stuffed": ("telemetry.record", outgoing(unstuffed)),
+        "the scalar part comes first": (attitude, fields_permuted("q1", "q4", "q3", "q2")),
+        "the quaternion is the conjugate": (attitude, telemetry_data(conjugated)),
+        "pitch and yaw are exchanged": (attitude, fields_permuted("pitch", "yaw")),
+        "similar texts are accepted": ("texts.set_keep_alive", similar_texts),
+        "unknown texts are acknowledged": ("texts.ping", with_code(ErrorCode.INVALID_ID, None)),
+        "commands are not acknowledged": (command, replies(lambda reply, _device: None if reply.kind is ReplyKind.ACK else reply)),
+        "the text READY is another": (command, outgoing(lambda data: [data.replace(b"READY", b"Ready")])),
+        "a text ends with CR only": (command, outgoing(lambda data: [data.replace(b"READY\r\n", b"READY\r")])),
+        "ping is answered": ("commands.ping", handling(ping_answered)),
+        "messages of any length are taken": ("framing.overlong", takes_any_length),
+    }  # fmt: skip
+    for name, (caught_by, damage) in found.items():
+        yield UnitMutant("st200", name, f"serial.{caught_by}", damage)
+
+
 def mutants() -> Iterator[UnitMutant]:
-    first = {"sagitta": "auto_blob", "nos3": "housekeeping", "st16": "ping"}
+    first = {"sagitta": "auto_blob", "nos3": "housekeeping", "st16": "ping", "st200": "record"}
     for unit, row in first.items():
         one = "serial.framing.one"
         yield UnitMutant(unit, "replies come twice", one, outgoing(twice))
@@ -232,7 +301,7 @@ def mutants() -> Iterator[UnitMutant]:
             "serial.framing.two-at-once",
             incoming(lambda data: [data[: (len(data) + 1) // 2]] if len(data) > 12 else [data]),
         )
-    for unit, row in (("sagitta", "solution"), ("nos3", "data")):
+    for unit, row in (("sagitta", "solution"), ("nos3", "data"), ("st200", "record")):
         yield UnitMutant(
             unit,
             "fields are shifted by a byte",
@@ -316,6 +385,7 @@ def mutants() -> Iterator[UnitMutant]:
     }  # fmt: skip
     for name, (caught_by, damage) in nos3.items():
         yield UnitMutant("nos3", name, caught_by, damage)
+    yield from st200()
     yield from gen2()
 
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from starhil.hil_tests.conformance.link_probe import ReadableSettings
-from starhil.hil_tests.conformance.runner import run_cases
-from starhil.hil_tests.conformance.suites import serial_suite, settings_of
+from starhil.hil_tests.conformance.runner import run_case, run_cases
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.judge.definition import read_unit
+from starhil.protocol.names import find_unit
 from tests.conformance.links import write_unit
 from tests.conformance.simulated import SimulatedUnit
 
@@ -55,6 +57,23 @@ def unit_with(folder: Path, own: str) -> Path:
     write_unit(folder, "sum")
     (folder / "own_cases.py").write_text(own, encoding="utf-8")
     return folder
+
+
+@pytest.mark.parametrize(("event", "status"), [("start", "passed"), ("error", "failed")])
+def test_a_row_that_reports_the_start_is_awaited_after_a_reset(
+    event: str, status: str, tmp_path: Path
+) -> None:
+    for name, sent_after in (("unit", "start"), ("served", event)):
+        folder = Path(shutil.copytree(find_unit("cubestar"), tmp_path / name))
+        (folder / "90-start.toml").write_text(
+            '[[telemetry]]\nid = 130\nname = "started"\ndoc = "The unit has started."\nprovenance = "ours"\n'
+            f'unsolicited = ["{sent_after}"]\nfields = [{{ name = "boots", type = "u16", value = "boot.count" }}]\n'
+        )
+    unit, served = tmp_path / "unit", tmp_path / "served"
+    case = next(item for item in can_suite(read_unit(unit)) if item.id == "can.unsolicited.started")
+    with SimulatedUnit("can", unit=unit, served=served) as simulated:
+        outcome = run_case(simulated.probe, case)
+    assert outcome.status == status
 
 
 def test_own_cases_are_run_with_those_of_the_definition(tmp_path: Path) -> None:

@@ -41,13 +41,22 @@ def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str
     assert len(outcomes) >= 15
 
 
-@pytest.mark.parametrize("unit", ["sagitta", "nos3", "st200", "cubestar"])
+@pytest.mark.parametrize(
+    ("link", "unit"),
+    [
+        *(("serial", unit) for unit in ("sagitta", "nos3", "st200", "cubestar")),
+        ("can", "cubestar"),
+        ("canopen", "oresat"),
+    ],
+)
 @pytest.mark.parametrize("known", ["true", "conjugated"])
-def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(unit: str, known: str) -> None:
-    definition = read_unit(unit)
+def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(
+    link: str, unit: str, known: str
+) -> None:
     truth = from_radec_roll(83.8, -1.2, 0.0)
-    cases = [case for case in serial_suite(definition) if case.id.startswith("serial.attitude.")]
-    with SimulatedUnit("serial", unit=unit) as simulated:
+    suite = {**SUITES, "canopen": canopen_suite}[link](read_unit(unit))
+    cases = [case for case in suite if case.id.startswith(f"{link}.attitude.")]
+    with SimulatedUnit(link, unit=unit) as simulated:
         simulated.probe.truth = lambda: truth if known == "true" else conjugate(truth)
         outcomes = run_cases(simulated.probe, cases)
     assert {o.status for o in outcomes} == {"passed" if known == "true" else "failed"}, outcomes

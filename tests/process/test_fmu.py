@@ -265,6 +265,23 @@ def test_reset_begins_again_with_the_same_outputs(fmu3: Path, tmp_path: Path) ->
     assert seen[0][OUTPUTS.index("valid")]
 
 
+def test_signals_of_the_host_do_not_disturb_a_step(fmu3: Path, tmp_path: Path) -> None:
+    seen = []
+    before = signal.signal(signal.SIGALRM, lambda number, _frame: seen.append(number))
+    try:
+        with unit_of(fmu3, tmp_path) as unit:
+            unit.begin()
+            signal.setitimer(signal.ITIMER_REAL, 1e-3, 1e-3)
+            for row in tumble(2.5):
+                unit.step(row)
+            unit.slave.terminate()
+            assert unit.get("valid")
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+    assert len(seen) > 20
+
+
 def test_an_emulator_that_dies_ends_the_step_with_a_message(fmu3: Path, tmp_path: Path) -> None:
     link = tmp_path / "port"
     with unit_of(fmu3, tmp_path, serial="auto", symlink=str(link)) as unit:

@@ -114,8 +114,8 @@ def test_the_traceback_of_an_error_ends_at_the_test_and_a_fixture_has_none(tmp_p
     assert "no field of identification named 'runtme_s'; did you mean runtime_s" in out
     assert "no field of precise_attitude named 'vald'; did you mean valid" in out
     assert "set_mode.mod: no such field; did you mean mode?" in out
-    assert "starhil: profile 'idel': not found" in out
-    assert "--set run.sede=1: run.sede: unknown key; did you mean seed?" in out
+    assert "\nprofile 'idel': not found; " in out
+    assert "\n--set run.sede=1: run.sede: unknown key; did you mean seed?" in out
     assert "During handling" not in out
 
 

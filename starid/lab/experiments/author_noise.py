@@ -25,14 +25,11 @@ IDENTIFICATION_ROOT: Final = 0.27
 """Experiments on identification: σ = this·√μ, pixels and units of intensity."""
 
 
-def filter_noise(
-    kind: Kind,
-    factor: float,
-    false_stars: int,
-    magnitude_range: tuple[float, float],
-    *,
-    stretch: float = 1.0,
-) -> NoiseModel:
+FILTER_MAGNITUDES: Final = (-1.5, 3.0)
+"""Experiments on the filter: range of the brightness, also of false stars."""
+
+
+def filter_noise(kind: Kind, factor: float, false_stars: int, stretch: float = 1.0) -> NoiseModel:
     """Noise of a set of experiments on the filter; frames with noise have positions in whole pixels.
 
     `stretch` multiplies the two constants, to fit them.
@@ -42,7 +39,7 @@ def filter_noise(
         position_sigma_px=stretch * root * math.sqrt(factor),
         brightness_sigma=0.0 if kind == "position" else factor,
         false_stars=false_stars,
-        magnitude_range=magnitude_range,
+        magnitude_range=FILTER_MAGNITUDES,
         whole_pixels=factor > 0.0,
     )
 

@@ -150,33 +150,24 @@ def _database_figures(context: Context, name: str, solver: Any) -> tuple[float, 
     return 1e-3 * solver.database_bytes, 1e-3 * papers.database_bytes, papers.build_seconds
 
 
-def _rate(results: Results, case: str) -> float:
-    return share(results[f"f_{case}"], IDENTIFIED_DEG)
-
-
-def _wrong(results: Results, case: str) -> float:
-    return 100.0 * float(np.mean(results[f"f_{case}"] > IDENTIFIED_DEG))
-
-
 def _case_label(case: str) -> str:
     kind, _, level = case.partition("-")
     return _LABELS[kind].format(level) if level else "no noise"
 
 
-def _compare(e: Evaluation) -> None:
+def _compare(e: Evaluation, lines: list[dict[str, Any]]) -> None:
     skies = e.parameters["skies"]
     for sky, case in itertools.product(skies, e.parameters["cases"]):
-        for part in e.parts:
-            if part["sky"] != sky:
+        for line in lines:
+            if (line["sky"], line["case"]) != (sky, case):
                 continue
-            name, result = part["algorithm"], e[part]
-            wrong = _wrong(result, case)
+            name, wrong = line["algorithm"], line["wrong_percent"]
             e.compare(
                 f"{SHORT[name]}, {_SKY_LABELS[sky]}, {_case_label(case)}: identified",
                 text=next(iter(e.published(f"{name}, {case}")), None),
                 unit="%",
                 check=f"≥ {floor}" if (floor := _COMPETITORS[name]["least_clean"]) and case == "none" else "",
-                ours=_rate(result, case),
+                ours=line["identified_percent"],
                 remark=f"{wrong:.1f} % wrong" if wrong > 0.0 else "",
             )
     # the first sky is the flat one if both are selected
@@ -222,16 +213,14 @@ def _figures(e: Evaluation, lines: list[dict[str, Any]]) -> None:
 def evaluate(e: Evaluation) -> None:
     """Rates, wrong answers, sizes and times of each algorithm beside the quoted ones."""
     lines = []
-    for part in e.parts:
-        result = e[part]
-        for case in e.parameters["cases"]:
-            times = result[f"ms_{case}"]
-            line = {**part.values, "case": case}
-            line |= {"identified_percent": _rate(result, case), "wrong_percent": _wrong(result, case)}
-            line |= {"median_ms": float(np.median(times)), "p99_ms": float(np.percentile(times, 99.0))}
-            lines.append(line)
+    for part, case in itertools.product(e.parts, e.parameters["cases"]):
+        errors, times = (e[part][f"{name}_{case}"] for name in ("f", "ms"))
+        line = {**part.values, "case": case, "identified_percent": share(errors, IDENTIFIED_DEG)}
+        line["wrong_percent"] = 100.0 * float(np.mean(errors > IDENTIFIED_DEG))
+        line |= {"median_ms": float(np.median(times)), "p99_ms": float(np.percentile(times, 99.0))}
+        lines.append(line)
     e.write("rates.csv", lines)
     _figures(e, lines)
-    _compare(e)
+    _compare(e, lines)
     stars, unit = len(thesis_sky("sphere").catalog), NoiseModel().magnitude_per_unit
     e.note = {"limit": IDENTIFIED_DEG, "unit": unit, "stars": stars}

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.arrays import Mask
-from starid.lab.experiments.author_noise import filter_noise
+from starid.lab.experiments.author_noise import FILTER_MAGNITUDES, filter_noise
 from starid.lab.experiments.comparison import best_constant
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
 from starid.lab.experiments.figures import Curve
@@ -31,32 +31,27 @@ FACTORS: Final = (0, 1, 2, 3, 4, 5)
 _KINDS: Final = {"brightness": "brightness", "position": "position", "both": "brightness and position"}
 _CORNER: Final = (87.41, -8.86)
 _BRIGHTEST: Final = 3.0
-_MAGNITUDES: Final = (-1.5, 3.0)
 _COUNTS: Final = ("TP", "FP", "FN", "TN")
 _INDICATORS: Final = ("accuracy", "precision", "recall", "f1")
 _DISTANCES: Final = ("μ_d", "σ_d")
 _PUBLISHED_FRAMES: Final = 1000
 
 
-def first_frame() -> tuple[Any, Any]:
-    """Magnitudes (7,) and offsets (7, 2), degrees, of the published stars: Hp < 3 in the square."""
-    catalog = star_catalog()
-    positions = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad])) - _CORNER - RADIUS_DEG
-    chosen = (catalog.hp < _BRIGHTEST) & np.all(np.abs(positions) <= RADIUS_DEG, axis=1)
-    return catalog.hp[chosen].copy(), positions[chosen]
-
-
 def frames_of_seven(
     rng: np.random.Generator, noise: NoiseModel, count: int
 ) -> tuple[SimulatedFrame, Iterator[SimulatedFrame]]:
-    """The clean frame with the seven stars, and `count` frames moved from it."""
-    frames = moved_frames(rng, *first_frame(), noise, count=count, radius_deg=RADIUS_DEG)
+    """The clean frame with the seven published stars, Hp < 3 in the square, and `count` frames moved from it."""
+    catalog = star_catalog()
+    positions = np.degrees(np.column_stack([catalog.ra_rad, catalog.dec_rad])) - _CORNER - RADIUS_DEG
+    chosen = (catalog.hp < _BRIGHTEST) & np.all(np.abs(positions) <= RADIUS_DEG, axis=1)
+    stars = catalog.hp[chosen], positions[chosen]
+    frames = moved_frames(rng, *stars, noise, count=count, radius_deg=RADIUS_DEG)
     return next(frames), frames
 
 
 def noise_of(kind: str, factor: float, false_stars: int) -> NoiseModel:
     """Noise model of one set, as printed."""
-    return NoiseModel.of(kind, factor, false_stars=false_stars, magnitude_range=_MAGNITUDES)
+    return NoiseModel.of(kind, factor, false_stars=false_stars, magnitude_range=FILTER_MAGNITUDES)
 
 
 def track_filter(noise: NoiseModel, least_deg: float, least_magnitude: float, **limits: Any) -> TrackFilter:
@@ -77,11 +72,6 @@ def motion_errors(motion: CameraMotion, frame: SimulatedFrame) -> tuple[float, f
     """Errors of the rotation and the translation of a frame, degrees."""
     away = motion.translation_deg - frame.shift_deg
     return abs(motion.rotation_deg - frame.rotation_deg), float(np.hypot(*away))
-
-
-def author_noise(kind: str, factor: float, false_stars: int, stretch: float = 1.0) -> NoiseModel:
-    """Noise model of one set as the author ran it."""
-    return filter_noise(kind, factor, false_stars, _MAGNITUDES, stretch=stretch)
 
 
 def author_distances(
@@ -108,7 +98,7 @@ def _author(context: Context, part: Part) -> Results:
     distances = np.full((len(FACTORS), starts, count, 2), math.nan)
     found = MatlabFilter(PIXEL_DEG)
     for k, factor in enumerate(FACTORS):
-        noise = author_noise(kind, factor, false_stars, stretch)
+        noise = filter_noise(kind, factor, false_stars, stretch)
         for start in range(starts):
             # the first frames are the same for all noise factors, as they seem to be in the thesis
             first, _ = frames_of_seven(context.rng("first", false_stars, start), noise, 0)

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
+from starid.lab.experiments.author_noise import filter_noise
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.figures import Curve, Panel, curves_of, plane_axes
 from starid.lab.experiments.fsf import (
     RADIUS_DEG,
     author_distances,
-    author_noise,
     frames_of_seven,
     motion_errors,
     noise_of,
@@ -101,17 +101,16 @@ def evaluate_case(e: Evaluation) -> None:
         known, c = CASE_STUDY[f, kind], Confusion(*e[part]["counts"].tolist())
         errors = e[part]["errors"]
         mean, sigma = errors.mean(axis=0), errors.std(axis=0, ddof=1)
-        line = {"f": f, "noise": kind, "accuracy": c.accuracy, "precision": c.precision, "recall": c.recall}
-        line |= {"rotation_error_deg": mean[0], "rotation_sigma_deg": sigma[0]}
-        line |= {"shift_error_deg": mean[1], "shift_sigma_deg": sigma[1]}
+        indicators = ("accuracy", "precision", "recall")
+        line = {"f": f, "noise": kind} | {name: getattr(c, name) for name in indicators}
+        measured = {name: {"printed": c.percent(name)} for name in indicators}
+        for name, each, spread in zip(("rotation", "shift"), mean.tolist(), sigma.tolist(), strict=True):
+            line |= {f"{name}_error_deg": each, f"{name}_sigma_deg": spread}
+            measured |= {f"{name}_mean": {"printed": each}, f"{name}_sigma": {"printed": spread}}
         line |= {f"published_{name}": 0.01 * known[name] for name in ("accuracy", "precision")}
         line |= {f"published_{name}_error_deg": known[f"{name}_mean"] for name in ("rotation", "shift")}
         lines.append(line)
-        measured = {name: c.percent(name) for name in ("accuracy", "precision", "recall")}
-        for i, name in enumerate(("rotation", "shift")):
-            measured |= {f"{name}_mean": float(mean[i]), f"{name}_sigma": float(sigma[i])}
-        printed = {name: {"printed": value} for name, value in measured.items()}
-        e.compare_line("6.3 and 6.4", "", f"f = {f}, noise: {kind}", known, printed)
+        e.compare_line("6.3 and 6.4", "", f"f = {f}, noise: {kind}", known, measured)
     e.write("tables_6_3_and_6_4.csv", lines)
     _draw_reconstruction(e)
 
@@ -136,7 +135,7 @@ def compute_correlation(context: Context, part: Part) -> Results:
     """μ_d and σ_d of the frames (n, 2), as the author ran it and as printed."""
     factor, count = part["factor"], int(context.parameters["frames"])
     found = MatlabFilter(PIXEL_DEG)
-    first, frames = frames_of_seven(context.rng(part.key), author_noise("both", factor, factor), count)
+    first, frames = frames_of_seven(context.rng(part.key), filter_noise("both", factor, factor), count)
     author = np.array([author_distances(first.observed, frame.observed, found)[1] for frame in frames])
     first, frames = frames_of_seven(context.rng(part.key), noise_of("both", factor, factor), count)
     printed = []

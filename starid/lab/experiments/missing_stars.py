@@ -10,7 +10,16 @@ import numpy as np
 
 from starid.arrays import Array
 from starid.lab.experiments.experiment import Context, Evaluation, Part, Results, star_catalog
-from starid.lab.experiments.lsi_trials import OFF, count_label, error_of, frames_under_test, share, stars_of
+from starid.lab.experiments.lsi_trials import (
+    HALF_FRAME_DEG,
+    OFF,
+    count_label,
+    error_of,
+    frames_under_test,
+    share,
+    stars_of,
+)
+from starid.lab.experiments.rsi_trials import START
 from starid.lab.simulation import NoiseModel, add_noise, sky_sequence
 from starid.thesis.cme import matched_motion
 from starid.thesis.database import DatabaseParameters, build_database
@@ -22,11 +31,9 @@ from starid.thesis.metrics import boresight_error
 from starid.thesis.missing_stars import DividedField, restore_missing
 
 _OVERLAP: Final = 0.995
-_HALF_WIDTH_DEG: Final = 20.0
 _FRAME_DEG: Final = 24.0
 _STEP_DEG: Final = 0.2
 _COVERED_FROM_DEG: Final = 12.0
-_START: Final = (108.41, 12.14)
 _MARGIN_DEG: Final = 1.6
 _RIM_DEG: Final = 0.01
 _LABELS: Final = {
@@ -40,7 +47,7 @@ _LABELS: Final = {
 def _divided() -> DividedField:
     parameters = DatabaseParameters(overlap=1.0 - _STEP_DEG / _FRAME_DEG, fov_deg=_FRAME_DEG)
     database = build_database(star_catalog(), parameters)
-    return DividedField(LostInSpace(database), half_width_deg=_HALF_WIDTH_DEG)
+    return DividedField(LostInSpace(database), half_width_deg=HALF_FRAME_DEG)
 
 
 def _with_changed_stars(
@@ -52,7 +59,7 @@ def _with_changed_stars(
         return ObservedFrame(brightness[seen], positions[seen])
     kind, _, count = case.partition("-")
     noise = NoiseModel.of(kind, float(count or 0))
-    mags, noisy, _ = add_noise(rng, brightness, positions, noise, _HALF_WIDTH_DEG)
+    mags, noisy, _ = add_noise(rng, brightness, positions, noise, HALF_FRAME_DEG)
     return ObservedFrame(mags, noisy)
 
 
@@ -74,7 +81,7 @@ def _boresight_errors(context: Context, part: Part) -> Results:
 
 
 def _features(frame: ObservedFrame) -> FeatureVector | None:
-    inside = np.sum(frame.positions**2, axis=1) <= _HALF_WIDTH_DEG**2
+    inside = np.sum(frame.positions**2, axis=1) <= HALF_FRAME_DEG**2
     try:
         return extract_features(frame.brightness[inside], frame.positions[inside])
     except FeatureError:
@@ -85,19 +92,19 @@ def _put_back(context: Context) -> Results:
     """ε_f (2, n) of frames that lack a star: as they are, and with the stars that the filter restores."""
     lsi, cluster = context.lost_in_space(_OVERLAP), ClusterFilter()
     rng, count = context.rng("put-back"), int(context.parameters["frames"])
-    frames = sky_sequence(rng, context.sky(), *_START, NoiseModel(), count=count, margin_deg=_MARGIN_DEG)
+    frames = sky_sequence(rng, context.sky(), *START, NoiseModel(), count=count, margin_deg=_MARGIN_DEG)
     sequence = list(frames)
     errors = np.full((2, len(sequence) - 1), np.nan)
     for i, (before, after) in enumerate(itertools.pairwise(sequence)):
         whole = after.observed
-        inside = np.flatnonzero(np.sum(whole.positions**2, axis=1) <= (_HALF_WIDTH_DEG - _RIM_DEG) ** 2)
+        inside = np.flatnonzero(np.sum(whole.positions**2, axis=1) <= (HALF_FRAME_DEG - _RIM_DEG) ** 2)
         kept = np.delete(np.arange(len(whole)), rng.choice(inside))
         now = ObservedFrame(whole.brightness[kept], whole.positions[kept])
         result = cluster(before.observed, now)
         motion = matched_motion(before.observed, now, result.matches)
         if motion is None:
             continue
-        rim = {"radius_deg": _HALF_WIDTH_DEG + _MARGIN_DEG, "margin_deg": _MARGIN_DEG}
+        rim = {"radius_deg": HALF_FRAME_DEG + _MARGIN_DEG, "margin_deg": _MARGIN_DEG}
         mended = restore_missing(before.observed, now, result, motion, **rim)
         place = after.right_ascension_deg, after.declination_deg
         for j, frame in enumerate((now, mended)):

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from starid.attitude import Attitude, propagate, random_attitude
-from starid.lab.experiments.experiment import Context, Evaluation, Parameters, Part, Results
+from starid.lab.experiments.experiment import Context, Evaluation, Part, Results
 from starid.lab.experiments.lsi_trials import share
 
 _WRONG_ARCSEC: Final = 300.0
@@ -52,15 +52,6 @@ def points(
     magnitude = np.concatenate([magnitude[seen], rng.uniform(2.0, _LIMIT, false)])
     order = rng.permutation(magnitude.size)
     return xy[order], 10.0 ** (-0.4 * (magnitude[order] - _ZERO_POINT))
-
-
-def parts(parameters: Parameters) -> list[Part]:
-    """Both algorithms with each noise."""
-    return [
-        Part(f"{algorithm}-{number}", {"algorithm": algorithm, "noise": noise})
-        for algorithm in ("lsi", "rsi")
-        for number, noise in enumerate(parameters["noises"])
-    ]
 
 
 def compute(context: Context, part: Part) -> Results:

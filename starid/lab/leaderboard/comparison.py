@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from starid.arrays import Array
 from starid.attitude import Attitude
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.catalog import StarCatalog, load_catalog
@@ -27,68 +27,23 @@ from starid.lab.leaderboard.peers import (
     resident_bytes,
     version_of,
 )
-from starid.lab.leaderboard.scenes import Scene, SceneMaker, SceneSettings
+from starid.lab.leaderboard.scenes import Scene, SceneMaker, SceneSettings, read_scenes
 
-Array = NDArray[np.float64]
+_GROUPS: Final = read_scenes()
 
-ROWS: Final[dict[str, SceneSettings]] = {
-    "0.5": SceneSettings(5.5, 0.5),
-    "1": SceneSettings(5.5, 1.0),
-    "2": SceneSettings(5.5, 2.0),
-    "3": SceneSettings(5.5, 3.0),
-    "0.5, 5, 0": SceneSettings(5.5, 0.5, false_stars=5),
-    "0.5, 0, 3": SceneSettings(5.5, 0.5, missing_stars=3),
-    "2, 5, 3": SceneSettings(5.5, 2.0, false_stars=5, missing_stars=3),
-    "V ≤ 4, 1, 3, 1": SceneSettings(4.0, 1.0, false_stars=3, missing_stars=1),
-    "100 random points": SceneSettings(5.5, random_points=(100, 100)),
-    "30–150 random points": SceneSettings(5.5, random_points=(30, 150)),
-    "0.5, half covered": SceneSettings(5.5, 0.5, covered=0.5),
-    "0.5, 100 false, V ≤ 4.75": SceneSettings(4.75, 0.5, false_stars=100),
-    "0.5, 200 false in half the field": SceneSettings(5.5, 0.5, false_stars=200, cluttered=0.5),
-    "8°, V ≤ 7.5, 0.5": SceneSettings(7.5, 0.5, field_deg=8.0),
-    "20°, V ≤ 6.5, 0.5": SceneSettings(6.5, 0.5, field_deg=20.0),
-    "62°, V ≤ 5, 0.5": SceneSettings(5.0, 0.5, field_deg=62.0),
-    "dense, V ≤ 7.8, 0.5": SceneSettings(7.8, 0.5),
-    "tracking, 3 stars": SceneSettings(5.5, 0.5, kept=3, predicted_px=3.0),
-    "tracking, 2 stars": SceneSettings(5.5, 0.5, kept=2, predicted_px=3.0),
-    "tracking, 2 stars, 0.05": SceneSettings(5.5, 0.05, kept=2, predicted_px=0.3),
-    "tracking, 1 star, 2 false": SceneSettings(5.5, 0.5, kept=1, false_stars=2, predicted_px=3.0),
-    "tracking, 1 star, 1 false, 0.05": SceneSettings(5.5, 0.05, kept=1, false_stars=1, predicted_px=0.3),
-    "dense, mirrored sky": SceneSettings(8.0, 0.5, mirrored=True),
-    "1000–1500 random points": SceneSettings(5.5, random_points=(1000, 1500)),
-    "12°, V ≤ 6, exact": SceneSettings(6.0, 0.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
-    "12°, V ≤ 6, 1": SceneSettings(6.0, 1.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
-    "12°, V ≤ 6, 2": SceneSettings(6.0, 2.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
-    "12°, V ≤ 6, 2, 12 stars": SceneSettings(
-        6.0, 2.0, magnitude_noise=0.0, least_stars=12, field_deg=12.0, side_px=1024
-    ),
-    "12°, V ≤ 6, 3": SceneSettings(6.0, 3.0, magnitude_noise=0.0, field_deg=12.0, side_px=1024),
-    "12°, V ≤ 6, 3, 12 stars": SceneSettings(
-        6.0, 3.0, magnitude_noise=0.0, least_stars=12, field_deg=12.0, side_px=1024
-    ),
-    "12°, V ≤ 6, 2, 0.3 mag": SceneSettings(6.0, 2.0, magnitude_noise=0.3, field_deg=12.0, side_px=1024),
-    "8°, V ≤ 7.5, 1, 0.4 mag": SceneSettings(7.5, 1.0, magnitude_noise=0.4, field_deg=8.0, side_px=512),
-    "12°, V ≤ 6, 3 of 2048 px": SceneSettings(6.0, 3.0, magnitude_noise=0.0, field_deg=12.0, side_px=2048),
-    "20°, V ≤ 5.5, 0.2, 162 false": SceneSettings(
-        5.5, 0.2, false_stars=162, magnitude_noise=0.0, field_deg=20.0, side_px=1024
-    ),
-    "20°, V ≤ 5.5, 0.2, 405 false": SceneSettings(
-        5.5, 0.2, false_stars=405, magnitude_noise=0.0, field_deg=20.0, side_px=1024
-    ),
-}
-"""Row of the report → scene. The name gives "σ px, false, missing"; stars are to V 5.5 in 42° unless it says otherwise."""
+ROWS: Final = {name: settings for group in _GROUPS.values() for name, settings in group.items()}
+"""Row of the report → scene, as in `scenes.toml`."""
 
-PAPERS: Final = tuple(ROWS)[-11:]
-"""Scenes of the sensors that the papers of the published algorithms simulate; those with at least 12
-stars leave out sparse fields. The last two have 6 and 15 times as many false stars as a field has stars on average."""
+PAPERS: Final = tuple(_GROUPS["papers"])
+"""Scenes of the sensors that the papers of the published algorithms simulate."""
 
 WINDOW_SIGMAS: Final = 20.0 / 3.0
 """Largest distance of a star from its predicted position, as given to solvers that track, in standard deviations."""
 
-STANDARD: Final = tuple(ROWS)[:9]
+STANDARD: Final = tuple(_GROUPS["standard"])
 """Rows of the published comparison."""
 
-LEADERBOARD: Final = (*STANDARD, *tuple(ROWS)[13:22])
+LEADERBOARD: Final = (*STANDARD, *_GROUPS["fields_and_tracking"])
 """Rows of the published comparison, other fields, a dense one, and a few stars in tracking."""
 
 WRONG_ARCSEC: Final = 360.0

@@ -199,10 +199,14 @@ def _custom(name: str, camera: Camera, stars: StarCatalog) -> Solver:
     module, _, function = name.partition(":")
     try:
         maker = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:  # a ValueError if the name is empty
         raise InvalidSolverError(
             f"solver {name!r}: {error}; add the module's folder to PYTHONPATH"
         ) from error
+    if not callable(maker):
+        raise InvalidSolverError(
+            f"solver {name!r}: a {type(maker).__name__} is not callable; name a function"
+        )
     solver = maker(camera, stars)
     if not isinstance(solver, Solver):
         raise InvalidSolverError(

@@ -9,7 +9,10 @@ these 20, and double stars within 2 px are merged.
 from __future__ import annotations
 
 import math
+import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -18,6 +21,9 @@ from numpy.typing import NDArray
 from starid.attitude import Attitude, random_attitude
 from starid.camera import Camera
 from starid.catalog import StarCatalog
+
+BRIGHTEST: Final = 20
+"""Number of brightest stars from which false magnitudes and missing stars are drawn."""
 
 MAX_DRAWS: Final = 1000
 """Maximum number of attitudes drawn for one scene."""
@@ -37,9 +43,7 @@ class SceneSettings:
         Number of stars added and removed.
     magnitude_noise : float
         One sigma, magnitudes.
-    brightest : int
-        Number of brightest stars from which false magnitudes and missing stars are drawn.
-    random_points : tuple (least, most) or None
+    random_points : (least, most) or None
         Instead of stars, this many points at uniform positions with magnitudes of the field's stars.
     covered : float
         Fraction of the field without stars, behind a straight edge of random direction.
@@ -63,8 +67,7 @@ class SceneSettings:
     false_stars: int = 0
     missing_stars: int = 0
     magnitude_noise: float = 0.1
-    brightest: int = 20
-    random_points: tuple[int, int] | None = None
+    random_points: Sequence[int] | None = None
     covered: float = 0.0
     cluttered: float = 1.0
     kept: int | None = None
@@ -79,6 +82,15 @@ class SceneSettings:
         """Whether there is an attitude to find: at least two true stars, and not mirrored."""
         few = self.kept is not None and self.kept < 2
         return self.random_points is None and not self.mirrored and not few
+
+
+def read_scenes() -> dict[str, dict[str, SceneSettings]]:
+    """Read `scenes.toml`: group → name → settings."""
+    text = Path(__file__).with_name("scenes.toml").read_text(encoding="utf-8")
+    return {
+        group: {name: SceneSettings(**values) for name, values in members.items()}
+        for group, members in tomllib.loads(text).items()
+    }
 
 
 @dataclass(frozen=True)
@@ -142,7 +154,7 @@ class SceneMaker:
         if settings.covered > 0.0:
             seen = self._uncovered(xy, settings.covered, rng)
             rows, xy, magnitudes = rows[seen], xy[seen], magnitudes[seen]
-        pool = magnitudes[: settings.brightest]
+        pool = magnitudes[:BRIGHTEST]
         false = rng.choice(pool, settings.false_stars) if pool.size else np.empty(0)
         victims = rng.choice(pool.size, min(settings.missing_stars, pool.size), replace=False)
         rows, xy = np.delete(rows, victims), np.delete(xy, victims, axis=0)

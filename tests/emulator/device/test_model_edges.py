@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from starhil.emulator.device import quantities
 from starhil.emulator.device.device import profile_defaults
 from starhil.emulator.profile import Profile
 from starhil.protocol.icd import load_unit
@@ -30,3 +31,9 @@ def test_the_bit_rate_is_that_of_the_unit_unless_the_profile_gives_one(links, ba
     serial = icd.link.serial.model_copy(update={"baud": 57600})
     changed = replace(icd, link=icd.link.model_copy(update={"serial": serial}))
     assert profile_defaults(Profile.model_validate({"links": links}), changed)["serial_baud"] == baud
+
+
+def test_a_quantity_that_is_declared_twice_is_an_error():
+    """The second declaration would replace the first, and change the rows that report it."""
+    with pytest.raises(ValueError, match=r"frame\.late is declared twice"):
+        quantities._quantity("frame.late", bool, "", "Late.", lambda _shot: True)

@@ -104,6 +104,53 @@ def test_the_camera_of_a_profile_of_the_emulator_is_found_by_name(monkeypatch: p
     assert identify._camera("cubestar").distortion[0] == -0.15
 
 
+def test_a_profile_that_the_emulator_does_not_have_ends_with_one_line(
+    photograph: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ((name, value),) = PROJECT["project"]["entry-points"]["starid.cameras"].items()
+    monkeypatch.setattr(identify, "entry_points", lambda group: [EntryPoint(name, value, group)])
+    status, out, said = run_command_line(
+        "identify", str(photograph), "--profile", "cubestarr", program="starid"
+    )
+    assert (status, out) == (2, "")
+    assert said.startswith("starid: profile 'cubestarr': not found; ")
+    assert said.endswith("did you mean cubestar?\n")
+    assert said.count("\n") == 1
+
+
+def test_an_annotated_photograph_is_named_in_the_output(photograph: Path, tmp_path: Path) -> None:
+    marked = tmp_path / "new" / "marked.png"
+    status, out, _ = run_command_line(
+        "annotate", str(photograph), "--fov", "20", "-o", str(marked), program="starid"
+    )
+    assert status == 0
+    assert out.splitlines()[-1] == f"written: {marked}"
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("bench", "--frames", "1", "--seed", "-1"), "'--seed': must be at least 0"),
+        (("bench", "--frames", "1", "--budget", "-1"), "'--budget': must be at least 0"),
+        (("bench", "--frames", "1", "--solvers", " , "), "--solvers: name at least one"),
+        (("bench", "--frames", "1", "-o", "FILE"), "FILE: is not a folder; name one with -o"),
+        (("reproduce", "worked-example", "-o", "FILE"), "FILE: is not a folder; name one with -o"),
+    ],
+)
+def test_the_laboratory_rejects_what_it_cannot_do_before_the_work(
+    tmp_path: Path, words: tuple[str, ...], why: str
+) -> None:
+    file = tmp_path / "notes.txt"
+    file.touch()
+    status, out, said = run_command_line(
+        *(word.replace("FILE", str(file)) for word in words), program="starid"
+    )
+    assert (status, out) == (2, "")
+    assert said.startswith("starid: ")
+    assert why.replace("FILE", str(file)) in said
+    assert said.count("\n") == 1
+
+
 def test_an_extra_that_is_not_installed_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     status, out, said = run_command_line("reproduce", "-o", str(tmp_path), program="starid")

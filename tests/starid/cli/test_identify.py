@@ -134,12 +134,14 @@ def test_an_image_of_another_size_is_rejected(tmp_path):
     assert isinstance(result.exception, StaridError)
     assert "640×480" in str(result.exception)
     assert "937×937" in str(result.exception)
+    assert "--fov auto" in str(result.exception)
 
 
 @pytest.mark.parametrize(
     ("options", "named"),
     [
         (["--fov", "wide"], "'wide'"),
+        (["--fov", "400"], "identify --fov: must be degrees in (0, 170]"),
         (["--fov", "11", "--profile", "cubestar"], "give one of them"),
         (["--fov", "11", "--model", "fisheye"], "pinhole or equidistant"),
     ],
@@ -158,6 +160,7 @@ def test_colour_is_rejected_but_where_the_image_may_come_from_any_camera(tmp_pat
     cv2.imwrite(str(image), noise)
     refused = starid("identify", str(image))
     assert "3 channels" in str(refused.exception)
+    assert "--fov" in str(refused.exception)
     looked_at = starid("identify", str(image), "--fov", "11", "--json")
     assert looked_at.exit_code == 1
     found = json.loads(looked_at.stdout)

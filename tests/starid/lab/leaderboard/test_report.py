@@ -142,7 +142,13 @@ def test_settings_of_ruststartracker_scale_with_the_field(monkeypatch) -> None:
 
 @pytest.mark.parametrize(
     ("name", "words"),
-    [("astrology", "MODULE:FUNCTION"), ("no_such_module:make", "PYTHONPATH"), ("oracle:nothing", "NoneType")],
+    [
+        ("astrology", "MODULE:FUNCTION"),
+        ("no_such_module:make", "PYTHONPATH"),
+        ("oracle:nothing", "NoneType"),
+        ("os:path", "not callable"),
+        (":make", "Empty module name"),
+    ],
 )
 def test_a_solver_that_is_none_is_named(oracle, name: str, words: str) -> None:
     with pytest.raises(StaridError, match=words):
