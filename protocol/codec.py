@@ -238,8 +238,7 @@ class Field(FieldKeys):
                 return self._text_to_raw(value, where, encoding, index)
             case "flag" | "enum":
                 raw = self._named_to_raw(value, where, check=check, index=index)
-                low, high = self.raw_limits
-                if check and not saturate and not low <= raw <= high:
+                if check and not saturate and not self.raw_limits[0] <= raw <= self.raw_limits[1]:
                     raise self._outside(value, where, index)
                 return raw
             case "float":
@@ -315,11 +314,11 @@ class Field(FieldKeys):
 
     def _named_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
         """Return the number of a flag or of a member of the enumeration."""
-        low, high = self.type_limits
         if self.enum is None:
             if isinstance(value, bool) or value in (0, 1):
                 return int(value)
             raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
+        low, high = self.type_limits
         if not check and type(value) is int and low <= value <= high:
             return int(value)
         return self.enum.number(value, where, index=index)

@@ -32,7 +32,7 @@ class MessageFormat:
     header: Header
     classes: Sequence[str] = ()
 
-    @property
+    @cached_property
     def request_size(self) -> int | None:
         """Bytes of each request, if all have the same size."""
         return self.model.request_size if isinstance(self.model, FixedFraming) else None

@@ -103,6 +103,7 @@ class SerialStack:
         self.byte_order: Final = byte_order
         self.dialects: Final = dialects_of(link)
         self._plugin = plugin
+        self._unanswered = link.framing.unanswered if isinstance(link.framing, CubeSpaceFraming) else []
         self._silent = {row.id for row in rows if not self.answers(row)}
         self._rows = {(row.klass, row.id): row for row in rows}
         self._rows_by_id = {row.id: row for row in reversed(self.rows)}
@@ -125,6 +126,8 @@ class SerialStack:
         self.replies: Final = self.reply_formats.other
         """Format of replies without a class, and of texts."""
         self._in_dialect: Final = {dialect: DialectReplies(dialect) for dialect in self.dialects}
+        default = default_dialect(self.dialects)
+        self._in_default_dialect = None if default is None else self._in_dialect[default]
         self._check_headers()
         headers = [self.request_header, self.reply_header]
         headers += [head for replies in self._in_dialect.values() for head in replies.headers.values()]
@@ -195,14 +198,15 @@ class SerialStack:
 
     def in_dialect(self, dialect: Dialect | None) -> DialectReplies | None:
         """Return the replies in a dialect; None if the unit has no dialects."""
-        chosen = dialect if dialect in self.dialects else default_dialect(self.dialects)
-        return None if chosen is None else self._in_dialect[chosen]
+        return (
+            self._in_default_dialect
+            if dialect is None
+            else self._in_dialect.get(dialect, self._in_default_dialect)
+        )
 
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on the line, of which there may be fewer than on other links."""
-        framing = self.link.framing
-        silent = isinstance(framing, CubeSpaceFraming) and row.name in framing.unanswered
-        return () if silent else row.answers
+        return () if row.name in self._unanswered else row.answers
 
     def _check_headers(self) -> None:
         for where, header in (("request", self.request_header), ("reply", self.reply_header)):
