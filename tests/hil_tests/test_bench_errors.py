@@ -159,6 +159,7 @@ def test_a_command_runs_with_its_parent_and_ends_at_once_if_that_has_ended():
 
 def test_the_first_signal_interrupts_and_further_ones_are_ignored():
     before = signal.getsignal(signal.SIGTERM)
+    hangup = signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored under nohup
 
     def send(number):
         os.kill(os.getpid(), number)
@@ -172,6 +173,7 @@ def test_the_first_signal_interrupts_and_further_ones_are_ignored():
             send(signal.SIGTERM)
         os.kill(os.getpid(), signal.SIGTERM)  # would end pytest
     assert signal.getsignal(signal.SIGTERM) is before
+    signal.signal(signal.SIGHUP, hangup)
 
 
 def test_signals_stay_as_they_are_in_other_threads_and_where_they_are_ignored():

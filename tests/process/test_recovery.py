@@ -16,7 +16,7 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.errors import DeviceError
+from starhil.hil_tests.errors import BenchError, DeviceError
 from starhil.hil_tests.private_can_bus import HubThread
 from starhil.hil_tests.raw_traffic import send_and_listen
 from starhil.protocol.can_framing import CanFrame
@@ -212,6 +212,5 @@ def test_a_port_that_another_program_holds_is_refused(emulator, own):
     with ObcClient.open(serial=taken) as obc:
         wait_until(lambda: answers(obc))
         baud = [f"links.serial.baud={FAST_BAUD}"]
-        with pytest.raises(Exception, match="status 2") as caught:
+        with pytest.raises(BenchError, match=r"^serial /dev/no-such-tty: no such port"):
             own(serial="/dev/no-such-tty", can="off", settings=baud)
-        assert "/dev/no-such-tty" in str(caught.value)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 
 import pytest
 from typer.testing import CliRunner
@@ -18,7 +19,7 @@ from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.names import bundled_units
+from starhil.protocol.names import bundled_units, find
 
 
 def unit(*words: str):
@@ -102,8 +103,9 @@ def test_an_unknown_unit_is_answered_with_similar_names():
 
 
 def test_a_profile_names_its_unit_by_name_or_by_a_folder_beside_it(tmp_path):
-    profile = tmp_path / "profile.toml"
-    for unit_, source in (("sagitta", "sagitta"), ("mine", str(tmp_path / "mine")), ("/a/b", "/a/b")):
+    profile, mine = tmp_path / "profile.toml", tmp_path / "mine"
+    shutil.copytree(find("unit", "sagitta"), mine)
+    for unit_, source in (("sagitta", "sagitta"), ("mine", str(mine)), (str(mine), str(mine))):
         profile.write_text(f'extends = "cubestar"\nunit = "{unit_}"\n', encoding="utf-8")
         assert load_profile(str(profile)).unit_source == source
 
