@@ -205,6 +205,7 @@ class Head:
             log.info("pipeline ready: %d stars, %.2f s", warm.stars, warm.seconds)
             self._record("ready")
             device.signals.mode_changed.connect(self._mode_changed)
+            device.signals.restarted.connect(self._device_reset)
             self.pipeline_ready(warm)
         except EmulatorError as error:
             raise EmulatorError(f"{self.profile.source_of(error)}: {error}") from None
@@ -222,10 +223,19 @@ class Head:
             self._awake.set()
 
     def pipeline_ready(self, warm: PipelineReady) -> None:
-        """Pass the camera of a ready pipeline to the device."""
+        """Pass the camera of a ready pipeline to the device, and the device's parameters to the pipeline."""
         self.warm = warm
         self.device.pipeline_ready(camera_constants(warm.camera))
+        self._prepare_index()
         self._on_warm()
+
+    def _prepare_index(self) -> None:
+        """Have the star index built for the parameters with which the device starts, before its first frame."""
+        self.imager.prepare(self.device.cycle.index_request())
+
+    def _device_reset(self, _cause: str) -> None:
+        if self.device.warm:
+            self._prepare_index()
 
     def start_time(self) -> None:
         """Run the events of the device from now on."""

@@ -287,19 +287,21 @@ class SessionRunner:
                     problems.append(last.problem)
                 crosses += [last.figures[key] for key in ("cross_boresight_arcsec",) if key in last.figures]
                 time.sleep(max(0.0, begin + count * step.every_s - time.monotonic()))
-        good = 1.0 - len(problems) / count
+        good = count - len(problems)
+        good_share = good / count
         figures = {
             "samples": float(count),
-            "good": good,
+            "good_share": good_share,
             "latency_p50_ms": percentile(latencies, 0.5) * MS_PER_S,
             "latency_p99_ms": percentile(latencies, 0.99) * MS_PER_S,
         }
         if crosses:
             figures["cross_boresight_median_arcsec"] = percentile(crosses, 0.5)
             figures["cross_boresight_max_arcsec"] = max(crosses)
-        detail = f"{count} samples in {step.file}, " + " ".join(f"{k}={v:.4g}" for k, v in figures.items())
+        measured = [f"{name}={v:.4g}" for name, v in figures.items() if name not in ("samples", "good_share")]
+        detail = f"{count} samples in {step.file}, {good} good, {' '.join(measured)}"
         problem = None
-        if good < step.at_least:
+        if good_share < step.at_least:
             problem = f"{len(problems)} of {count} samples did not meet the expectations; the last one: {problems[-1]}"
         elif count < step.min_samples:
             problem = (

@@ -53,25 +53,36 @@ def warm(
 ) -> None:
     """Compile the kernels and build the star index, as the first start of a profile does.
 
-    Progress is shown on stderr. Kernels are the same for all profiles; the star index depends on the camera.
+    Progress is shown on stderr. Kernels are the same for all profiles; the star index depends on the camera and the
+    parameters.
     """
     from dataclasses import replace
 
+    from starhil.emulator.device.device import profile_defaults
+    from starhil.emulator.device.parameters import Parameters, solver_settings
     from starhil.emulator.pipeline.imager import WorkerImager
+    from starhil.emulator.pipeline.messages import IndexRequest, camera_constants
     from starhil.emulator.pipeline.worker_process import WorkerProcess
     from starhil.emulator.pipeline_setup import pipeline_setup
     from starhil.emulator.profile import DEFAULT_PROFILE, load_profile
+    from starhil.protocol.icd import load_unit
     from starid.cache import cache_dir, kernels_written_since
 
     begin_s = time.time()
-    setup = pipeline_setup(load_profile(profile or DEFAULT_PROFILE))
+    loaded = load_profile(profile or DEFAULT_PROFILE)
+    icd = load_unit(loaded.unit_source)
+    parameters = Parameters(icd, profile_defaults(loaded, icd))
+    setup = pipeline_setup(loaded)
     setup = replace(setup, previews=True, sky={"bodies": "ephemeris"})  # these have kernels of their own
 
     async def start() -> None:
         imager = WorkerImager(setup, WorkerProcess())
         progress = asyncio.create_task(report_slow_start())
         try:
-            await imager.start()
+            constants = camera_constants((await imager.start()).camera)
+            parameters.adopt_defaults({k: v for k, v in constants.items() if k not in loaded.parameters})
+            imager.prepare(IndexRequest(solver_settings(parameters)))
+            await imager.settle()
         finally:
             progress.cancel()
             await imager.close()

@@ -35,6 +35,7 @@ from starhil.emulator.pipeline.messages import (
     Failure,
     FrameRequest,
     FrameResult,
+    IndexRequest,
     Triple,
 )
 from starhil.emulator.profile import Profile
@@ -240,6 +241,10 @@ class FrameCycle:
                 "corrects_aberration has no effect: the sky has no aberration; give it a date, sky.date or sky.bodies=ephemeris"
             )
         return None
+
+    def index_request(self) -> IndexRequest:
+        """Return the request for the star index of the current parameters."""
+        return IndexRequest(solver_settings(self._parameters), self.upsets)
 
     def single_frame(self, mid_ns: int) -> FrameRequest:
         """Return the request for an exposure that is not solved, with a given simulation time of mid-exposure."""

@@ -236,9 +236,9 @@ _frame("frame.detect", float, "s", "Duration of the detection.", lambda frame: f
 _frame("frame.identify", float, "s", "Duration of the identification.", lambda frame: float(frame.identify_s))
 _named("frame.mode", "mode", "Mode of the device at the exposure; without a frame, the current mode.",
        lambda shot: (shot.device.modes.mode if shot.frame is None else shot.frame.mode).value)
-_named("frame.method", "identification_mode", "How the frame was identified.",
+_named("frame.method", "identification_mode", "How the identification was attempted, also if it failed.",
        lambda shot: None if shot.frame is None else "tracking" if shot.frame.result.tracked else "lost_in_space")
-_frame("frame.tracking", bool, "", "Whether the frame was solved by tracking.",
+_frame("frame.tracking", bool, "", "Whether identification was by tracking, also if it failed.",
        lambda frame: bool(frame.result.tracked))
 _frame("frame.capture_ok", bool, "", "Whether the capture succeeded.",
        lambda frame: frame.reason not in {"no_frame", "processing_error"})

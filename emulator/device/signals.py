@@ -5,7 +5,7 @@
     cycle ──exposed──► images              cycle ──frame_published──► device, subscriptions, CANopen, logs, console
     modes ──mode_changed──► device, subscriptions, CANopen, head, console
     parameters ──parameters_changed──► device, subscriptions, links
-    device ──started──► subscriptions, serial link          device ──restarted──► links, revival of the pipeline
+    device ──started──► subscriptions, serial link          device ──restarted──► links, head, revival of the pipeline
     subscriptions ──row_due──► requests    requests ──unsolicited──► links
     faults ──faults_changed──► recording
 

@@ -24,6 +24,7 @@ from starhil.emulator.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
+    IndexRequest,
     MatchedStar,
     PipelineEnded,
     PipelineReady,
@@ -93,6 +94,9 @@ class ErrorModelImager:
         """End unexpectedly."""
         self._running = False
         self.ended.emit(reason)
+
+    def prepare(self, request: IndexRequest) -> None:
+        """Do nothing: there is no star index."""
 
     def submit(self, request: PipelineRequest, done: ReplyCallback) -> None:
         """Answer a request."""

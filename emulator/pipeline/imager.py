@@ -23,6 +23,8 @@ from starhil.emulator.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
+    IndexReady,
+    IndexRequest,
     PipelineEnded,
     PipelineReady,
     PipelineSetup,
@@ -34,7 +36,7 @@ from starhil.emulator.signals import Signal
 log = logging.getLogger("starhil.pipeline")
 
 PipelineRequest: TypeAlias = FrameRequest | ImageRequest
-PipelineReply: TypeAlias = FrameResult | ImageResult | Failure
+PipelineReply: TypeAlias = FrameResult | ImageResult | IndexReady | Failure
 ReplyCallback: TypeAlias = Callable[[PipelineReply], None]
 
 
@@ -108,10 +110,20 @@ class WorkerImager:
             return
         if self.watchers and isinstance(request, FrameRequest):
             request = replace(request, preview=True)
+        self._send(self._writer, request, done)
+
+    def prepare(self, request: IndexRequest) -> None:
+        """Let the requests after this one wait for a star index; why it cannot be built, the next frame reports."""
+        if self._writer is not None:
+            self._send(self._writer, request, lambda _reply: None)
+
+    def _send(
+        self, writer: asyncio.StreamWriter, request: PipelineRequest | IndexRequest, done: ReplyCallback
+    ) -> None:
         data = with_length(request)
         self._waiting.append(done)
         self._idle.clear()
-        self._writer.write(data)
+        writer.write(data)
 
     def _disconnect(self) -> None:
         """Close the connection; requests fail until another worker is connected."""

@@ -149,6 +149,19 @@ class FrameRequest:
 
 
 @dataclass(frozen=True)
+class IndexRequest:
+    """Request to build the star index that frames with these settings need; those after it wait for it."""
+
+    settings: SolverSettings
+    upsets: tuple[CatalogUpset, ...] = ()
+
+
+@dataclass(frozen=True)
+class IndexReady:
+    """Message that the star index of a request is built."""
+
+
+@dataclass(frozen=True)
 class Preview:
     """An image for display, and its overlay."""
 
@@ -183,7 +196,7 @@ class FrameResult:
     reason: str = "no_frame"
     """Whether the attitude is valid, and the reason if not, as named in the interface definition."""
     tracked: bool = False
-    """Whether the frame was solved from the prediction."""
+    """Whether it was solved from the prediction, or, if invalid, whether that was attempted."""
     quaternion_xyzw: Quaternion = (0.0, 0.0, 0.0, 0.0)
     """Attitude ICRS→sensor at mid-exposure; zeros if invalid."""
     sigma_cross_arcsec: float = 0.0

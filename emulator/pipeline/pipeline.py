@@ -24,6 +24,8 @@ from starhil.emulator.pipeline.messages import (
     FrameResult,
     ImageRequest,
     ImageResult,
+    IndexReady,
+    IndexRequest,
     MatchedStar,
     PipelineReady,
     PipelineSetup,
@@ -154,9 +156,14 @@ class Pipeline:
         self._last = None
         gc.enable()
 
-    def handle(self, request: FrameRequest | ImageRequest) -> FrameResult | ImageResult | Failure:
+    def handle(
+        self, request: FrameRequest | ImageRequest | IndexRequest
+    ) -> FrameResult | ImageResult | IndexReady | Failure:
         """Process a request; return a failure if the settings make it impossible."""
         try:
+            if isinstance(request, IndexRequest):
+                self._identifiers.build(self._identifier_setup(request))
+                return IndexReady()
             if isinstance(request, ImageRequest):
                 return self._scaled_image(request)
             return self._process_frame(request)
@@ -267,7 +274,7 @@ class Pipeline:
             return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
         return solution
 
-    def _identifier_setup(self, request: FrameRequest) -> StarIdentifierSetup:
+    def _identifier_setup(self, request: FrameRequest | IndexRequest) -> StarIdentifierSetup:
         """Return the setup of the star identifier for the parameters and the calibrated camera."""
         setup, settings = self._setup, request.settings
         options: dict[str, Any] = {**setup.identifier}

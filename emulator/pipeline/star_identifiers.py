@@ -109,7 +109,7 @@ def _known_options(algorithm: type) -> dict[str, str]:
 class StarIdentifiers:
     """Provides the star identifier for a setup, or the previous one while it is being built.
 
-    It is built in a thread if `in_background`; otherwise `get` blocks until that is done.
+    It is built in a thread if `in_background`; otherwise, and for the first one, `get` blocks until that is done.
     """
 
     def __init__(self, make: Callable[[StarIdentifierSetup], StarIdentifier], *, in_background: bool) -> None:
@@ -123,9 +123,7 @@ class StarIdentifiers:
         """Return the current star identifier, and whether it is the one for this setup."""
         self._adopt_finished_build()
         if self._current is None or not self._in_background:
-            if self._current is None or self._current[0] != setup:
-                self._current = (setup, self._make(setup))
-            return self._current[1], True
+            return self.build(setup), True
         current_setup, identifier = self._current
         if current_setup == setup:
             return identifier, True
@@ -135,6 +133,13 @@ class StarIdentifiers:
         if self._build is None:
             self._build = (setup, self._start_build(setup))
         return identifier, False
+
+    def build(self, setup: StarIdentifierSetup) -> StarIdentifier:
+        """Return the star identifier for this setup, and discard a build in the background."""
+        self._build = None
+        if self._current is None or self._current[0] != setup:
+            self._current = (setup, self._make(setup))
+        return self._current[1]
 
     def _adopt_finished_build(self) -> None:
         """Switch to a finished build, even if the setup has changed since; the next one will replace it."""

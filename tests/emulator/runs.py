@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from starhil.emulator.device.pending import PendingAnswer
 from starhil.emulator.pipeline.imager import PipelineReply, PipelineRequest, ReplyCallback
-from starhil.emulator.pipeline.messages import FrameRequest, PipelineReady
+from starhil.emulator.pipeline.messages import FrameRequest, IndexRequest, PipelineReady
 from starhil.emulator.signals import Signal
 from starhil.protocol.messages import ErrorCode, Request
 
@@ -42,6 +42,9 @@ class FakeImager(DirectImager):
         if self.watchers and isinstance(request, FrameRequest):
             request = replace(request, preview=True)
         super().submit(request, done)
+
+    def prepare(self, request: IndexRequest) -> None:
+        """There is no star index."""
 
     async def start(self) -> PipelineReady:
         return PipelineReady(CAMERA, 5, 0.0)

@@ -339,6 +339,10 @@ def test_samples_go_to_a_csv_file_with_all_digits(play, device, tmp_path):
     assert float(rows[0]["q_w"]) == pytest.approx(attitude_values(5.0)["q_w"], abs=1e-7)
     assert (rows[0]["valid"], rows[0]["mode"], float(rows[0]["time_of_exposure"])) == ("1", "tracking", 100.5)
     assert float(rows[0]["latency_ms"]) > 0.0
+    assert [item.figures["good_share"] for item in result.results] == [1.0, 0.0]
+    assert result.results[0].detail.startswith(
+        f"{len(rows)} samples in a.csv, {len(rows)} good, latency_p50_ms="
+    )
     assert result.results[0].figures["cross_boresight_max_arcsec"] == pytest.approx(5.0, abs=0.1)
 
 

@@ -20,8 +20,15 @@ from tests.emulator.workers import WORKER
 MEGABYTE = np.zeros(125_000)
 RECORDS_SETUP = (
     WORKER.replace("{", "{{").replace("}", "}}")
-    + "text = f'{{setup.previews}} {{setup.sky}}'\nopen('{path}', 'w').write(text)\nsend({outcome})\nreceive()\n"
+    + "text = f'{{setup.previews}} {{setup.sky}}'\nopen('{path}', 'w').write(text)\nsend({outcome})\n"
 )
+RECORDS_INDEX = """
+from starhil.emulator.pipeline.messages import IndexReady
+settings = receive().settings
+open({path!r}, "w").write(f"{{settings.limiting_magnitude}} {{settings.focal_length}} {{settings.centroid_x}}")
+send(IndexReady())
+receive()
+"""
 
 
 @pytest.fixture
@@ -113,15 +120,18 @@ def test_kernels_are_counted_from_a_time_on(folder: Path) -> None:
     assert [cache.kernels_written_since(begin_s) for begin_s in (0, 2000, 4000)] == [3, 2, 0]
 
 
-def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel(
+def test_warming_the_cache_starts_a_pipeline_that_needs_every_kernel_and_the_index_of_the_device(
     folder: Path, worker: Callable[..., object]
 ) -> None:
-    worker(RECORDS_SETUP.format(path=folder.parent / "setup", outcome=f"PipelineReady({CAMERA}, 5, 0.0)"))
-    status, out, said = run_command_line("cache", "warm", "ideal")
+    setup, index = folder.parent / "setup", folder.parent / "index"
+    ready = RECORDS_SETUP.format(path=setup, outcome=f"PipelineReady({CAMERA}, 5, 0.0)")
+    worker(ready + RECORDS_INDEX.format(path=str(index)))
+    status, out, said = run_command_line("cache", "warm", "cubestar")
     assert (status, said) == (0, "")
     assert out.startswith("0 kernels compiled in ")
     assert str(folder) in out
-    assert (folder.parent / "setup").read_text() == "True {'bodies': 'ephemeris'}"
+    assert setup.read_text() == "True {'bodies': 'ephemeris'}"
+    assert index.read_text() == "4.2 1247.35 470.32"  # as in the profile
 
 
 def test_a_failure_to_warm_the_cache_is_one_line(folder: Path, worker: Callable[..., object]) -> None:

@@ -90,6 +90,15 @@ def test_only_the_last_wish_is_made_after_the_one_under_way(factory, beside):
     assert beside.get(WIDE) == (Made(WIDE), True)
 
 
+def test_one_built_at_once_discards_the_build_in_the_background(factory, beside):
+    assert beside.get(SHALLOW) == (Made(DEEP), False)
+    factory.go.set()
+    assert beside.build(WIDE) == Made(WIDE)
+    factory.wait_for_thread()
+    factory.wait_for_thread()
+    assert beside.get(WIDE) == (Made(WIDE), True)
+
+
 def test_returning_to_the_current_solver_takes_no_time(factory, beside):
     assert beside.get(SHALLOW) == (Made(DEEP), False)
     assert beside.get(DEEP) == (Made(DEEP), True)

@@ -1,0 +1,96 @@
+"""The first frame after a start is solved like those after it: with the star index for the device's parameters."""
+
+import asyncio
+
+import pytest
+
+from starhil.emulator.profile import load_profile
+from starhil.emulator.run import Run
+from tests.emulator.runs import FirstHead, command
+
+WITHIN_S = 60.0
+FRAMES = 3
+FEWER_STARS = {"limiting_magnitude": 3.0}
+LOST_IN_SPACE = "parameters.start_mode=lost_in_space"
+
+pytestmark = pytest.mark.process
+
+
+def run(scenario, state_dir, *settings, clock="scaled:2"):
+    """Run a scenario with a miscalibrated device that keeps its state in a folder."""
+    links = ("links.serial.port=off", "links.can.channel=off")
+    state = (f"run.clock={clock}", f"run.state_dir={state_dir}")
+    profile = load_profile("cubestar", [*links, *state, LOST_IN_SPACE, *settings])
+
+    async def whole():
+        run = Run([profile])
+        try:
+            await run.open()
+            run.begin()
+            await asyncio.wait_for(run.ready(), WITHIN_S)
+            emulation = FirstHead(run)
+            emulation.shots = []
+            emulation.device.signals.frame_published.connect(emulation.shots.append)
+            return await asyncio.wait_for(scenario(emulation), WITHIN_S)
+        finally:
+            await run.close()
+
+    return asyncio.run(whole())
+
+
+async def first_frames(emulation):
+    """Wait for frames from now on; return the results of the first ones."""
+    emulation.shots.clear()
+    if emulation.stepper is not None:
+        await emulation.stepper.step(FRAMES + 1.0)
+    while len(emulation.shots) < FRAMES:
+        await asyncio.sleep(0.01)
+    return [shot.result for shot in emulation.shots[:FRAMES]]
+
+
+def rows(results):
+    """Return what the index decides of each frame."""
+    return [(result.index, result.index_pending, result.valid, result.matched) for result in results]
+
+
+def test_it_is_the_same_on_the_real_and_on_the_stepped_clock(tmp_path):
+    stepped = run(first_frames, tmp_path, clock="stepped")
+    real = run(first_frames, tmp_path, clock="real")
+    assert rows(real) == rows(stepped)
+    assert [result.index_pending for result in real] == [False] * FRAMES
+
+
+def test_it_is_solved_with_the_stored_parameters(tmp_path):
+    async def save(emulation):
+        emulation.device.parameters.set(FEWER_STARS)
+        emulation.device.save_parameters()
+
+    run(save, tmp_path)
+    results = run(first_frames, tmp_path)
+    assert not any(result.index_pending for result in results)
+    assert len({result.matched for result in results}) == 1
+
+
+def test_after_a_reset_it_is_solved_with_the_restored_parameters(tmp_path):
+    async def reset(emulation):
+        emulation.device.parameters.set(FEWER_STARS)
+        pending = [result.index_pending for result in await first_frames(emulation)]
+        assert not pending[-1]  # the index of the changed parameter is in force
+        emulation.device.reset("command")
+        return await first_frames(emulation)
+
+    assert not any(result.index_pending for result in run(reset, tmp_path))
+
+
+def test_after_the_end_of_the_pipeline_it_is_solved_with_the_current_parameters(tmp_path):
+    async def kill(emulation):
+        emulation.imager.worker.process.kill()
+        while emulation.device.modes.mode.value != "error":
+            await asyncio.sleep(0.01)
+        while not emulation.device.warm:
+            await asyncio.sleep(0.01)
+        command(emulation, "set_mode", mode="standby")
+        command(emulation, "set_mode", mode="lost_in_space")
+        return await first_frames(emulation)
+
+    assert not any(result.index_pending for result in run(kill, tmp_path))
