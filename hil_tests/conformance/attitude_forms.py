@@ -54,6 +54,11 @@ class Form:
     read: Callable[[Sequence[float], Conventions], Axes]
     lengths: tuple[float, float] | None = None
 
+    @property
+    def has_inverse(self) -> bool:
+        """Whether the values could state the inverse rotation: all but RA and Dec."""
+        return self.read is not _radec
+
 
 def axes_of(attitude: Quaternion) -> Axes:
     """Return the axes of a sensor with an attitude from ICRS."""
