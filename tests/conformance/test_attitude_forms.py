@@ -113,6 +113,17 @@ def test_a_conjugated_quaternion_fails_beside_another_form(tmp_path):
     )
 
 
+@pytest.mark.parametrize("sign", ["positive", "any"])
+def test_a_negative_scalar_part_fails_where_its_sign_is_fixed(sign, tmp_path):
+    conventions = f'{CONVENTIONS[0]}\nscalar_sign = "{sign}"'
+    unit = write(tmp_path, "unit", conventions)
+    served = write(tmp_path, "served", conventions, dict.fromkeys(("q_w", "q_x", "q_y", "q_z"), -1.0))
+    outcome = outcome_of("attitude.forms", unit, served, TRUTH)
+    assert outcome.status == ("failed" if sign == "positive" else "passed")
+    if sign == "positive":
+        assert outcome.expected == "q_w not negative (R15, docs/rules.md)"
+
+
 def test_a_row_without_a_flag_is_judged_unless_it_is_zeros(tmp_path):
     flag = '{ name = "valid", type = "u8", const = 0 }'
     unit = write(tmp_path, "unit", CONVENTIONS[0], flag=flag)
