@@ -299,7 +299,7 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
 
     attitude = solution.attitude
     missing = missing_stars(solution, result.camera, result.stars, found.xy_px)
-    stars = [
+    stars: list[dict[str, Any]] = [
         {
             "hip": int(hip),
             "name": STAR_NAMES.get(int(hip)),
