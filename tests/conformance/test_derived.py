@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 
@@ -10,9 +11,9 @@ import pytest
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, identifying_stars
 from starhil.hil_tests.conformance.case import Case, CaseFailed, check
-from starhil.hil_tests.conformance.runner import identity_of, run_case
+from starhil.hil_tests.conformance.runner import identity_of, run_case, run_cases
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.suites import serial_suite
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.links import LINKS, ROWS, write_unit
 from tests.conformance.simulated import SimulatedUnit
@@ -224,6 +225,52 @@ def test_the_mode_is_commanded_by_a_telecommand_without_fields_too(mode, last, t
 def test_the_identity_of_a_device_is_read(link, unit, words):
     with SimulatedUnit(link, unit=unit) as simulated:
         assert words in identity_of(simulated.probe)
+
+
+class SlowPort:
+    """A port on which everything arrives later."""
+
+    def __init__(self, port, delay_s: float) -> None:
+        self.send, self.now = port.send, port.now
+        self.port, self.delay_s = port, delay_s
+        self.coming = []
+
+    def receive(self, timeout_s):
+        end = self.now() + timeout_s
+        while True:
+            if self.coming and self.coming[0][0] <= self.now():
+                return self.coming.pop(0)[1]
+            until = min(end, self.coming[0][0]) if self.coming else end
+            item = self.port.receive(max(0.0, until - self.now()))
+            if item is not None:
+                self.coming.append((self.now() + self.delay_s, item))
+            elif self.now() >= end:
+                return None
+
+
+@pytest.mark.parametrize("link", ["serial", "can"])
+def test_an_answer_after_the_time_out_is_named_as_late(link):
+    suite = {"serial": serial_suite, "can": can_suite}[link]
+    case = next(item for item in suite(read_unit("cubestar")) if item.id == f"{link}.telemetry.boot_status")
+    with SimulatedUnit(link) as simulated:
+        simulated.probe.port = SlowPort(simulated.probe.port, 0.3)
+        assert run_case(simulated.probe, case).status == "passed"
+        simulated.probe.port.delay_s = 0.7
+        outcome = run_case(simulated.probe, case)
+    assert outcome.status == "failed"
+    assert outcome.seen.startswith("late: telemetry")
+    assert outcome.seen.endswith(" after 0.7 s; see --time-out")
+
+
+def test_a_late_answer_with_a_sequence_number_is_named_as_late(tmp_path):
+    unit = sequenced(tmp_path, "unit", '{ role = "sequence", type = "u16" }')
+    with SimulatedUnit("serial", unit=unit) as simulated:
+        simulated.probe.port = SlowPort(simulated.probe.port, 0.7)
+        outcome = run_cases(simulated.probe, serial_suite(read_unit(unit)), port="/dev/ttyX")[0]
+    assert outcome.id == "serial.answers"
+    assert re.match(
+        r"no valid answer on /dev/ttyX: late: telemetry of .* after 0.7 s; see --time-out$", outcome.seen
+    )
 
 
 def test_a_pause_begins_when_the_line_is_free(tmp_path):
