@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from starhil.hil_tests.bench import Bench, LinkOptions
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointing
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.private_can_bus import private_can_bus
@@ -240,9 +240,7 @@ def _beside(profile: str | None, script: Path) -> str | None:
 def _pointed(script: Script) -> list[str]:
     """Return the settings that point the emulator at the script's true attitude, unless it has settings for this."""
     truth = script.truth.attitude
-    if truth is None or any(setting.strip().startswith("truth.") for setting in script.emulator.settings):
-        return []
-    return ["truth.kind=fixed", f"truth.attitude={{ quaternion_xyzw = {list(truth)} }}"]
+    return [] if truth is None else pointing(truth, script.emulator.settings)
 
 
 def _printer(*, quiet: bool) -> Callable[[StepResult], None]:
