@@ -144,6 +144,22 @@ def test_a_valid_quaternion_that_is_not_of_length_1_fails_a_safe_case(tmp_path):
     assert (outcome.status, outcome.expected) == ("failed", "a quaternion of length 1 in x, y, z, w")
 
 
+@pytest.mark.parametrize(
+    ("reported", "wanted"), [("lost_in_space", "standby"), ("standby", "lost_in_space or tracking")]
+)
+def test_a_mode_that_is_not_the_commanded_one_fails(reported, wanted, tmp_path):
+    unit = commanded(tmp_path)
+    number = {"standby": 1, "lost_in_space": 2}[reported]
+    modes = ", ".join(f'"{mode}"' for mode in ("boot", "standby", "lost_in_space", "tracking", "error"))
+    text = (unit / "unit.toml").read_text()
+    before, _, after = text.partition('map = { 0 = "boot"')
+    served = written(tmp_path, "served", f"{before}map = {{ {number} = [{modes}] }}{after.partition('}')[2]}")
+    assert outcome_of("attitude.attitude", unit).status == "passed"
+    outcome = outcome_of("attitude.attitude", unit, served)
+    assert (outcome.status, outcome.seen) == ("failed", reported)
+    assert outcome.expected == f"mode of state {wanted} within 5 s of the telecommand (R13, docs/rules.md)"
+
+
 class Rows:
     """Rows of a unit with given values, and the commands sent."""
 
