@@ -27,7 +27,7 @@ from starhil.hil_tests.results import (
     write_junit,
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.script import Control, Script, load_script
+from starhil.hil_tests.script import Control, Restart, Script, load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.cubespace import Dialect
@@ -79,6 +79,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     script = load_script(path, icd)
     if request.keep_going:
         script.defaults.keep_going = True
+    if not request.start:
+        _reject_emulator_steps(path, script)
     options = _options(request, script)
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
@@ -113,6 +115,15 @@ def run_session(request: SessionRequest) -> SessionResult:
     if not request.quiet:
         _print_summary(result, folder)
     return result
+
+
+def _reject_emulator_steps(path: Path, script: Script) -> None:
+    """Raise ScriptError if a step needs an emulator that the bench started."""
+    for step in script.steps:
+        if isinstance(step, Control | Restart):
+            action = "control" if isinstance(step, Control) else "restart"
+            why = "only an emulator that the bench started can do this: use --start"
+            raise ScriptError(f"{path.name}: step {step.number}: {action}: {why}")
 
 
 def _failed(

@@ -16,7 +16,10 @@ from starhil.hil_tests.conformance.serial_probe import SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.links import LINKS, ROWS, write_unit
+from tests.conformance.mutant_seams import handling, only_acknowledged
+from tests.conformance.mutants_units import telemetry_data
 from tests.conformance.simulated import SimulatedUnit
+from tests.test_your_unit import written as tutorial
 
 SEQUENCE = """
 framing = { kind = "length", start = [0xEB, 0x90] }
@@ -300,3 +303,96 @@ def test_the_seconds_of_a_failed_case_include_its_recovery(tmp_path):
             simulated.probe, Case("a.b.c", "a.b", "t", "c", lambda _probe: check(None, "so", "not so"))
         )
     assert outcome.seconds >= 0.05
+
+
+PARAMETERS = """
+[[telecommand]]
+id = 6
+name = "imaging"
+doc = "Parameters that contradict each other, a scale, a flag and an enumeration."
+action = "set_parameters"
+fields = [
+    { name = "exposure", type = "u16", unit = "ms", scale = 0.5, parameter = "exposure" },
+    { name = "rate", type = "f32", unit = "Hz", parameter = "update_rate" },
+    { name = "gain", type = "u16", scale = 0.01, parameter = "analog_gain" },
+    { name = "start", type = "enum8", enum = "start_mode", parameter = "start_mode" },
+    { type = "bits8", bits = [{ name = "follows", parameter = "tracking_enable" }, { width = 7 }] },
+]
+
+[[telemetry]]
+id = 132
+name = "imaging_state"
+doc = "As set."
+include = ["imaging"]
+
+[[telemetry]]
+id = 133
+name = "flag"
+doc = "Not all of them."
+fields = [{ type = "bits8", bits = [{ name = "follows", value = "parameter.tracking_enable" }, { width = 7 }] }]
+
+[[telecommand]]
+id = 7
+name = "relocate"
+doc = "Changes the address of the unit."
+action = "set_parameters"
+fields = [{ name = "address", type = "u8", parameter = "can_address" }]
+
+[[telemetry]]
+id = 134
+name = "address"
+doc = "The address."
+include = ["relocate"]
+
+[link.serial]
+"""
+
+
+def of_row(name: str, change) -> object:
+    return telemetry_data(lambda data, row: change(data) if row.name == name else data)
+
+
+def flipped(place: int):
+    return lambda data: data[:place] + bytes((data[place] ^ 1,)) + data[place + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        of_row("exposure", flipped(1)),
+        of_row("exposure", lambda _data: b"\x03\xe8"),
+        only_acknowledged(0x12),
+        handling(lambda _device, request, handle: handle(request) if request.id != 0x12 else []),
+    ],
+    ids=["a bit of the answer", "a constant", "forgotten", "unanswered"],
+)
+def test_a_parameter_of_the_tutorial_that_is_not_reported_as_set_fails(damage, tmp_path):
+    unit, case = tutorial(tmp_path / "lynx"), "settings.exposure.set_exposure"
+    assert outcome_of(case, unit).status == "passed"
+    assert outcome_of(case, unit, damage=damage).status == "failed"
+
+
+SETTINGS = ["serial.settings.numbers", "serial.settings.imaging_state.imaging"]
+
+
+def with_parameters(folder: Path) -> Path:
+    text = ROWS.format(name="parameters", order="big").removesuffix("[link.serial]\n")
+    return written(folder, "parameters", text + PARAMETERS + LINKS["sum"])
+
+
+@pytest.mark.parametrize("place", [1, 3, 7, 8, 9])
+def test_parameters_are_read_back_and_restored(place, tmp_path):
+    unit = with_parameters(tmp_path)
+    cases = {item.id: item for item in serial_suite(read_unit(unit))}
+    assert [name for name in cases if ".settings." in name] == SETTINGS
+    with SimulatedUnit("serial", unit=unit) as simulated:
+        before = simulated.probe.telemetry("imaging_state")
+        outcome = run_case(simulated.probe, cases["serial.settings.imaging_state.imaging"])
+        assert (outcome.status, outcome.expected, outcome.seen) == ("passed", "", "")
+        assert simulated.probe.telemetry("imaging_state") == before
+    assert (
+        outcome_of(
+            "settings.imaging_state.imaging", unit, damage=of_row("imaging_state", flipped(place))
+        ).status
+        == "failed"
+    )
