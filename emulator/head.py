@@ -29,6 +29,7 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.faults import Faults
 from starhil.emulator.guard import close_all
 from starhil.emulator.links.base import Link
+from starhil.emulator.links.bus_address import in_use
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.serial import SerialLink
 from starhil.emulator.links.traffic import Traffic
@@ -132,9 +133,10 @@ class Head:
 
     # --- links ---
 
-    async def open_links(self) -> None:
-        """Open ports and buses."""
+    async def open_links(self, automatic: str = "auto") -> None:
+        """Open ports and buses; `automatic` is the CAN bus for the channel `auto`, such as that of another head."""
         links, seed = self.profile.links, self.profile.run.seed
+        channel = automatic if links.can.channel == "auto" else links.can.channel
         stepped = isinstance(self.clock, SteppedClock)  # no time passes between two items of one event
         if links.serial.port != "off" and self.icd.link.serial is not None:
             self.serial = SerialLink(self.requests, self._serial_transport(paced=not stepped), seed)
@@ -142,13 +144,20 @@ class Head:
             self.ready_fields["serial"] = await self.serial.start()
             if self.serial.dialect is not None:
                 self.ready_fields["dialect"] = self.serial.dialect.value
-        if links.can.channel != "off" and self.icd.link.can is not None:
+        if channel != "off" and self.icd.link.can is not None:
             gap_s = 0.0 if stepped else links.can.frame_gap_s
-            self.can = CanLink(self.requests, self._can_transport("can", links.can.channel), gap_s, seed)
+            self.can = CanLink(self.requests, self._can_transport("can", channel), gap_s, seed)
             self._add(self.can)
             self.ready_fields["can"] = await self.can.start()
-        if links.canopen.node or (self.icd.canopen_only and links.can.channel != "off"):
-            await self._open_canopen()
+        if self._has_canopen:
+            await self._open_canopen(
+                self.ready_fields.get("can") or (automatic if channel == "off" else channel)
+            )
+
+    @property
+    def _has_canopen(self) -> bool:
+        links = self.profile.links
+        return bool(links.canopen.node) or (self.icd.canopen_only and links.can.channel != "off")
 
     def _add(self, link: Link) -> None:
         self.links.append(link)
@@ -171,16 +180,32 @@ class Head:
         )
 
     def _can_transport(self, name: str, channel: str) -> Transport[CanFrame]:
-        from starhil.protocol.transports.can import open_can
+        from starhil.protocol.transports.can import new_hub, open_can
 
-        return self._wiring.can(name, lambda: open_can(channel))
+        def make() -> Transport[CanFrame]:
+            usual = open_can(channel)
+            return usual if channel != "auto" or self._is_free(usual.description) else new_hub()
 
-    async def _open_canopen(self) -> None:
-        """Open the CANopen link on the bus of the CAN link, or on the configured bus."""
+        return self._wiring.can(name, make)
+
+    def _is_free(self, bus: str) -> bool:
+        """Return whether no other emulator uses the addresses of this head on a bus; log the one that does."""
+        parameters, numbers = self.device.parameters, {}
+        if self.icd.link.can is not None and self.profile.links.can.channel != "off":
+            numbers["address"] = int(parameters["can_address"])
+        if self._has_canopen:
+            numbers["node"] = int(parameters["canopen_node"])
+        for what, number in numbers.items():
+            why = in_use(what, bus, number)
+            if why:
+                log.warning("%s; this one starts a CAN hub on a free port", why)
+                return False
+        return True
+
+    async def _open_canopen(self, bus: str) -> None:
+        """Open the CANopen link on a bus."""
         from starhil.emulator.links.canopen import open_canopen
 
-        channel = self.profile.links.can.channel
-        bus = self.ready_fields.get("can") or ("auto" if channel == "off" else channel)
         transport = self._can_transport("canopen", bus)
         self.canopen = open_canopen(self.requests, transport, self._state_dir, self.profile.run.seed)
         self._add(self.canopen)

@@ -236,7 +236,7 @@ class CanConfig(Strict):
     """The CAN link."""
 
     channel: str = "auto"
-    """`auto` (vcan0 if available, else the TCP hub), a python-can channel, or `off`."""
+    """`auto` (vcan0 if available, else the TCP hub; a new hub if another emulator there has the address), a python-can channel, or `off`."""
     address: Annotated[int, Field(ge=1, le=254)] = 4
     """CAN address of the device."""
     host_address: Annotated[int, Field(ge=1, le=254)] = 1
@@ -381,6 +381,9 @@ ALTERNATIVES: Final = (
 CALIBRATION: Final = frozenset({"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"})
 """Device parameters that describe the camera; by default, the device is calibrated exactly."""
 
+OF_CAMERA: Final = CALIBRATION | {"limiting_magnitude"}
+"""Device parameters that are not inherited by a profile with another camera."""
+
 PATHS: Final = frozenset(
     {"truth.path", "orbit.path", "catalog.path", "images.folder", "images.dark", "run.state_dir"}
 )
@@ -415,10 +418,10 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     values: dict[str, Any] = {}
     for _, table in layers:
         if "camera" in table:
-            _drop_calibration(values)
+            _drop_parameters_of_camera(values)
         values = merge(values, table)
     if any(override.startswith("camera.") for override in overrides):
-        _drop_calibration(values)
+        _drop_parameters_of_camera(values)
     layers += [_apply_override(values, override) for override in overrides]
     found: list[tuple[Sequence[object], str]] = []
     profile = None
@@ -548,11 +551,11 @@ def _read_extended(path: Path, depth: int) -> list[Layer]:
     return [*_read_extended(extended, depth + 1), (f"profile {path}", values)]
 
 
-def _drop_calibration(values: dict[str, Any]) -> None:
-    """Remove the calibration of a camera that is going to be replaced."""
+def _drop_parameters_of_camera(values: dict[str, Any]) -> None:
+    """Remove the device parameters that belong to a camera that is going to be replaced."""
     parameters = values.get("parameters")
     if isinstance(parameters, dict):
-        values["parameters"] = {key: value for key, value in parameters.items() if key not in CALIBRATION}
+        values["parameters"] = {key: value for key, value in parameters.items() if key not in OF_CAMERA}
 
 
 def _replaced_by(given: Iterable[str]) -> set[str]:

@@ -9,8 +9,8 @@ import shutil
 import tempfile
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from io import TextIOWrapper
 from pathlib import Path
@@ -25,7 +25,7 @@ from starhil.emulator.errors import EmulatorError, explained
 from starhil.emulator.faults import FaultRequest
 from starhil.emulator.guard import call_guarded
 from starhil.emulator.head import Head
-from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
+from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text, cansend
 from starhil.emulator.pipeline.imager import Imager, PipelineReply, PipelineRequest, ReplyCallback
 from starhil.emulator.pipeline.messages import PipelineEnded, PipelineReady
 from starhil.emulator.profile import Profile
@@ -38,7 +38,6 @@ from starhil.emulator.tape import (
     TRUTH_FILE,
     Done,
     Wiring,
-    as_json,
     from_json,
 )
 from starhil.emulator.truth.config import FileConfig, Strict, TruthConfig
@@ -518,14 +517,16 @@ def _compare_sent(
 ) -> None:
     """Compare what was sent on each link, if not to the end then as far as it was recorded."""
     for link in sorted({each.bus for each in recording} | set(player.receivers)):
-        passed = [[each for each in items if each.bus == link] for items in (recording, player.passed)]
-        before, now = (list(_units(items)) for items in passed)
+        recorded, passed = (
+            [each for each in items if each.bus == link] for items in (recording, player.passed)
+        )
+        before, now = list(_units(recorded)), list(_units(passed))
         report.sent[link] = len(before)
         if not to_the_end:
             now = now[: len(before)]
         if before != now:
-            difference = _message_difference(*(_messages(items, new_decoder()) for items in passed))
             what = "byte" if link == "serial" else "frame"
+            difference = _message_difference(recorded, passed, before, now, new_decoder)
             report.differences.append(f"{link}: {difference or _unit_difference(before, now, what)}")
 
 
@@ -536,47 +537,120 @@ def _units(items: Iterable[WireItem]) -> Iterator[Any]:
     """
     for each in items:
         if each.outgoing:
-            yield from (each.item if isinstance(each.item, bytes) else (as_json(each.item),))
+            yield from (each.item if isinstance(each.item, bytes) else (replace(each.item, timestamp=None),))
 
 
-def _messages(items: Iterable[WireItem], decoder: Decoder) -> Iterator[tuple[float, str, bytes]]:
-    """Yield the messages that were sent, each with its time, the name of its row or frame, and its data."""
+@dataclass
+class _Message:
+    """A message that was sent."""
+
+    name: str
+    """Row or frame."""
+    data: bytes
+    begin: int
+    end: int
+    """Its bytes or frames among those that were sent on the link: from `begin` to before `end`."""
+
+
+def _message_at(items: Iterable[WireItem], at: int, decoder: Decoder) -> _Message | None:
+    """Return the first message that ends with or after a sent byte or frame, counted from 0."""
+    begin = end = 0
     for each in items:
-        events = decoder.events(each)
         if not each.outgoing:
+            decoder.events(each)
             continue
-        for event in events:
-            if isinstance(event, Reply):
-                row = decoder.row_of(event)
-                name = event.kind.value if row is None else row.name
-                if event.kind in {ReplyKind.ACK, ReplyKind.NACK}:
-                    name += f" answered with {int(event.code)}"
-                yield each.at_s, name, event.data
-        if isinstance(each.item, CanFrame) and not each.item.extended:
-            yield each.at_s, canopen_text(each.item), each.item.data
+        for part in _parts(each, at - end):
+            events = decoder.events(part)
+            end += len(part.item) if isinstance(part.item, bytes) else 1
+            named = [_named(event, decoder) for event in events if isinstance(event, Reply)]
+            if isinstance(part.item, CanFrame) and not part.item.extended:
+                named.append((canopen_text(part.item), part.item.data))
+            if named and end > at:
+                name, data = named[0]
+                return _Message(name, data, begin, end)
+            if events:
+                begin = end
+    return None
+
+
+def _parts(item: WireItem, whole: int) -> Iterator[WireItem]:
+    """Yield the item, byte by byte if it has more than `whole` bytes."""
+    if isinstance(item.item, CanFrame) or len(item.item) <= whole:
+        yield item
+    else:
+        yield from (replace(item, item=bytes([byte])) for byte in item.item)
+
+
+def _named(reply: Reply, decoder: Decoder) -> tuple[str, bytes]:
+    """Return the name of a reply, and its data."""
+    row = decoder.row_of(reply)
+    name = reply.kind.value if row is None else row.name
+    if reply.kind in {ReplyKind.ACK, ReplyKind.NACK}:
+        name += f" answered with {int(reply.code)}"
+    return name, reply.data
 
 
 def _message_difference(
-    recorded: Iterable[tuple[float, str, bytes]], now: Iterable[tuple[float, str, bytes]]
+    recording: list[WireItem],
+    passed: list[WireItem],
+    before: list[Any],
+    now: list[Any],
+    new_decoder: Callable[[], Decoder],
 ) -> str:
-    """Return where the messages differ first; empty if those that both runs have are the same."""
-    for (at_s, name, data), (_, other, changed) in zip(recorded, now, strict=False):
-        if name != other:
-            return f"at {at_s:.3f} s: recorded {name}, now {other}"
-        if len(data) != len(changed):
-            return f"at {at_s:.3f} s, {name}: {len(data)} bytes recorded, {len(changed)} now"
-        for number, (old, new) in enumerate(zip(data, changed, strict=True)):
-            if old != new:
-                return f"at {at_s:.3f} s, {name}, byte {number}: recorded {old:02x}, now {new:02x}"
-    return ""
+    """Return the message and its byte at which what was sent differs first; empty if one run sent only more.
+
+    The message is the one sent now, because the recorded bytes may no longer decode.
+    """
+    at = _first_difference(before, now)
+    if at == min(len(before), len(now)):
+        return ""
+    changed = _message_at(passed, at, new_decoder())
+    if changed is None:
+        return ""
+    where = f"at {_time_of(recording, at):.3f} s"
+    recorded = _message_at(recording, at, new_decoder())
+    tail = slice(changed.end, None if recorded is None else recorded.end)
+    damaged = recorded is None or (recorded.end > changed.end and before[tail] == now[tail])
+    if recorded is not None and not damaged:
+        if recorded.name != changed.name:
+            return f"{where}: recorded {recorded.name}, now {changed.name}"
+        if len(recorded.data) != len(changed.data):
+            return f"{where}, {changed.name}: {len(recorded.data)} bytes recorded, {len(changed.data)} now"
+        number = _first_difference(recorded.data, changed.data)
+        if number < len(changed.data):
+            old, new = recorded.data[number], changed.data[number]
+            return f"{where}, {changed.name}, byte {number}: recorded {old:02x}, now {new:02x}"
+    if not isinstance(now[at], int):
+        return f"{where}, {changed.name}: recorded frame {cansend(before[at])}, now {cansend(now[at])}"
+    number = at - changed.begin
+    place = f"byte {number} of the message"
+    wire = bytes(now[changed.begin : changed.end])
+    offset = wire.find(changed.data)
+    if wire.count(changed.data) == 1 and 0 <= number - offset < len(changed.data):
+        place = f"byte {number - offset}"
+    return f"{where}, {changed.name}, {place}: recorded {before[at]:02x}, now {now[at]:02x}"
+
+
+def _first_difference(before: Sequence[Any], now: Sequence[Any]) -> int:
+    """Return the index of the first difference, or the length of the shorter one."""
+    pairs = enumerate(zip(before, now, strict=False))
+    return next((n for n, (old, new) in pairs if old != new), min(len(before), len(now)))
+
+
+def _time_of(items: Iterable[WireItem], at: int) -> float:
+    """Return when a byte or frame was sent, counted from 0, s."""
+    sent = 0
+    for each in items:
+        if each.outgoing:
+            sent += len(each.item) if isinstance(each.item, bytes) else 1
+            if sent > at:
+                return each.at_s
+    raise IndexError(at)
 
 
 def _unit_difference(before: list[Any], now: list[Any], what: str) -> str:
     """Return where bytes or frames differ first."""
-    at = next(
-        (n for n, (old, new) in enumerate(zip(before, now, strict=False)) if old != new),
-        min(len(before), len(now)),
-    )
+    at = _first_difference(before, now)
     return f"differs from {what} {at + 1} on: {len(before)} recorded, {len(now)} now"
 
 

@@ -89,12 +89,15 @@ class Run:
 
     async def open(self) -> None:
         """Make the heads, open links and truth, and let the boot time pass."""
+        automatic = "auto"
         while self._plans:
             profile, icd, imager = self._plans[0]
             head = Head(len(self.heads) + 1, profile, icd, imager, self.truth, self.wiring, self._start_time)
             self.heads.append(head)
             self._plans.pop(0)
-            await head.open_links()
+            await head.open_links(automatic)
+            if profile.links.can.channel == "auto":
+                automatic = head.ready_fields.get("can", automatic)
         await self.truth.open()
         boot_s = min(head.profile.device.boot_s for head in self.heads)
         self.clock.switch_on(self._switched_on_ns, round(boot_s * NANOSECONDS))

@@ -37,10 +37,14 @@ class LockError(EmulatorError):
     """A name cannot be locked; the text gives the reason, usually another emulator with its process ID."""
 
 
+class InUseError(LockError):
+    """Another emulator has the lock."""
+
+
 def lock_name(kind: str, name: bytes) -> socket.socket:
     """Lock a name of some kind in this network namespace until the socket is closed.
 
-    LockError if another emulator uses the name, or the operating system cannot make the lock.
+    InUseError if another emulator uses the name, another LockError if the operating system cannot make the lock.
     """
     address = f"\0starhil-{kind}-{hashlib.sha256(name).hexdigest()}".encode()
     lock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -50,7 +54,7 @@ def lock_name(kind: str, name: bytes) -> socket.socket:
     except OSError as error:
         lock.close()
         if error.errno == errno.EADDRINUSE:
-            raise LockError(f"in use by another emulator, process {_owner(address)}") from None
+            raise InUseError(f"in use by another emulator, process {_owner(address)}") from None
         raise LockError(f"cannot be locked ({error.strerror})") from None
     return lock
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
@@ -22,7 +22,7 @@ from starhil.protocol.values import Value
 DEFAULT_TIMEOUT_S: Final = 1.0
 """Time-out in current public flight software."""
 UNSOLICITED_KEPT: Final = 1000
-"""Longest queue of unsolicited readings; the oldest are dropped."""
+"""Longest queue of unsolicited readings of a row; the oldest are dropped."""
 HISTORY_LENGTH: Final = 10_000
 """Number of transactions, faults and stray replies that a client keeps."""
 SETTLE_S: Final = 0.05
@@ -50,7 +50,10 @@ class AsyncObcClient:
         self.transactions: deque[Transaction] = deque(maxlen=HISTORY_LENGTH)
         self.faults: deque[LinkFault] = deque(maxlen=HISTORY_LENGTH)
         self.stray_replies: deque[Reply] = deque(maxlen=HISTORY_LENGTH)
-        self.unsolicited: asyncio.Queue[Reading] = asyncio.Queue(UNSOLICITED_KEPT)
+        self.unsolicited: defaultdict[str, asyncio.Queue[Reading]] = defaultdict(
+            lambda: asyncio.Queue(UNSOLICITED_KEPT)
+        )
+        """Unsolicited readings by row."""
         self.unsolicited_dropped = 0
         self.bursts: asyncio.Queue[bytes] = asyncio.Queue()
         self._turn = asyncio.Lock()
@@ -179,17 +182,18 @@ class AsyncObcClient:
     async def wait_unsolicited(
         self, name: str, *, timeout_s: float | None = None, since_s: float = -math.inf
     ) -> Reading:
-        """Return the next unsolicited telemetry of a row; other rows are dropped.
+        """Return the next unsolicited telemetry of a row, which may have arrived before the call.
 
-        Messages received before `since_s` (on `time.monotonic`) are dropped too.
+        Messages received before `since_s` (on `time.monotonic`) are dropped.
         """
         wanted = self.icd.telemetry[name].name
+        queue = self.unsolicited[wanted]
         limit = self.timeout_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(limit):
                 while True:
-                    reading = await self.unsolicited.get()
-                    if reading.name == wanted and reading.received_s >= since_s:
+                    reading = await queue.get()
+                    if reading.received_s >= since_s:
                         return reading
         except TimeoutError:
             raise NoReplyError(f"unsolicited {wanted}", limit) from None
@@ -279,10 +283,11 @@ class AsyncObcClient:
         if row is None or row.kind != "telemetry" or len(reply.data) != row.size:
             self.stray_replies.append(reply)
         else:
-            if self.unsolicited.full():
-                self.unsolicited.get_nowait()
+            queue = self.unsolicited[row.name]
+            if queue.full():
+                queue.get_nowait()
                 self.unsolicited_dropped += 1
-            self.unsolicited.put_nowait(self._reading(reply, 0.0))
+            queue.put_nowait(self._reading(reply, 0.0))
 
     def _row_of(self, reply: Reply) -> Row | None:
         return None if reply.id is None else self.icd.rows_by_key.get((reply.klass, reply.id))

@@ -53,7 +53,8 @@ def unit(values: Sequence[float]) -> Quaternion:
         raise BenchError(f"a quaternion must have four parts (x, y, z, w), not {len(values)}")
     length = math.sqrt(math.fsum(v * v for v in values))
     if not math.isfinite(length) or abs(length - 1.0) > _NORM_TOLERANCE:
-        raise BenchError(f"not an attitude quaternion: its length is {length:.6g}, not 1")
+        zero = "" if length else "; units report zeros if the attitude is not valid"
+        raise BenchError(f"not an attitude quaternion: its length is {length:.6g}, not 1{zero}")
     x, y, z, w = (v / length for v in values)
     return Quaternion(x, y, z, w)
 

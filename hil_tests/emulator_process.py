@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import IO, Final, Self
 from urllib.parse import unquote
 
+from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.protocol.names import DEFAULT_UNIT
 
@@ -60,6 +61,13 @@ def emulator_command(
     given += [("--set", setting) for setting in settings]
     command = [*_starhil_command(), "run", *([] if profile is None else [profile]), *chain(*given)]
     return [*command, *([] if truth_log is None else ["--overwrite"]), *extra]
+
+
+def pointing(attitude: Quaternion, settings: Sequence[str]) -> list[str]:
+    """Return the settings that point an emulator at an attitude, unless its own settings have keys of `truth`."""
+    if any(setting.strip().startswith("truth.") for setting in settings):
+        return []
+    return ["truth.kind=fixed", f"truth.attitude={{ quaternion_xyzw = {list(attitude)} }}"]
 
 
 def hub_command(*, log: Path | None = None) -> list[str]:

@@ -194,6 +194,11 @@ class Step(Keys):
         return self._number
 
     @property
+    def pause_s(self) -> float:
+        """Pause between attempts and between repetitions, s."""
+        return self.every_s
+
+    @property
     def reading(self) -> Row | None:
         """The row that the step reads; None if it reads no telemetry."""
         return None
@@ -281,6 +286,11 @@ class Listen(ReadingStep):
     default_name = "listen for {self.row.name}"
     row: Telemetry = Field(alias="listen")
     count: Count = 1
+
+    @property
+    def pause_s(self) -> float:
+        """No pause: the messages set the pace, and each is judged."""
+        return 0.0
 
 
 class Sample(ReadingStep):

@@ -69,6 +69,7 @@ class SessionRunner:
         self._folder = folder
         self._on_result = on_result
         self._captured: dict[str, Value] = {}
+        self._step_begin_s = 0.0
         path = truth_path
         if path is None and script.truth.file is not None:
             path = folder / script.truth.file
@@ -115,7 +116,7 @@ class SessionRunner:
     # --- one step ---
 
     def _run_step(self, step: Step, link: str) -> StepResult:
-        begin = time.monotonic()
+        begin = self._step_begin_s = time.monotonic()
         if link and link not in self._bench.links:
             detail = f"needs a {link} link, the session has {' and '.join(self._bench.links)}"
             return StepResult(step.number, step.name, link, SKIPPED, detail, 0.0)
@@ -124,7 +125,7 @@ class SessionRunner:
         attempt = Attempt()
         for turn in range(step.repeat):
             if turn:
-                time.sleep(step.every_s)
+                time.sleep(step.pause_s)
             attempt = self._try_until_passed(step, link)
             if attempt.problem is not None:
                 if step.repeat > 1:
@@ -152,7 +153,7 @@ class SessionRunner:
             if time.monotonic() >= deadline:
                 attempt.problem = f"not within {step.within_s:g} s: {attempt.problem}"
                 return attempt
-            time.sleep(min(step.every_s, max(0.0, deadline - time.monotonic())))
+            time.sleep(min(step.pause_s, max(0.0, deadline - time.monotonic())))
 
     def _try_once(self, step: Step, link: str) -> Attempt:
         try:
@@ -247,11 +248,14 @@ class SessionRunner:
         return Attempt(detail="accepted", latency_s=answer.latency_s), answer
 
     def _listen(self, step: scripts.Listen, client: ObcClient) -> Attempt:
+        """Judge the next messages since the begin of the step that no earlier attempt has judged."""
         attempt = Attempt()
-        times = [time.monotonic()]
+        times: list[float] = []
         for _ in range(step.count):
             reading = client.wait_unsolicited(
-                step.row.name, timeout_s=step.timeout_s or self._script.defaults.timeout_s, since_s=times[0]
+                step.row.name,
+                timeout_s=step.timeout_s or self._script.defaults.timeout_s,
+                since_s=self._step_begin_s,
             )
             times.append(reading.received_s)
             attempt = self._compare(step, reading)
@@ -259,7 +263,7 @@ class SessionRunner:
                 return attempt
         attempt.latency_s = None
         if step.count > 1:  # without the wait for the first reading
-            attempt.figures["rate_hz"] = (step.count - 1) / max(times[-1] - times[1], CLOCK_GRAIN_S)
+            attempt.figures["rate_hz"] = (step.count - 1) / max(times[-1] - times[0], CLOCK_GRAIN_S)
         return attempt
 
     def _sample(self, step: scripts.Sample, client: ObcClient) -> Attempt:

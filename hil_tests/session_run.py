@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.text import Text
 
 from starhil.hil_tests.bench import Bench, LinkOptions
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointing
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.private_can_bus import private_can_bus
@@ -27,7 +27,7 @@ from starhil.hil_tests.results import (
     write_junit,
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.script import Control, Script, load_script
+from starhil.hil_tests.script import Control, Restart, Script, load_script
 from starhil.hil_tests.session import SessionRunner
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.cubespace import Dialect
@@ -79,6 +79,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     script = load_script(path, icd)
     if request.keep_going:
         script.defaults.keep_going = True
+    if not request.start:
+        _reject_emulator_steps(path, script)
     options = _options(request, script)
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
@@ -113,6 +115,15 @@ def run_session(request: SessionRequest) -> SessionResult:
     if not request.quiet:
         _print_summary(result, folder)
     return result
+
+
+def _reject_emulator_steps(path: Path, script: Script) -> None:
+    """Raise ScriptError if a step needs an emulator that the bench started."""
+    for step in script.steps:
+        if isinstance(step, Control | Restart):
+            action = "control" if isinstance(step, Control) else "restart"
+            why = "only an emulator that the bench started can do this: use --start"
+            raise ScriptError(f"{path.name}: step {step.number}: {action}: {why}")
 
 
 def _failed(
@@ -229,9 +240,7 @@ def _beside(profile: str | None, script: Path) -> str | None:
 def _pointed(script: Script) -> list[str]:
     """Return the settings that point the emulator at the script's true attitude, unless it has settings for this."""
     truth = script.truth.attitude
-    if truth is None or any(setting.strip().startswith("truth.") for setting in script.emulator.settings):
-        return []
-    return ["truth.kind=fixed", f"truth.attitude={{ quaternion_xyzw = {list(truth)} }}"]
+    return [] if truth is None else pointing(truth, script.emulator.settings)
 
 
 def _printer(*, quiet: bool) -> Callable[[StepResult], None]:

@@ -158,7 +158,7 @@ class Slip(Framing):
         self._escaped_end = self.escape + bytes((substitutes[0],))
         self._escaped_escape = self.escape + bytes((substitutes[1],))
         self._originals = {substitutes[0]: self.end, substitutes[1]: self.escape}
-        if len(self._originals) < 2 or model.end == model.escape or self.end[0] in self._originals:
+        if len({model.end, model.escape, *substitutes}) < 4:
             raise IcdError("link.serial.framing: end, escape and substitutes must differ")
 
     def encode(self, body: bytes) -> bytes:

@@ -140,6 +140,8 @@ class _Reader:
         self._row_files: dict[str, Path] = {}
         self._ids: dict[tuple[int | None, int], str] = {}
         """Code of the class and ID → name of the row."""
+        self._removed: list[tuple[Path, RequestKind, Any]] = []
+        """Rows that are not valid, with their files."""
         self.byte_order = Conventions().byte_order
 
     # --- files ---
@@ -166,11 +168,11 @@ class _Reader:
                     self.errors += [f"{file}: {problem}" for problem in found]
                 said = True
                 for place in sorted({_place(problem) for problem in found}, key=_order, reverse=True):
-                    self._remove(document, place)
+                    self._remove(file, document, place)
             else:
                 return
 
-    def _remove(self, document: Any, place: tuple[int | str, ...]) -> None:
+    def _remove(self, file: Path, document: Any, place: tuple[int | str, ...]) -> None:
         """Remove what is invalid from a document, and record the names that are missing because of that."""
         *path, last = place
         named = [name for name in (_name_at(document, place[:2]),) if name is not None]
@@ -181,6 +183,8 @@ class _Reader:
             document["unit"] = UNKNOWN_UNIT
             self._plugin = Plugin(skipped="")
             return
+        if len(place) == 2 and place[0] in tuple(RequestKind):
+            self._removed.append((file, RequestKind(place[0]), document[place[0]][last]))
         for step in path:
             document = document[step]
         del document[last]
@@ -210,7 +214,7 @@ class _Reader:
         """Record an error, except for a name that is missing because of another error."""
         caused = isinstance(error, MissingNameError) and (self._unread or error.name in self._broken)
         if not caused:
-            self.errors.append(str(error))
+            self.errors += error.args
 
     # --- the definition ---
 
@@ -232,6 +236,7 @@ class _Reader:
         self._add_parameters()
         telecommands = self._build_rows(RequestKind.TELECOMMAND)
         telemetry = self._build_rows(RequestKind.TELEMETRY)
+        self._check_removed()
         for row in self._rows.values():
             self._attempt(self._check_answers, row)
         self._attempt(self._check_errors, errors_file, errors, conventions)
@@ -464,6 +469,20 @@ class _Reader:
         if self._ids.setdefault((code, row.id), row.name) != row.name:
             raise IcdError(f"{where}: ID {row.id} is already used by {self._ids[code, row.id]}")
 
+    def _check_removed(self) -> None:
+        """Report the IDs of rows that are not valid, if other rows have them."""
+        for file, kind, table in self._removed:
+            if not isinstance(table, dict) or not isinstance(table.get("id"), int):
+                continue
+            name, row_id = table.get("name"), table["id"]
+            of_kind = [item.name for item in self._classes.values() if item.kind is kind]
+            klass = self._classes.get(str(table.get("class", of_kind[0] if len(of_kind) == 1 else "")))
+            if self._classes and klass is None:
+                continue
+            used = self._ids.get((None if klass is None else klass.code, row_id), name)
+            if used != name:
+                self.errors.append(f"{file}: {kind} {name}: ID {row_id} is already used by {used}")
+
     @property
     def _highest_id(self) -> int:
         """Highest ID that the link can carry."""
@@ -504,7 +523,10 @@ class _Reader:
                 if not self._attempt(layout.add, item):
                     self._broken.add(model.name)
             if model.size is not None and layout.size != model.size and model.name not in self._broken:
-                raise IcdError(f"{where}: size is {model.size} but the fields add up to {layout.size} bytes")
+                self._broken.add(model.name)  # its ID and bindings can still be checked
+                self._record(
+                    IcdError(f"{where}: size is {model.size} but the fields add up to {layout.size} bytes")
+                )
             yield Row.model_construct(
                 kind=kind,
                 id=row_id,

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from itertools import product
 from typing import Any, Final, Protocol
 
@@ -180,7 +180,13 @@ class Layout:
         else:
             kind = _KINDS.get(str(model.type), "integer")
             limits, described = INTEGER_RANGES.get(slot.type), f"type {model.type}"
-        _check_numbers(model, limits, described, where)
+        faults = list(_wrong_numbers(model, limits, described, where))
+        try:
+            parameter = self._definitions.check_parameter(model.parameter, model.unit, where)
+        except IcdError as error:
+            faults.insert(0, str(error))
+        if faults:
+            raise IcdError(*faults)
         enum, aliases = self._enumeration(model, where)
         if enum is not None:
             kind = "enum"
@@ -200,7 +206,7 @@ class Layout:
             "enum": enum,
             "aliases": aliases,
             "default": _default(model.default, enum, where),
-            "parameter": self._definitions.check_parameter(model.parameter, model.unit, where),
+            "parameter": parameter,
             "value": _numbered(model.value, number, where),
             "argument": _numbered(model.argument, number, where),
             "provenance": model.provenance or self._provenance,
@@ -248,17 +254,19 @@ class Layout:
         self._names |= {item.name} - {""}
 
 
-def _check_numbers(
+def _wrong_numbers(
     model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str, where: str
-) -> None:
+) -> Iterator[str]:
+    """Yield what is wrong with the numbers of a field."""
     if abs(model.scale) < SMALLEST_SCALE:
-        raise IcdError(f"{where}: scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}")
+        yield f"{where}: scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}"
+        return
     if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
-        raise IcdError(f"{where}: min {model.minimum:g} is above max {model.maximum:g}")
+        yield f"{where}: min {model.minimum:g} is above max {model.maximum:g}"
     if model.wrap and isinstance(model, FieldModel) and not str(model.type).startswith("u"):
-        raise IcdError(f"{where}: wrap: only unsigned integers wrap")
+        yield f"{where}: wrap: only unsigned integers wrap"
     if model.wrap and (model.minimum, model.maximum) != (None, None):
-        raise IcdError(f"{where}: wrap: a field that wraps has no min and max")
+        yield f"{where}: wrap: a field that wraps has no min and max"
     if limits is None:
         return
     numbers = {"min": model.minimum, "max": model.maximum, "const": model.const, "default": model.default}
@@ -267,7 +275,7 @@ def _check_numbers(
             isinstance(value, int | float)
             and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]
         ):
-            raise IcdError(f"{where}: {name} {value:g} does not fit {described} with its scale")
+            yield f"{where}: {name} {value:g} does not fit {described} with its scale"
 
 
 def mapped(

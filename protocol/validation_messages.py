@@ -75,7 +75,7 @@ def problems(
     also:
         Further keys allowed at the top level.
     """
-    seen: set[tuple[int | str, ...]] = set()
+    found: dict[tuple[int | str, ...], tuple[str, list[Problem]]] = {}
     for item in error.errors(include_url=False):
         location, models = _along(model, item["loc"])
         unknown = item["type"] == "extra_forbidden"
@@ -92,9 +92,13 @@ def problems(
             texts = _texts(item)
         if document is not None:
             location = _in(document, location, absent=item["type"] in _ABSENT)
-        if location not in seen:  # an alternative of a union that has been reported
-            yield from (Problem(location, _dotted(document, location), text, unknown) for text in texts)
-        seen.add(location)
+        if location not in found:  # an alternative of a union that has been reported
+            key = _dotted(document, location)
+            found[location] = item["type"], [Problem(location, key, text, unknown) for text in texts]
+    for location, (kind, said) in found.items():
+        below = any(other != location and other[: len(location)] == location for other in found)
+        if not (kind in _NEEDED and below):  # another alternative has the right type, and errors in it
+            yield from said
 
 
 def _texts(item: ErrorDetails) -> list[str]:
@@ -136,7 +140,8 @@ def _choice(item: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
     expected = context.get("expected_tags") or ", ".join(
         sorted(repr(tag) for each in models for tag in _tags_of(each))
     )
-    return f"must be one of {expected}{given}"
+    near = did_you_mean(str(context.get("tag", "")), re.findall("'([^']*)'", expected))
+    return f"must be one of {expected}{given}{near}"
 
 
 def _along(

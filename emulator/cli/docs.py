@@ -25,8 +25,8 @@ _DIRECTIVES: Final = re.compile(r"^```\{eval-rst\}\n(.*?)^```\n", re.MULTILINE |
 
 
 def pages() -> dict[str, str]:
-    """Return the pages in Markdown, by name; those of the API are `api/NAME`."""
-    files = [*sorted(_FOLDER.glob("*.md")), *sorted(_FOLDER.glob("api/*.md"))]
+    """Return the pages in Markdown, by path, those of the folder itself first; those of the API are `api/NAME`."""
+    files = sorted(_FOLDER.rglob("*.md"), key=lambda file: (len(file.parts), file))
     texts = {
         str(file.relative_to(_FOLDER).with_suffix("")): file.read_text(encoding="utf-8") for file in files
     }

@@ -183,7 +183,7 @@ class UnitUnderTest:
         self._emulator = None
         port = MemorySerial("serial", self._time_s)
         buses: dict[str, MemoryTransport[CanFrame]] = {
-            name: MemoryTransport(name, self._time_s) for name in ("can", "canopen")
+            name: MemoryTransport(f"virtual:{name}", self._time_s) for name in ("can", "canopen")
         }
         self._transports = {"serial": port, **buses}
         for name, transport in self._transports.items():

@@ -1,4 +1,4 @@
-"""The address of a node on a CAN bus, and a warning if another node uses it too."""
+"""The address of a node on a CAN bus, which no other node may have: both would answer each request."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import logging
 import socket
 from typing import Final
 
-from starhil.emulator.symlink_lock import LockError, lock_name
+from starhil.emulator.errors import EmulatorError
+from starhil.emulator.symlink_lock import InUseError, LockError, lock_name
 
 log = logging.getLogger("starhil.link")
 
@@ -14,13 +15,28 @@ PRIVATE_BUS: Final = "virtual:"
 """Prefix of buses that no other process can join."""
 
 HIGHEST: Final = 126
-"""Highest address that a warning suggests; valid for both CAN protocols."""
+"""Highest address that a message suggests; valid for both CAN protocols."""
+
+
+def in_use(what: str, bus: str, number: int) -> str:
+    """Return who uses an address of a bus, `address` or `node`; empty if no other emulator on this machine does."""
+    try:
+        _lock(what, bus, number).close()
+    except InUseError as error:
+        return f"CAN {bus}: {what} {number}: {error}"
+    except LockError:
+        pass  # logged by `acquire`
+    return ""
+
+
+def _lock(what: str, bus: str, number: int) -> socket.socket:
+    return lock_name(what, f"{bus} {number}".encode())
 
 
 class BusAddress:
-    """Warns when another emulator on this machine, or any node on the bus, uses the same address.
+    """Reserves an address of a bus among the emulators on this machine, and warns of other nodes with it.
 
-    `what` is its name in warnings, `address` or `node`; `setting` is the key of the profile that sets it.
+    `what` is its name in messages, `address` or `node`; `setting` is the key of the profile that sets it.
     """
 
     def __init__(self, what: str, setting: str) -> None:
@@ -33,21 +49,34 @@ class BusAddress:
         """Whether a CAN frame from another node with this address has been reported."""
 
     def acquire(self, bus: str, number: int) -> None:
-        """Use a new address on a bus; warn if another emulator uses it."""
+        """Use a new address on a bus. EmulatorError if another emulator uses it; warn if it cannot be reserved."""
         self.release()
         self._bus, self.number, self.duplicate_reported = bus, number, False
         if not number or bus.startswith(PRIVATE_BUS):
             return
         try:
-            self._lock = lock_name(self._what, f"{bus} {number}".encode())
+            self._lock = _lock(self._what, bus, number)
+        except InUseError as error:
+            raise EmulatorError(
+                f"{self._problem(str(error))}; choose another, {self._remedy}, or another bus, "
+                "e.g. that of `starhil hub --port 0`"
+            ) from None
         except LockError as error:
-            self._warn(str(error))
+            log.warning("%s", self._problem(str(error)))
+
+    def change(self, bus: str, number: int) -> None:
+        """Use a new address in operation; warn if another emulator uses it."""
+        try:
+            self.acquire(bus, number)
+        except EmulatorError as error:
+            log.warning("%s", error)
 
     def report_duplicate(self) -> None:
         """Warn, once per address, of a CAN frame from another node with this address."""
         if not self.duplicate_reported:
             self.duplicate_reported = True
-            self._warn("also used by another node, whose frames arrive here")
+            problem = self._problem("also used by another node, whose frames arrive here")
+            log.warning("%s; change one of them: %s", problem, self._remedy)
 
     def release(self) -> None:
         """Release the address."""
@@ -55,9 +84,9 @@ class BusAddress:
             self._lock.close()
             self._lock = None
 
-    def _warn(self, why: str) -> None:
-        other = self.number % HIGHEST + 1
-        log.warning(
-            "CAN %s: %s %d: %s; change one of them: --set %s=%d",
-            *(self._bus, self._what, self.number, why, self._setting, other),
-        )
+    def _problem(self, why: str) -> str:
+        return f"CAN {self._bus}: {self._what} {self.number}: {why}"
+
+    @property
+    def _remedy(self) -> str:
+        return f"--set {self._setting}={self.number % HIGHEST + 1}"

@@ -120,4 +120,4 @@ class CanLink(DeviceLink[CanFrame, int]):
     def _parameters_changed(self, names: frozenset[str]) -> None:
         if "can_address" in names:
             self._receiver = self._new_receiver()
-            self._address.acquire(self.transport.description, self._reply_style())
+            self._address.change(self.transport.description, self._reply_style())

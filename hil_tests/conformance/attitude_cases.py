@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, Protocol, Self
 
-from starhil.hil_tests.attitude import Quaternion, as_reported
+from starhil.hil_tests.attitude import Quaternion, as_reported, conjugate, from_reported, to_radec_roll
 from starhil.hil_tests.conformance.attitude_forms import (
+    QUATERNION,
+    VECTOR_PART,
+    Axes,
     Conventions,
     Reading,
     angle_deg,
@@ -24,7 +28,10 @@ ATTITUDE_S: Final = 20.0
 """Maximum time until an attitude is valid."""
 TRUTH_DEG: Final = 2.0
 """Largest difference from the truth, which may have moved since the exposure, and between the attitudes in a row."""
+MODE_S: Final = 5.0
+"""Maximum time until a commanded mode is reported."""
 SEARCHING: Final = "lost_in_space"
+TRACKING: Final = "tracking"
 STANDBY: Final = "standby"
 
 TruthSource = Callable[[], Quaternion]
@@ -101,7 +108,10 @@ class AttitudeRow:
                     "no valid attitude in standby (R11, docs/rules.md)",
                     "a valid one",
                 )
+                check_mode(access, STANDBY)
                 search()
+            if search is not None:
+                check_mode(access, SEARCHING, TRACKING)
             end = access.now() + ATTITUDE_S
             while not self.is_valid(seen := access.values(self.row)):
                 if access.now() > end:
@@ -109,6 +119,7 @@ class AttitudeRow:
                     raise CaseSkipped(f"no attitude was valid within {ATTITUDE_S:g} s: no stars in view?")
                 access.sleep(0.1)
             self.check(access, seen)
+            self._check_truth(access)
 
     def check(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
         """Fail the case if an attitude is valid in standby, of a wrong length, not the truth, or not that of other fields."""
@@ -121,20 +132,38 @@ class AttitudeRow:
 
     def _check_attitudes(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
         """Compare the first attitude with the truth, and the others with both."""
-        known = []
-        if access.truth is not None:
-            truth = access.truth()
-            parts = tuple(round(part, 4) for part in as_reported(truth, self.conventions))
-            known.append((f"the true attitude {parts}", axes_of(truth), 0.0))
+        known: list[tuple[str, Axes, float]] = []
+        truth = None if access.truth is None else access.truth()
         for reading in self.readings:
             axes = reading.axes(seen, self.conventions)
-            for what, other, rounding_deg in known[:2]:
+            true = [] if truth is None else [(self._stated(truth, reading), axes_of(truth), 0.0)]
+            for what, other, rounding_deg in (true + known)[:2]:
                 error_deg = angle_deg(axes, other)
                 limit_deg = TRUTH_DEG + reading.rounding_deg + rounding_deg
                 numbers = tuple(round(float(seen[item.name]), 4) for item in reading.fields)
                 wanted = f"{what} in {reading}, to {limit_deg:.3g} deg"
                 check(error_deg <= limit_deg, wanted, f"{numbers}, {error_deg:.2f} deg off")
             known.append((f"the attitude of {reading}", axes, reading.rounding_deg))
+
+    def _stated(self, truth: Quaternion, reading: Reading) -> str:
+        """Return the text of the true attitude: as a quaternion if the unit reports one, otherwise as angles."""
+        if reading.form in (QUATERNION, VECTOR_PART):
+            reported = as_reported(truth, self.conventions)
+            return f"the true attitude {tuple(round(math.copysign(1.0, reported.w) * part, 4) for part in reported)}"
+        ra, dec, roll = (round(angle, 3) for angle in to_radec_roll(truth))
+        return f"the true attitude RA {ra} deg, Dec {dec} deg, roll {roll} deg"
+
+    def _check_truth(self, access: RowAccess) -> None:
+        """Skip the case, which has passed, if the conjugate of the true attitude would have passed as well."""
+        limits = [TRUTH_DEG + item.rounding_deg for item in self.readings if item.form.has_inverse]
+        if access.truth is None or not limits:
+            return
+        truth = access.truth()
+        turned = from_reported(conjugate(as_reported(truth, self.conventions)), self.conventions)
+        error_deg = angle_deg(axes_of(turned), axes_of(truth))
+        if error_deg <= max(limits):
+            reason = f"a conjugated attitude would pass too: at this truth it is only {error_deg:.2f} deg off"
+            raise CaseSkipped(f"{reason}; point the unit elsewhere")
 
     def _check_flag(self, access: RowAccess, seen: Mapping[str, Value]) -> None:
         """Fail the case if the true attitude is reported, but never as valid."""
@@ -169,6 +198,22 @@ def in_standby(access: RowAccess) -> bool:
     return False
 
 
+def check_mode(access: RowAccess, commanded: str, *entered: str) -> None:
+    """Fail the case unless rows report in time the mode commanded, or one since entered by itself (R13).
+
+    A field that has no number for the commanded mode, or another mode's, is left out.
+    """
+    wanted = (commanded, *entered)
+    for row, item in _mode_fields(access):
+        if commanded not in (item.enum or {}):
+            continue
+        end = access.now() + MODE_S
+        while (seen := access.values(row)[item.name]) not in wanted:
+            within = f"within {MODE_S:g} s of the telecommand (R13, docs/rules.md)"
+            check(access.now() < end, f"{item.name} of {row.name} {' or '.join(wanted)} {within}", seen)
+            access.sleep(0.1)
+
+
 def mode_command(access: RowAccess, mode: Value | None) -> Callable[[], None] | None:
     """Return what commands a mode; None if no telecommand does, or the mode is unknown."""
     for row in access.telecommands():
@@ -195,7 +240,7 @@ def identifying_stars(access: RowAccess) -> Iterator[None]:
         yield
         return
     before = reported_mode(access)
-    restore = mode_command(access, SEARCHING if before == "tracking" else before)
+    restore = mode_command(access, SEARCHING if before == TRACKING else before)
     start()
     try:
         yield

@@ -54,6 +54,11 @@ class Form:
     read: Callable[[Sequence[float], Conventions], Axes]
     lengths: tuple[float, float] | None = None
 
+    @property
+    def has_inverse(self) -> bool:
+        """Whether the values could state the inverse rotation: all but RA and Dec."""
+        return self.read is not _radec
+
 
 def axes_of(attitude: Quaternion) -> Axes:
     """Return the axes of a sensor with an attitude from ICRS."""
@@ -102,9 +107,10 @@ def _of(prefix: str, names: Iterable[str]) -> tuple[str, ...]:
 
 
 COUNTED: Final = ("[1]", "[2]", "[3]")
+QUATERNION: Final = Form("quaternion", _of("", "xyzw"), _quaternion, (1.0, 1.0))
 VECTOR_PART: Final = Form("vector part", _of("", "xyz"), _quaternion, (0.0, 1.0))
 FORMS: Final = (
-    Form("quaternion", _of("", "xyzw"), _quaternion, (1.0, 1.0)),
+    QUATERNION,
     VECTOR_PART,
     Form("rotation vector", _of("rotation_", "xyz"), _rotation_vector, (0.0, math.pi)),
     *(Form("matrix row", _of(f"dcm_{axis}", COUNTED), _matrix_row(number), (1.0, 1.0)) for number, axis in enumerate("xyz")),
@@ -143,7 +149,7 @@ class Reading:
         return math.degrees(2.0 * math.sqrt(angle) if self.form is VECTOR_PART else angle)
 
     def axes(self, seen: Mapping[str, Value], conventions: Conventions) -> Axes:
-        """Return the sensor axes; fail the case if the values make no vector of the right length."""
+        """Return the sensor axes; fail the case if the values make no vector of the right length, or have the wrong sign."""
         numbers = [float(seen[item.name]) * RAD_PER.get(item.unit, 1.0) for item in self.fields]
         if self.form.lengths is not None:
             least, most = self.form.lengths
@@ -151,6 +157,13 @@ class Reading:
             length = math.hypot(*numbers)
             wanted = f"{self.form.name} of length {'' if least else 'up to '}{most:.4g}"
             check(least - tolerance < length < most + tolerance, f"a {wanted} in {self}", f"{length:.7f}")
+            if self.form is QUATERNION and conventions.scalar_sign == "positive":
+                scalar = self.fields[3].name
+                check(
+                    numbers[3] > -tolerance,
+                    f"{scalar} not negative (R15, docs/rules.md)",
+                    f"{numbers[3]:.7g}",
+                )
             nearest = min(max(length, least), most)
             numbers = [number * nearest / length for number in numbers] if length else numbers
         return self.form.read(numbers, conventions)

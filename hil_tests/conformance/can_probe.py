@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from starhil.hil_tests.conformance.case import CaseFailed, check
-from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
+from starhil.hil_tests.conformance.link_probe import LATE_S, LinkProbe, ProbeTimes, Settings, late
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
@@ -106,8 +106,16 @@ class CanProbe(LinkProbe):
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
         """Return the next unread answer."""
+        began = self.now()
         frame = self.next_frame(timeout_s)
-        return Answer("none") if frame is None else can.read_answer(frame, self.next_frame)
+        if frame is not None:
+            return can.read_answer(frame, self.next_frame)
+        frame = self.next_frame(LATE_S)
+        return (
+            Answer("none")
+            if frame is None
+            else late(can.read_answer(frame, self.next_frame), self.now() - began)
+        )
 
     def expect_answer(self, kind: AnswerKind, what: str, error: str | None = None) -> Answer:
         """Take the next answer, which must be of a given kind, with a code if an error is given."""

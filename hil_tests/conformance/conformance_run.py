@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.attitude_cases import TruthSource
@@ -29,7 +29,7 @@ from starhil.hil_tests.conformance.runner import (
 from starhil.hil_tests.conformance.serial_probe import DEFAULT_BAUD, SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.control import ControlClient, Truth
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointing
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.judge.definition import Unit, read_unit
@@ -45,6 +45,10 @@ from starhil.protocol.values import IcdError
 
 if TYPE_CHECKING:
     from starhil.hil_tests.conformance.canopen_probe import CanopenProbe
+
+
+POINTING: Final = from_radec_roll(90.0, -30.0, 45.0)
+"""Attitude of an emulator that a run starts: in any naming of the axes, a conjugated quaternion is at least 19 deg off."""
 
 
 @dataclass(frozen=True)
@@ -188,11 +192,14 @@ def truth_source(text: str) -> TruthSource:
     Raises BenchError: the log cannot be read or is none, or an angle is out of range.
     """
     try:
-        ra_deg, dec_deg, roll_deg = map(float, text.split(","))
+        angles = [float(part) for part in text.split(",")]
     except ValueError:
         log = TruthLogReader(Path(text))
         log.check()
         return log.latest
+    if len(angles) != 3:
+        raise BenchError(f"--truth {text}: give three numbers in degrees, RA,DEC,ROLL, or a truth log")
+    ra_deg, dec_deg, roll_deg = angles
     if not (math.isfinite(ra_deg + roll_deg) and abs(dec_deg) <= 90.0):
         raise BenchError(f"--truth {text}: give RA, Dec from -90 to 90 and roll in degrees")
     attitude = from_radec_roll(ra_deg, dec_deg, roll_deg)
@@ -282,7 +289,7 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
         can=channel,
         dialect=request.dialect,
         seed=1,
-        settings=request.settings,
+        settings=(*pointing(POINTING, request.settings), *request.settings),
         state_dir=folder,
         extra=extra,
     )

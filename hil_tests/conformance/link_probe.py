@@ -28,6 +28,8 @@ SETTING_ACTIONS: Final = frozenset({None, "nothing", "set_parameters", "subscrib
 """Actions of the device model that repeating a telecommand with the same data does not carry out again."""
 LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
+LATE_S: Final = 1.0
+"""Time after the time-out in which an answer is still taken, to be named as late."""
 RECOVERY_S: Final = 1.0
 """Pause after a failed case, in which time-outs of the device pass."""
 SHOWING: Final = 8
@@ -401,6 +403,11 @@ class LinkProbe(ABC):
             self.recover()
             self.drain()
             self.settings.restore(self)
+
+
+def late(answer: Answer, seconds: float) -> Answer:
+    """Return no answer, which names the one that came after the time-out, seconds after it was awaited."""
+    return Answer("none", fault=f"late: {answer} after {seconds:.1f} s; see --time-out")
 
 
 def checked_values(row: Row, data: bytes) -> dict[str, Value]:

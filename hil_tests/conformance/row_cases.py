@@ -24,6 +24,7 @@ from starhil.hil_tests.conformance.link_probe import (
     LinkProbe,
     checked_values,
 )
+from starhil.hil_tests.conformance.parameter_cases import parameter_cases
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer
 from starhil.hil_tests.judge.rows import Field, Row
@@ -68,6 +69,7 @@ def row_cases(
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
+    yield from parameter_cases(unit)
     yield from _unsolicited(unit)
     yield from _subscriptions(unit)
     yield case_in(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from starhil.hil_tests.conformance.case import check
-from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
+from starhil.hil_tests.conformance.link_probe import LATE_S, LinkProbe, ProbeTimes, Settings, late
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
@@ -144,11 +144,22 @@ class SerialProbe(LinkProbe):
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
         """Return the next unread answer; bytes without an end are a malformed one."""
-        end = self.now() + (self.times.answer_s if timeout_s is None else timeout_s)
+        began = self.now()
+        self._await_answer(self.times.answer_s if timeout_s is None else timeout_s)
+        if self._answers:
+            return self._answers.popleft()
+        if not self.line.received:
+            self._await_answer(LATE_S)
+            if self._answers:
+                return late(self._answers.popleft(), self.now() - began)
+        return self._rest()
+
+    def _await_answer(self, seconds: float) -> None:
+        """Receive until there is an answer, and the message that has begun is complete."""
+        end = self.now() + seconds
         while not self._answers and (left := end - self.now()) > 0:
             self._receive(left)
         self._complete()
-        return self._answers.popleft() if self._answers else self._rest()
 
     def _rest(self) -> Answer:
         """Return the bytes without an end, after which no answer is awaited any more."""

@@ -17,6 +17,7 @@ from starhil.hil_tests.judge.framings import Framing, Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import SIZES, Field, Row
 from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.device_model import PARAMETER
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import find_unit
@@ -199,6 +200,7 @@ def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
                 bound.minimum if item.minimum is None else item.minimum,
                 bound.maximum if item.maximum is None else item.maximum, None if item.enum is None else item.enum.values, default, item.const,
                 item.value, item.argument, item.telecommand, item.unit, frozenset(item.aliases.values()),
+                item.parameter or (value.removeprefix(PARAMETER) if (value := item.value or "").startswith(PARAMETER) else None),
             )  # fmt: skip
             shift += item.width
         offset += size

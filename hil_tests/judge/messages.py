@@ -66,7 +66,7 @@ class Answer:
     number
         Number that the unit gives its messages; None if it does not number such a message.
     fault
-        What is wrong with a malformed answer, if its header can be read.
+        What is wrong with a malformed answer, if its header can be read; of `none`, the answer that came too late.
     """
 
     kind: AnswerKind
@@ -92,4 +92,4 @@ class Answer:
                 what = f"malformed ({self.fault})" if self.fault else "malformed"
                 return f"{what}, {len(self.data)} bytes: {self.data[:24].hex(' ')}"
             case _:
-                return f"acknowledge{where}" if self.kind == "ack" else "nothing"
+                return f"acknowledge{where}" if self.kind == "ack" else self.fault or "nothing"

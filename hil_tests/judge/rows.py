@@ -52,6 +52,8 @@ class Field:
         Quantity that it reports, argument of the action that it sets, telecommand whose value it reports.
     shared
         Names of the enumeration whose number stands for further values too.
+    parameter
+        Parameter that it sets or reports.
     """
 
     name: str
@@ -74,6 +76,7 @@ class Field:
     telecommand: str | None = None
     unit: str = ""
     shared: frozenset[str] = frozenset()
+    parameter: str | None = None
 
     @property
     def type_limits(self) -> tuple[int, int]:

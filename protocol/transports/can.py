@@ -80,6 +80,11 @@ def open_can(
     raise TransportError(f"CAN {spec}: must be {_FORMS}")
 
 
+def new_hub() -> CanTransport:
+    """Return the transport of a hub that `start` starts in this process, on a free port."""
+    return AutoHubTransport(DEFAULT_HOST, 0)
+
+
 def _socketcand(spec: str, where: str) -> CanTransport:
     address, slash, bus = where.partition("/")
     host, _, port = address.rpartition(":")

@@ -293,14 +293,24 @@ def _report(image: Path, result: ImageSolution, advice: str) -> dict[str, Any]:
     }
     if not solution.valid:
         return report
+    from starid.catalog import load_catalog
     from starid.missing import missing_stars
+    from starid.star_names import STAR_NAMES
 
     attitude = solution.attitude
     missing = missing_stars(solution, result.camera, result.stars, found.xy_px)
-    stars = [
-        {"hip": int(hip), "x_px": float(x), "y_px": float(y), "flux": float(flux)}
-        for hip, (x, y), flux in zip(
+    stars: list[dict[str, Any]] = [
+        {
+            "hip": int(hip),
+            "name": STAR_NAMES.get(int(hip)),
+            "v": float(v),
+            "x_px": float(x),
+            "y_px": float(y),
+            "flux": float(flux),
+        }
+        for hip, v, (x, y), flux in zip(
             solution.hip,
+            load_catalog().v[solution.catalog_index],
             result.on_image(found.xy_px[solution.detection_index]),
             found.flux[solution.detection_index],
             strict=True,
@@ -383,7 +393,8 @@ def _print_solution(report: dict[str, Any], console: Console) -> None:
             f"{len(report['missing_stars'])} expected stars were not detected, the brightest HIP {brightest['hip']}, "
             f"V {brightest['v']:.1f}"
         )
-    table = Table("HIP", "x px", "y px", "flux", box=SIMPLE, title="brightest identified stars")
+    table = Table("HIP", "name", "V", "x px", "y px", "flux", box=SIMPLE, title="brightest identified stars")
     for star in report["stars"][:_SHOWN_STARS]:
-        table.add_row(str(star["hip"]), f"{star['x_px']:.2f}", f"{star['y_px']:.2f}", f"{star['flux']:.0f}")
+        place = (f"{star['x_px']:.2f}", f"{star['y_px']:.2f}", f"{star['flux']:.0f}")
+        table.add_row(str(star["hip"]), star["name"] or "", f"{star['v']:.2f}", *place)
     console.print(table)

@@ -65,7 +65,7 @@ class MemoryTransport(Transport[Any]):
     """Joins the device to the tester without a wire; bytes take their time."""
 
     def __init__(self, loop: SimulatedLoop, *, paced: bool) -> None:
-        super().__init__("memory")
+        super().__init__("virtual:memory")
         self._loop = loop
         self._paced = paced
         self.out: deque[Any] = deque()

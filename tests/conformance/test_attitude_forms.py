@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import re
 import shutil
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 
 import pytest
+from pydantic import ValidationError
 
 from starhil.emulator.truth.source import FixedTruth
-from starhil.hil_tests.attitude import from_radec_roll
+from starhil.hil_tests.attitude import as_reported, conjugate, from_radec_roll, from_reported
+from starhil.hil_tests.conformance.attitude_forms import angle_deg, axes_of
+from starhil.hil_tests.conformance.conformance_run import POINTING
 from starhil.hil_tests.conformance.runner import run_case
 from starhil.hil_tests.conformance.suites import serial_suite
 from starhil.hil_tests.judge.definition import read_unit
+from starhil.protocol.conventions import Conventions
 from starhil.protocol.names import find_unit
 from starid.attitude import Attitude
 from tests.conformance.links import LINKS, ROWS
@@ -20,6 +25,7 @@ from tests.conformance.simulated import SimulatedUnit
 
 RADEC_ROLL = (211.0, 48.0, 77.0)
 TRUTH = from_radec_roll(*RADEC_ROLL)
+HALF_TURN = from_radec_roll(91.0, 0.0, 180.0)
 ANOTHER = from_radec_roll(211.0, 48.0, 82.0)
 EULER = tuple(a + b + end for a, b, c in permutations("xyz") for end in (a, c))
 FORMS = {
@@ -73,11 +79,11 @@ fields = [
     return place
 
 
-def outcome_of(case: str, unit: str | Path, served: Path | None, truth=None):
+def outcome_of(case: str, unit: str | Path, served: Path | None, truth=None, pointed=RADEC_ROLL):
     cases = {item.id: item for item in serial_suite(read_unit(unit))}
 
     def point(simulated):
-        simulated.device.surroundings.truth = FixedTruth(Attitude.from_radec_roll(*RADEC_ROLL))
+        simulated.device.surroundings.truth = FixedTruth(Attitude.from_radec_roll(*pointed))
 
     with SimulatedUnit("serial", point, unit=unit, served=served) as simulated:
         simulated.probe.truth = truth and (lambda: truth)
@@ -111,6 +117,49 @@ def test_a_conjugated_quaternion_fails_beside_another_form(tmp_path):
     assert (
         outcome.expected == "the attitude of q_x, q_y, q_z, q_w in copy_x, copy_y, copy_z, copy_w, to 2 deg"
     )
+
+
+def test_the_true_attitude_is_stated_as_the_row_reports_it(tmp_path):
+    unit = write(tmp_path, "unit", CONVENTIONS[0])
+    first = outcome_of("telemetry.forms", unit, None, ANOTHER)
+    assert re.match(r"the true attitude \(.*, 0\.[0-9]+\) in q_x, q_y, q_z, q_w,", first.expected)
+    served = write(tmp_path, "served", CONVENTIONS[0], {"roll": 0.5})
+    angles = outcome_of("telemetry.forms", unit, served, TRUTH)
+    assert angles.expected.startswith(
+        "the true attitude RA 211.0 deg, Dec 48.0 deg, roll 77.0 deg in ra, dec, roll,"
+    )
+
+
+def test_a_truth_that_its_conjugate_resembles_is_named(tmp_path):
+    """The rotation from ICRS to this attitude is nearly half a turn."""
+    outcome = outcome_of("attitude.solution", "sagitta", None, HALF_TURN, (91.0, 0.0, 180.0))
+    assert (outcome.status, outcome.seen) == (
+        "skipped",
+        "a conjugated attitude would pass too: at this truth it is only 1.41 deg off; point the unit elsewhere",
+    )
+
+
+@pytest.mark.parametrize("order", list(permutations("xyz")))
+def test_where_a_started_emulator_points_no_conjugate_resembles_the_truth(order):
+    for signs in product("+-", repeat=3):
+        axes = [sign + axis for sign, axis in zip(signs, order, strict=True)]
+        try:
+            conventions = Conventions(axes=axes)
+        except ValidationError:
+            continue  # a left-handed frame
+        turned = from_reported(conjugate(as_reported(POINTING, conventions)), conventions)
+        assert angle_deg(axes_of(turned), axes_of(POINTING)) > 19.0
+
+
+@pytest.mark.parametrize("sign", ["positive", "any"])
+def test_a_negative_scalar_part_fails_where_its_sign_is_fixed(sign, tmp_path):
+    conventions = f'{CONVENTIONS[0]}\nscalar_sign = "{sign}"'
+    unit = write(tmp_path, "unit", conventions)
+    served = write(tmp_path, "served", conventions, dict.fromkeys(("q_w", "q_x", "q_y", "q_z"), -1.0))
+    outcome = outcome_of("attitude.forms", unit, served, TRUTH)
+    assert outcome.status == ("failed" if sign == "positive" else "passed")
+    if sign == "positive":
+        assert outcome.expected == "q_w not negative (R15, docs/rules.md)"
 
 
 def test_a_row_without_a_flag_is_judged_unless_it_is_zeros(tmp_path):

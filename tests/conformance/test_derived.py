@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from pathlib import Path
 
@@ -10,12 +11,15 @@ import pytest
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.attitude_cases import AttitudeRow, identifying_stars
 from starhil.hil_tests.conformance.case import Case, CaseFailed, check
-from starhil.hil_tests.conformance.runner import identity_of, run_case
+from starhil.hil_tests.conformance.runner import identity_of, run_case, run_cases
 from starhil.hil_tests.conformance.serial_probe import SerialProbe
-from starhil.hil_tests.conformance.suites import serial_suite
+from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from tests.conformance.links import LINKS, ROWS, write_unit
+from tests.conformance.mutant_seams import handling, only_acknowledged
+from tests.conformance.mutants_units import telemetry_data
 from tests.conformance.simulated import SimulatedUnit
+from tests.test_your_unit import written as tutorial
 
 SEQUENCE = """
 framing = { kind = "length", start = [0xEB, 0x90] }
@@ -141,6 +145,22 @@ def test_a_valid_quaternion_that_is_not_of_length_1_fails_a_safe_case(tmp_path):
     assert (outcome.status, outcome.expected) == ("failed", "a quaternion of length 1 in x, y, z, w")
 
 
+@pytest.mark.parametrize(
+    ("reported", "wanted"), [("lost_in_space", "standby"), ("standby", "lost_in_space or tracking")]
+)
+def test_a_mode_that_is_not_the_commanded_one_fails(reported, wanted, tmp_path):
+    unit = commanded(tmp_path)
+    number = {"standby": 1, "lost_in_space": 2}[reported]
+    modes = ", ".join(f'"{mode}"' for mode in ("boot", "standby", "lost_in_space", "tracking", "error"))
+    text = (unit / "unit.toml").read_text()
+    before, _, after = text.partition('map = { 0 = "boot"')
+    served = written(tmp_path, "served", f"{before}map = {{ {number} = [{modes}] }}{after.partition('}')[2]}")
+    assert outcome_of("attitude.attitude", unit).status == "passed"
+    outcome = outcome_of("attitude.attitude", unit, served)
+    assert (outcome.status, outcome.seen) == ("failed", reported)
+    assert outcome.expected == f"mode of state {wanted} within 5 s of the telecommand (R13, docs/rules.md)"
+
+
 class Rows:
     """Rows of a unit with given values, and the commands sent."""
 
@@ -210,6 +230,52 @@ def test_the_identity_of_a_device_is_read(link, unit, words):
         assert words in identity_of(simulated.probe)
 
 
+class SlowPort:
+    """A port on which everything arrives later."""
+
+    def __init__(self, port, delay_s: float) -> None:
+        self.send, self.now = port.send, port.now
+        self.port, self.delay_s = port, delay_s
+        self.coming = []
+
+    def receive(self, timeout_s):
+        end = self.now() + timeout_s
+        while True:
+            if self.coming and self.coming[0][0] <= self.now():
+                return self.coming.pop(0)[1]
+            until = min(end, self.coming[0][0]) if self.coming else end
+            item = self.port.receive(max(0.0, until - self.now()))
+            if item is not None:
+                self.coming.append((self.now() + self.delay_s, item))
+            elif self.now() >= end:
+                return None
+
+
+@pytest.mark.parametrize("link", ["serial", "can"])
+def test_an_answer_after_the_time_out_is_named_as_late(link):
+    suite = {"serial": serial_suite, "can": can_suite}[link]
+    case = next(item for item in suite(read_unit("cubestar")) if item.id == f"{link}.telemetry.boot_status")
+    with SimulatedUnit(link) as simulated:
+        simulated.probe.port = SlowPort(simulated.probe.port, 0.3)
+        assert run_case(simulated.probe, case).status == "passed"
+        simulated.probe.port.delay_s = 0.7
+        outcome = run_case(simulated.probe, case)
+    assert outcome.status == "failed"
+    assert outcome.seen.startswith("late: telemetry")
+    assert outcome.seen.endswith(" after 0.7 s; see --time-out")
+
+
+def test_a_late_answer_with_a_sequence_number_is_named_as_late(tmp_path):
+    unit = sequenced(tmp_path, "unit", '{ role = "sequence", type = "u16" }')
+    with SimulatedUnit("serial", unit=unit) as simulated:
+        simulated.probe.port = SlowPort(simulated.probe.port, 0.7)
+        outcome = run_cases(simulated.probe, serial_suite(read_unit(unit)), port="/dev/ttyX")[0]
+    assert outcome.id == "serial.answers"
+    assert re.match(
+        r"no valid answer on /dev/ttyX: late: telemetry of .* after 0.7 s; see --time-out$", outcome.seen
+    )
+
+
 def test_a_pause_begins_when_the_line_is_free(tmp_path):
     """At 9600 bits a second, 960 bytes take a second."""
 
@@ -237,3 +303,96 @@ def test_the_seconds_of_a_failed_case_include_its_recovery(tmp_path):
             simulated.probe, Case("a.b.c", "a.b", "t", "c", lambda _probe: check(None, "so", "not so"))
         )
     assert outcome.seconds >= 0.05
+
+
+PARAMETERS = """
+[[telecommand]]
+id = 6
+name = "imaging"
+doc = "Parameters that contradict each other, a scale, a flag and an enumeration."
+action = "set_parameters"
+fields = [
+    { name = "exposure", type = "u16", unit = "ms", scale = 0.5, parameter = "exposure" },
+    { name = "rate", type = "f32", unit = "Hz", parameter = "update_rate" },
+    { name = "gain", type = "u16", scale = 0.01, parameter = "analog_gain" },
+    { name = "start", type = "enum8", enum = "start_mode", parameter = "start_mode" },
+    { type = "bits8", bits = [{ name = "follows", parameter = "tracking_enable" }, { width = 7 }] },
+]
+
+[[telemetry]]
+id = 132
+name = "imaging_state"
+doc = "As set."
+include = ["imaging"]
+
+[[telemetry]]
+id = 133
+name = "flag"
+doc = "Not all of them."
+fields = [{ type = "bits8", bits = [{ name = "follows", value = "parameter.tracking_enable" }, { width = 7 }] }]
+
+[[telecommand]]
+id = 7
+name = "relocate"
+doc = "Changes the address of the unit."
+action = "set_parameters"
+fields = [{ name = "address", type = "u8", parameter = "can_address" }]
+
+[[telemetry]]
+id = 134
+name = "address"
+doc = "The address."
+include = ["relocate"]
+
+[link.serial]
+"""
+
+
+def of_row(name: str, change) -> object:
+    return telemetry_data(lambda data, row: change(data) if row.name == name else data)
+
+
+def flipped(place: int):
+    return lambda data: data[:place] + bytes((data[place] ^ 1,)) + data[place + 1 :]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        of_row("exposure", flipped(1)),
+        of_row("exposure", lambda _data: b"\x03\xe8"),
+        only_acknowledged(0x12),
+        handling(lambda _device, request, handle: handle(request) if request.id != 0x12 else []),
+    ],
+    ids=["a bit of the answer", "a constant", "forgotten", "unanswered"],
+)
+def test_a_parameter_of_the_tutorial_that_is_not_reported_as_set_fails(damage, tmp_path):
+    unit, case = tutorial(tmp_path / "lynx"), "settings.exposure.set_exposure"
+    assert outcome_of(case, unit).status == "passed"
+    assert outcome_of(case, unit, damage=damage).status == "failed"
+
+
+SETTINGS = ["serial.settings.numbers", "serial.settings.imaging_state.imaging"]
+
+
+def with_parameters(folder: Path) -> Path:
+    text = ROWS.format(name="parameters", order="big").removesuffix("[link.serial]\n")
+    return written(folder, "parameters", text + PARAMETERS + LINKS["sum"])
+
+
+@pytest.mark.parametrize("place", [1, 3, 7, 8, 9])
+def test_parameters_are_read_back_and_restored(place, tmp_path):
+    unit = with_parameters(tmp_path)
+    cases = {item.id: item for item in serial_suite(read_unit(unit))}
+    assert [name for name in cases if ".settings." in name] == SETTINGS
+    with SimulatedUnit("serial", unit=unit) as simulated:
+        before = simulated.probe.telemetry("imaging_state")
+        outcome = run_case(simulated.probe, cases["serial.settings.imaging_state.imaging"])
+        assert (outcome.status, outcome.expected, outcome.seen) == ("passed", "", "")
+        assert simulated.probe.telemetry("imaging_state") == before
+    assert (
+        outcome_of(
+            "settings.imaging_state.imaging", unit, damage=of_row("imaging_state", flipped(place))
+        ).status
+        == "failed"
+    )

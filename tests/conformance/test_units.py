@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.attitude import conjugate, from_radec_roll
+from starhil.emulator.truth.source import FixedTruth
+from starhil.hil_tests.attitude import conjugate
 from starhil.hil_tests.conformance.canopen_suite import CANOPEN_CASES, canopen_suite
+from starhil.hil_tests.conformance.conformance_run import POINTING
 from starhil.hil_tests.conformance.runner import run_case, run_cases
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.judge.definition import read_unit
+from starid.attitude import Attitude
 from tests.conformance.mutant_seams import Damage
 from tests.conformance.mutants_oresat import DAMAGES, DEFINITION_MUTANTS, DefinitionMutant
 from tests.conformance.mutants_units import UnitMutant, gen2, mutants
@@ -53,11 +56,14 @@ def test_a_bundled_unit_passes_every_case_of_its_definition(unit: str, link: str
 def test_an_attitude_is_compared_with_the_truth_as_the_unit_reports_it(
     link: str, unit: str, known: str
 ) -> None:
-    truth = from_radec_roll(83.8, -1.2, 0.0)
     suite = {**SUITES, "canopen": canopen_suite}[link](read_unit(unit))
     cases = [case for case in suite if case.id.startswith(f"{link}.attitude.")]
-    with SimulatedUnit(link, unit=unit) as simulated:
-        simulated.probe.truth = lambda: truth if known == "true" else conjugate(truth)
+
+    def point(simulated: SimulatedUnit) -> None:
+        simulated.device.surroundings.truth = FixedTruth(Attitude.from_quaternion(POINTING))
+
+    with SimulatedUnit(link, point, unit=unit) as simulated:
+        simulated.probe.truth = lambda: POINTING if known == "true" else conjugate(POINTING)
         outcomes = run_cases(simulated.probe, cases)
     assert {o.status for o in outcomes} == {"passed" if known == "true" else "failed"}, outcomes
 

@@ -119,6 +119,17 @@ def test_the_start_is_a_date_and_moves_the_stars(date):
     assert load_profile("cubestar").epoch == 2026.0
 
 
+@pytest.mark.parametrize("key", ["fov_deg = 18.0", "width = 1024"])
+def test_another_camera_does_not_inherit_the_limiting_magnitude(tmp_path, key):
+    assert "limiting_magnitude" in load_profile("cubestar").parameters
+    mine = f'extends = "cubestar"\n[camera]\n{key}\n'
+    assert "limiting_magnitude" not in load_profile(write(tmp_path, mine)).parameters
+    own = load_profile(write(tmp_path, f"{mine}[parameters]\nlimiting_magnitude = 5.5\n"))
+    assert own.parameters["limiting_magnitude"] == 5.5
+    kept = load_profile(write(tmp_path, 'extends = "mine.toml"\n', "child.toml"))
+    assert kept.parameters["limiting_magnitude"] == 5.5
+
+
 def test_a_profile_s_camera_is_known_exactly_by_default(tmp_path):
     mine = 'extends = "cubestar"\n[camera]\nfov_deg = 20.0\n'
     assert not load_profile(write(tmp_path, mine)).parameters.keys() & CALIBRATION

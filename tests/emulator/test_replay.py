@@ -245,6 +245,67 @@ def test_a_changed_byte_is_named_by_time_row_and_place(record):
     assert re.fullmatch(place + "[0-9a-f]{2}", difference)
 
 
+@pytest.mark.parametrize("last", [False, True], ids=["others follow", "last"])
+@pytest.mark.parametrize(
+    ("at", "place"),
+    [
+        (0, "byte 0 of the message"),
+        (3, "byte 3 of the message"),
+        (16, "byte 12"),
+        (-1, "byte 30 of the message"),
+    ],
+    ids=["begin", "header", "data", "end"],
+)
+def test_a_changed_byte_of_a_message_that_no_longer_decodes_is_named(record, at, place, last):
+    """The check of the recorded message is now wrong; messages of another row may follow."""
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(
+            SerialHostLink(emulation.icd, emulation.ready_fields["serial"]), emulation.icd
+        )
+        await client.start()
+        await client.command("go")
+        await client.telemetry("ping")
+        if not last:
+            await client.command("go")
+            await client.command("go")
+        await client.close()
+
+    folder = record(scenario, unit="st16")
+    events = folder / EVENTS_FILE
+    lines = [json.loads(line) for line in events.read_text().splitlines()]
+    entry = [entry for entry in lines if entry["do"] == "out"][1]
+    data = bytearray.fromhex(entry["data"])
+    assert data[4:10] == b"starhi"
+    was = data[at]
+    data[at] ^= 1
+    entry["data"] = data.hex()
+    events.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    at_s = entry["ns"] / 1e9
+    assert report_of(folder).differences == [
+        f"serial: at {at_s:.3f} s, ping, {place}: recorded {data[at]:02x}, now {was:02x}"
+    ]
+
+
+def test_a_changed_address_of_a_can_frame_is_shown_in_both_frames(record):
+    bus = "virtual:id"
+
+    async def scenario(emulation, _line):
+        client = AsyncObcClient(CanHostLink(bus), emulation.icd)
+        await client.start()
+        for name in ("identification", "device_status", "identification"):
+            await client.telemetry(name)
+        await client.close()
+
+    links = {"serial": {"port": "off"}, "can": {"channel": bus}}
+    folder = record(scenario, clock="real", links=links)
+    changed_byte(folder, "can", lambda data: [data[0] ^ 1, *data[1:]])
+    (difference,) = report_of(folder).differences
+    assert re.fullmatch(
+        r"can: at \d+\.\d{3} s, identification: recorded frame \w{8}#\w+, now \w{8}#\w+", difference
+    )
+
+
 def test_a_changed_can_frame_is_named_by_its_row_or_its_meaning_in_canopen(record):
     bus = "virtual:changed"
 

@@ -3,6 +3,7 @@
 import asyncio
 import csv
 import resource
+from functools import partial
 
 import pytest
 
@@ -17,9 +18,11 @@ from starhil.emulator.profile import Profile, RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
+from starhil.hil_tests.private_can_bus import HubThread
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import bundled
+from starhil.protocol.transports import open_can
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 
@@ -330,6 +333,55 @@ def test_a_symlink_in_use_is_rejected_and_stays(run, tmp_path):
 
     run(scenario, links=links)
     assert not link.is_symlink()
+
+
+def can_links(channel, address=4, node=0):
+    can = {"channel": channel, "address": address}
+    return {"serial": {"port": "off"}, "can": can, "canopen": {"node": node}}
+
+
+def test_an_address_in_use_on_a_bus_with_a_name_is_rejected(run):
+    async def scenario(first, _line):
+        [head] = first.heads
+        second = Run([Profile.model_validate({"links": can_links(head.ready_fields["can"])})])
+        with pytest.raises(EmulatorError, match="address 4: in use by another emulator"):
+            await second.open()
+        await second.close()
+
+    with HubThread() as hub:
+        run(scenario, links=can_links(hub.channel))
+
+
+@pytest.mark.parametrize(
+    ("other", "same"),
+    [
+        (can_links("auto", address=5), True),
+        (can_links("auto"), False),
+        (can_links("auto", address=5, node=44), False),
+    ],
+)
+def test_auto_is_a_new_hub_if_an_address_is_in_use_on_the_usual_bus(run, monkeypatch, caplog, other, same):
+    with HubThread() as hub:  # its port is free again afterwards
+        usual = hub.port
+    monkeypatch.setattr("starhil.protocol.transports.can.kernel_can_is_up", lambda _: False)
+    monkeypatch.setattr("starhil.protocol.transports.can.open_can", partial(open_can, hub_port=usual))
+
+    async def scenario(first, _line):
+        both = [other, can_links("auto", address=6)]
+        second = Run(
+            [Profile.model_validate({"run": {"clock": "stepped"}, "links": links}) for links in both]
+        )
+        try:
+            await second.open()
+            return [head.ready_fields["can"] for head in (*first.heads, *second.heads)]
+        finally:
+            await second.close()
+
+    buses = run(scenario, links=can_links("auto", node=44))
+    assert buses[0] == f"socketcand:127.0.0.1:{usual}/vcan0"
+    assert buses[1] == buses[2], "heads of one run share the bus"
+    assert (buses[0] == buses[1]) is same
+    assert ("starts a CAN hub on a free port" in caplog.text) is not same
 
 
 def test_a_truth_log_that_cannot_be_written_is_rejected(run, tmp_path):

@@ -9,7 +9,7 @@ class Wire(Transport):
     """Keeps what the device sends, and its changes of the bit rate; a test puts in what arrives."""
 
     def __init__(self) -> None:
-        super().__init__("wire")
+        super().__init__("virtual:wire")  # a bus that no other process can join
         self.sent: list = []
 
     async def _open(self) -> None:

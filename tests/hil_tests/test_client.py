@@ -241,7 +241,7 @@ def test_a_telecommand_that_the_serial_line_does_not_answer_is_not_waited_for(hu
         assert [name for name, _ in device.received] == ["reset", "reset"]
 
 
-def test_unsolicited_telemetry_is_a_separate_stream(hub):
+def test_unsolicited_telemetry_is_a_separate_stream_of_each_row(hub):
     with FakeDevice() as device, ObcClient.open(can=device.open_can(hub), timeout_s=PATIENCE_S) as client:
         client.read("rates")
         for count in range(3):
@@ -250,6 +250,8 @@ def test_unsolicited_telemetry_is_a_separate_stream(hub):
         client.read("identification")
         counts = [client.wait_unsolicited("precise_attitude")["frame_counter"] for _ in range(3)]
         assert counts == [0, 1, 2]
+        rates = [client.wait_unsolicited("rates")["rate_x"] for _ in range(3)]
+        assert rates == pytest.approx([0.0, 0.1, 0.2], abs=1e-3)
         with pytest.raises(NoReplyError, match="unsolicited"):
             client.wait_unsolicited("precise_attitude", timeout_s=0.05)
         assert not client.stray_replies

@@ -428,6 +428,37 @@ def test_one_unsolicited_message_is_judged_without_a_rate(device, hub, tmp_path,
     assert (result.status, "rate_hz" in result.figures) == (status, False), result.detail
 
 
+LISTENING = "[[step]]\nlisten = 'precise_attitude'\n"
+IN_A_PAUSE = LISTENING + "within_s = 5\ntimeout_s = 0.3\nevery_s = 0.6\nexpect = { frame_counter = 7 }\n"
+
+
+@pytest.mark.parametrize(
+    ("script", "numbers"),
+    [
+        (IN_A_PAUSE, [7]),
+        (IN_A_PAUSE, range(8)),
+        (LISTENING + "within_s = 0\nrepeat = 3\nexpect = { frame_counter = { min = 1 } }\n", range(1, 4)),
+    ],
+    ids=["one message after the first attempt", "many messages at once", "repetitions"],
+)
+def test_listen_takes_each_message_from_the_begin_of_the_step(device, hub, tmp_path, script, numbers):
+    path = tmp_path / "trial.toml"
+    path.write_text(script, encoding="utf-8")
+
+    def say() -> None:
+        for number in numbers:
+            device.say("precise_attitude", {"frame_counter": number})
+
+    with Bench(LinkOptions(can=device.open_can(hub)), ICD) as bench:
+        bench.client("can").read("rates")
+        timer = threading.Timer(0.5, say)
+        timer.start()
+        (result,) = SessionRunner(load_script(path, ICD), bench, tmp_path).run().results
+        timer.join()
+    assert result.status == "passed", result.detail
+    assert result.seconds < 2.0
+
+
 def test_frames_are_sent_and_each_frame_of_the_answer_compared(play, device, hub):
     channel = device.open_can(hub)
     request = f"send = '{4 << 24 | 188 << 16 | 1 << 8 | 4:08X}#'\nlink = 'can'\n"

@@ -126,6 +126,10 @@ def test_the_attitude_of_a_running_unit_is_compared_with_its_truth_log_or_a_stat
         (["--canopen", "5"], "--canopen needs --can"),
         (["--start", "--truth", "1,2,3"], "--truth is for a unit that runs already"),
         (["--serial", "/dev/null", "--truth", "no.csv"], "no.csv: the truth cannot be read"),
+        (
+            ["--serial", "/dev/null", "--truth", "1,2"],
+            "--truth 1,2: give three numbers in degrees, RA,DEC,ROLL",
+        ),
         (["--serial", "/dev/null", "--truth", "0,91,0"], "--truth 0,91,0: give RA, Dec from -90 to 90"),
         (["--serial", "/dev/null", "--dialect", "x"], "must be a, b or c"),
     ],

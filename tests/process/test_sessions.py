@@ -101,7 +101,7 @@ with = { optical = { blocked_shar = 1.0 } }
 """
 
 
-def test_a_session_injects_faults_into_the_emulator_that_it_started(emulator, tmp_path):
+def test_a_session_injects_faults_into_the_emulator_that_it_started(tmp_path):
     script = tmp_path / "faults.toml"
     script.write_text(FAULTS)
     done = starhil("session", script, "--start", "--serial", "auto", "--log", tmp_path, "--json")
@@ -109,8 +109,6 @@ def test_a_session_injects_faults_into_the_emulator_that_it_started(emulator, tm
     assert [item["status"] for item in result["results"]] == 5 * ["passed"] + ["failed"]
     assert result["results"][1]["detail"] == '{"faults": {"optical": {"blocked_share": 1.0}}}'
     assert "unknown key 'blocked_shar'; did you mean blocked_share?" in result["results"][5]["detail"]
-    done = starhil("session", script, "--serial", emulator.ready["serial"], "--log", tmp_path, "--keep-going")
-    assert "only an emulator that the bench started has a control channel: use --start" in done.stdout
 
 
 def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
@@ -130,12 +128,30 @@ def test_the_profile_of_a_script_may_stand_beside_it(tmp_path, monkeypatch):
             ["--start"],
             "wrong.toml: step 1: read: no telemetry row named 'quaternoin'",
         ),
+        (
+            "[[step]]\nwait_s = 0\n[[step]]\ncontrol = 'clear_faults'\n",
+            ["--serial", "/dev/no-such-port"],
+            "wrong.toml: step 2: control: only an emulator that the bench started",
+        ),
+        (
+            "[[step]]\nrestart = 'kill'\n",
+            ["--serial", "/dev/no-such-port"],
+            "wrong.toml: step 1: restart: only an emulator that the bench started",
+        ),
         ("[[step]]\nwait_s = 0\n", ["--serial", "/dev/no-such-port"], "/dev/no-such-port"),
         ("[[step]]\nwait_s = 0\n", ["--can", "socketcand:127.0.0.1:1/vcan0"], "cannot connect"),
         ("[[step]]\nwait_s = 0\n", ["--start", "--profile", "no_such_profile"], "no_such_profile"),
         ("[emulator]\nset = ['camera.widht=5']\n[[step]]\nwait_s = 0\n", ["--start"], "widht"),
     ],
-    ids=["unknown telemetry", "no port", "no hub", "no profile", "wrong key"],
+    ids=[
+        "unknown telemetry",
+        "control without emulator",
+        "restart without emulator",
+        "no port",
+        "no hub",
+        "no profile",
+        "wrong key",
+    ],
 )
 def test_bad_input_ends_with_one_line_and_status_2(text, words, message, tmp_path):
     script = tmp_path / "wrong.toml"

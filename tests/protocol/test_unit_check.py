@@ -337,3 +337,57 @@ def test_a_row_needs_no_list_of_fields(tmp_path: Path) -> None:
     (tmp_path / "unit.toml").write_text(HEAD + row, encoding="utf-8")
     assert check_unit(tmp_path) == []
     assert load_unit(tmp_path).telecommands["row"].size == 0
+
+
+# -- the wording of single errors --------------------------------------------------------------------------------------
+
+SLIP = """
+[link.serial]
+framing = { kind = "slip", KEYS }
+request_header = [{ role = "id", type = "u8" }]
+reply_header = [{ role = "id", type = "u8" }]
+"""
+FIELDS = 'fields = [{ name = "error", type = "u8", value = "stars.matched" }]\n'
+
+
+def said_of(folder: Path, text: str) -> list[str]:
+    (folder / "unit.toml").write_text(HEAD + text, encoding="utf-8")
+    return [line.removeprefix(f"{folder}/unit.toml: ") for line in check_unit(folder)]
+
+
+def test_of_two_types_only_the_one_that_is_given_is_said_to_be_wrong(tmp_path: Path) -> None:
+    (said,) = said_of(tmp_path, ROW + FIELDS + 'unsolicited = ["valid"]\n')
+    assert said.startswith("telemetry.row.unsolicited.0: must be one of 'start', ")
+    assert said.endswith("(given: 'valid'); did you mean validity?")
+
+
+def test_an_unknown_kind_is_suggested(tmp_path: Path) -> None:
+    text = SLIP.replace("KEYS", "end = 0xC0").replace(
+        "request_header", 'check = { kind = "fletcher" }\nrequest_header'
+    )
+    (said,) = said_of(tmp_path, ROW + FIELDS + text)
+    assert said.endswith("(given: 'fletcher'); did you mean fletcher16?")
+
+
+def test_an_unknown_parameter_is_named_beside_a_limit_that_does_not_fit(tmp_path: Path) -> None:
+    field = 'fields = [{ name = "a", type = "u16", scale = 0.1, max = 50000, parameter = "exposur" }]\n'
+    assert said_of(tmp_path, ROW + field) == [
+        "telemetry row: field a: no parameter named 'exposur'; did you mean exposure?",
+        "telemetry row: field a: max 50000 does not fit type u16 with its scale",
+    ]
+
+
+@pytest.mark.parametrize(
+    "keys", ["end = 0xDB", "substitutes = [0xDB, 0xDD]", "substitutes = [0xDC, 0xDB]", "xor = 0x1B"]
+)
+def test_bytes_of_slip_that_are_equal_are_rejected(tmp_path: Path, keys: str) -> None:
+    (said,) = said_of(tmp_path, ROW + FIELDS + SLIP.replace("KEYS", keys))
+    assert said.endswith("link.serial.framing: end, escape and substitutes must differ")
+
+
+@pytest.mark.parametrize("fault", ["size = 7\n", 'unsolicited = ["valid"]\n', "sice = 1\n"])
+def test_a_duplicate_id_is_reported_beside_another_error_of_its_row(tmp_path: Path, fault: str) -> None:
+    other = ROW.replace('"row"', '"other"') + FIELDS
+    said = said_of(tmp_path, other + ROW + FIELDS + fault)
+    assert len(said) == 2
+    assert said[1] == "telemetry row: ID 1 is already used by other"

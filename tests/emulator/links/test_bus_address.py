@@ -1,13 +1,16 @@
-"""Two nodes of one address on a bus are reported, with the setting that gives one of them another."""
+"""Two emulators cannot start with one address on a bus; other nodes with that address are reported."""
 
 import asyncio
 import logging
+import os
 
 import pytest
 
+from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.bus_address import BusAddress
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
+from starhil.emulator.symlink_lock import LockError
 from starhil.protocol.can_framing import CanFrame, CanId, MessageType, encode_request_frames
 from starhil.protocol.hub import CanHub
 from starhil.protocol.messages import Request
@@ -23,20 +26,42 @@ def clashes(caplog) -> list[str]:
     return [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
 
 
-def test_an_address_is_reported_while_another_uses_it_and_free_afterwards(caplog):
+def test_an_address_is_rejected_while_another_uses_it_and_free_afterwards(caplog):
     first, second = (BusAddress("address", "links.can.address") for _ in range(2))
     first.acquire(BUS, 4)
     second.acquire(BUS, 5)
-    assert clashes(caplog) == []
-    second.acquire(BUS, 4)
-    [text] = clashes(caplog)
-    assert text.startswith(f"CAN {BUS}: address 4: in use by another emulator, process ")
-    assert text.endswith("change one of them: --set links.can.address=5")
-    second.release()
+    with pytest.raises(EmulatorError) as refused:
+        second.acquire(BUS, 4)
+    text = str(refused.value)
+    assert text.startswith(f"CAN {BUS}: address 4: in use by another emulator, process {os.getpid()}; ")
+    assert "--set links.can.address=5" in text
+    assert "starhil hub --port 0" in text
     first.release()
     second.acquire(BUS, 4)
-    assert len(clashes(caplog)) == 1
     second.release()
+    assert clashes(caplog) == []
+
+
+def test_an_address_changed_in_operation_is_reported_while_another_uses_it(caplog):
+    first, second = (BusAddress("address", "links.can.address") for _ in range(2))
+    first.acquire(BUS, 4)
+    second.acquire(BUS, 5)
+    second.change(BUS, 4)
+    [text] = clashes(caplog)
+    assert text.startswith(f"CAN {BUS}: address 4: in use by another emulator, process {os.getpid()}; ")
+    second.release()
+    first.release()
+
+
+def test_an_address_that_the_system_cannot_lock_is_reported_and_used(caplog, monkeypatch):
+    def refuse(*_):
+        raise LockError("cannot be locked (Operation not permitted)")
+
+    monkeypatch.setattr("starhil.emulator.links.bus_address.lock_name", refuse)
+    address = BusAddress("address", "links.can.address")
+    address.acquire(BUS, 4)
+    assert clashes(caplog) == [f"CAN {BUS}: address 4: cannot be locked (Operation not permitted)"]
+    assert address.number == 4
 
 
 @pytest.mark.parametrize(("bus", "number"), [("virtual:pair", 4), (BUS, 0)])
@@ -52,7 +77,7 @@ def test_a_bus_of_one_process_and_a_node_that_is_off_have_no_clash(bus, number, 
 @pytest.mark.parametrize(
     ("kind", "remedy"), [(CanLink, "--set links.can.address=5"), (CanopenLink, "--set links.canopen.node=")]
 )
-def test_a_second_device_on_a_bus_warns_at_its_start_and_works(kind, remedy, bench, caplog):
+def test_a_second_device_on_a_bus_is_rejected_at_its_start(kind, remedy, bench):
     async def main():
         hub = CanHub(port=0)
         await hub.start()
@@ -60,10 +85,8 @@ def test_a_second_device_on_a_bus_warns_at_its_start_and_works(kind, remedy, ben
             bench.device.parameters.set({"canopen_node": 44})
         links = [kind(bench.requests, open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0")) for _ in range(2)]
         await links[0].start()
-        assert clashes(caplog) == []
-        await links[1].start()
-        [text] = clashes(caplog)
-        assert remedy in text
+        with pytest.raises(EmulatorError, match=remedy):
+            await links[1].start()
         for link in links:
             await link.close()
         await hub.close()

@@ -34,7 +34,7 @@ class PaperTransport(Transport[CanFrame]):
     """Writes down what is sent, hands in what a test receives."""
 
     def __init__(self) -> None:
-        super().__init__("paper")
+        super().__init__("virtual:paper")
         self.frames: list[CanFrame] = []
 
     async def _open(self) -> None:

@@ -85,6 +85,11 @@ def test_the_stars_are_where_the_truth_has_them(tmp_path):
     ]
     assert len(stars) > 50
     assert np.median(distances) < 0.1
+    rigel = next(star for star in stars if star["hip"] == 24436)
+    assert (rigel["name"], rigel["v"]) == ("Rigel", pytest.approx(0.18, abs=0.1))
+    text = starid("identify", str(image)).stdout
+    assert re.search(r"HIP +name +V +x px", text)
+    assert re.search(r"24436 +Rigel +0\.\d\d ", text)
 
 
 def test_the_annotated_image_is_written_in_colour(tmp_path):
