@@ -18,7 +18,7 @@ import numpy as np
 
 from starhil.emulator.benchmarks.campaign import WRONG_DEG, of_thread, open_store, run_parts
 from starhil.emulator.benchmarks.hard_sky import direction_around
-from starhil.emulator.device.device import profile_defaults
+from starhil.emulator.device.device import adopt_camera, profile_defaults
 from starhil.emulator.device.navigation import observer_velocity
 from starhil.emulator.device.parameters import Parameters, exposure_period_s, solver_settings
 from starhil.emulator.device.power import FrameTiming, PowerModel
@@ -143,8 +143,7 @@ class EcssDevice:
         self.pipeline = Pipeline(replace(setup, sky=sky))
         self.start_unix_s, self.orbit = profile.start_unix_s, orbit_of(profile)
         parameters = self.parameters = Parameters(icd, profile_defaults(profile, icd))
-        constants = camera_constants(self.pipeline.camera.to_dict())
-        parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
+        adopt_camera(parameters, profile, camera_constants(self.pipeline.camera.to_dict()))
         self.settings = solver_settings(parameters)
         self.exposure_s = float(parameters["exposure"]) / 1000.0
         self.gain = float(parameters["analog_gain"])

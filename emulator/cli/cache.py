@@ -58,7 +58,7 @@ def warm(
     """
     from dataclasses import replace
 
-    from starhil.emulator.device.device import profile_defaults
+    from starhil.emulator.device.device import adopt_camera, profile_defaults
     from starhil.emulator.device.parameters import Parameters, solver_settings
     from starhil.emulator.pipeline.imager import WorkerImager
     from starhil.emulator.pipeline.messages import IndexRequest, camera_constants
@@ -79,8 +79,7 @@ def warm(
         imager = WorkerImager(setup, WorkerProcess())
         progress = asyncio.create_task(report_slow_start())
         try:
-            constants = camera_constants((await imager.start()).camera)
-            parameters.adopt_defaults({k: v for k, v in constants.items() if k not in loaded.parameters})
+            adopt_camera(parameters, loaded, camera_constants((await imager.start()).camera))
             imager.prepare(IndexRequest(solver_settings(parameters)))
             await imager.settle()
         finally:

@@ -188,10 +188,9 @@ class Device:
         self._boot_end = self.scheduler.at(self.started_ns + boot_ns, self._boot_time_over)
 
     def pipeline_ready(self, camera_constants: dict[str, Value]) -> None:
-        """Handle a ready pipeline; camera constants become defaults unless the profile sets them."""
+        """Handle a ready pipeline; its camera constants become defaults."""
         self.warm = True
-        configured = self.profile.parameters  # a device may be miscalibrated on purpose
-        self.parameters.adopt_defaults({k: v for k, v in camera_constants.items() if k not in configured})
+        adopt_camera(self.parameters, self.profile, camera_constants)
         if self._boot_end is None and self.modes.mode is Mode.BOOT:
             self._end_boot()
 
@@ -321,6 +320,11 @@ def rate_fields(icd: InterfaceDefinition) -> list[tuple[Field, int, float]]:
         for field in row.named_fields.values()
         if field.value in axes and field.kind == "integer"
     ]
+
+
+def adopt_camera(parameters: Parameters, profile: Profile, constants: Mapping[str, Value]) -> None:
+    """Make camera constants the defaults, except those that the profile sets: a device may be miscalibrated on purpose."""
+    parameters.adopt_defaults({k: v for k, v in constants.items() if k not in profile.parameters})
 
 
 def profile_defaults(profile: Profile, icd: InterfaceDefinition) -> dict[str, Value]:
