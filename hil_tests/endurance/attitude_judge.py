@@ -8,11 +8,11 @@ from typing import Final
 
 from starhil.hil_tests.attitude import Quaternion, conjugate, from_matrix, product
 from starhil.hil_tests.endurance.truth import Error, Motion, Vector, cross, frame_turned, of_pairs
-from starhil.hil_tests.endurance.violation import Known, Violation, resolution
-from starhil.protocol.codec import Field
+from starhil.hil_tests.endurance.violation import Known, Violation
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import Value
 
 SIGMAS: Final = 6.0
 """A valid attitude is within this many of its stated standard deviations of the truth."""
@@ -70,7 +70,7 @@ class AttitudeJudge:
         stars = _stars(read)
         if not read["attitude.valid"][1]:
             if any(
-                abs(number) > resolution(field) for number, (field, _) in zip(numbers, reported, strict=True)
+                abs(number) > field.resolution for number, (field, _) in zip(numbers, reported, strict=True)
             ):
                 raise Violation(f"{row}: quaternion {numbers} though the attitude is invalid")
             if stars:
@@ -85,7 +85,7 @@ class AttitudeJudge:
         if not math.isfinite(window_s):
             return
         if len(numbers) >= 3:
-            finest = max(resolution(field) for field, _ in reported) + 1e-7
+            finest = max(field.resolution for field, _ in reported) + 1e-7
             self._judge_quaternion(row, numbers, 4.0 * finest, read, (now_s, window_s), values)
         if len(stars) >= 2:
             self._judge_stars(row, stars, (now_s, window_s), values)
@@ -196,13 +196,13 @@ class AttitudeJudge:
         self, where: str, field: Field, value: Value, now_s: float, values: Mapping[str, Known | None]
     ) -> None:
         """Check the time between exposures, which changes with the next image after a telecommand."""
-        low, high = field.physical_limits
+        low, high = field.limits
         scale = factor("s", field.unit) or 1.0
         recent = self._recent_periods(now_s, values)
         if isinstance(value, (str, bytes)) or not all(map(math.isfinite, recent)):
             return
         possible = [min(max(period * scale, low), high) for period in recent]
-        if all(abs(value - period) > resolution(field) + 1e-6 * period for period in possible):
+        if all(abs(value - period) > field.resolution + 1e-6 * period for period in possible):
             raise Violation(f"{where}: {value!r}, not {possible[0]!r}")
 
     def _recent_periods(self, now_s: float, values: Mapping[str, Known | None]) -> list[float]:
@@ -244,6 +244,6 @@ def _stars(read: Readings) -> list[tuple[Vector, Vector, float]]:
             (
                 (numbers[0], numbers[1], numbers[2]),
                 (numbers[3], numbers[4], numbers[5]),
-                resolution(items[0][0]),
+                items[0][0].resolution,
             )
         )

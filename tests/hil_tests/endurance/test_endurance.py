@@ -21,6 +21,7 @@ from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.shrink import kind_of, shortened
 from starhil.hil_tests.endurance.truth import Error, Motion
+from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled_units
@@ -31,7 +32,7 @@ READ_MODE = {"do": "request", "link": "serial", "row": ["", 160, "telemetry"]}
 
 def life_of(unit, seed, steps=STEPS):
     icd = load_unit(unit)
-    return make_life(icd, unit, links_of(icd), seed, steps)
+    return make_life(unit_of(icd), unit, links_of(icd), seed, steps)
 
 
 @pytest.mark.parametrize("unit", sorted(bundled_units()))
@@ -81,7 +82,7 @@ def test_a_long_life_passes_the_wraps_of_its_counters():
 
 def test_long_lives_last_for_months():
     icd = load_unit("sagitta")
-    life = make_life(icd, "sagitta", links_of(icd), 1, 150, is_long=True)
+    life = make_life(unit_of(icd), "sagitta", links_of(icd), 1, 150, is_long=True)
     assert sum(step["s"] for step in life.steps if step["do"] == "wait") > 49.7 * 86_400.0
     assert not {"power", "fault", "recover"} & {step["do"] for step in life.steps}
 
@@ -390,7 +391,7 @@ def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
         'reply_header = [{ role = "id", type = "u8" }, { role = "status", type = "u8" }]\n'
     )
     icd = load_unit(tmp_path)
-    life = make_life(icd, str(tmp_path), links_of(icd), 1, 200)
+    life = make_life(unit_of(icd), str(tmp_path), links_of(icd), 1, 200)
     sent = [step for step in life.steps if step["do"] == "request"]
     assert sum(step["row"] == ["", 2, "telemetry"] for step in sent) > 50
     assert "nmt" not in {step["do"] for step in life.steps}
