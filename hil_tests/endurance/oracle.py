@@ -13,8 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
-from starhil.hil_tests.endurance.truth import Motion
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
 from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Value

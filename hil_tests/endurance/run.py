@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
 
+from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import MOST_EVENTS, Life, Outcome
 from starhil.hil_tests.endurance.obc import Obc
 from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
-from starhil.hil_tests.endurance.truth import Motion
 from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit

@@ -17,10 +17,10 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.replay import replay
+from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.shrink import kind_of, shortened
-from starhil.hil_tests.endurance.truth import Error, Motion
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
@@ -263,11 +263,10 @@ def test_a_life_is_shortened_to_the_events_that_matter():
 
 def test_a_late_exposure_is_no_error_along_the_motion():
     motion = Motion(0.0, (0.0, 0.0, 0.0, 1.0), (0.0, 0.01, 0.0))
-    error = Error.between(motion.at(10.0), motion.at(10.3))
-    assert abs(error.y) == pytest.approx(0.003)
-    left = error.along(motion.rate_rad_s, 0.5)
-    assert (left.x, left.y, left.z) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
-    assert abs(error.along(motion.rate_rad_s, 0.1).y) == pytest.approx(0.002)
+    late = motion.at(10.0)
+    assert abs(motion.error(late, 10.3, 0.0)[1]) == pytest.approx(0.003)
+    assert motion.error(late, 10.3, 0.5) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    assert abs(motion.error(late, 10.3, 0.1)[1]) == pytest.approx(0.002)
 
 
 def test_a_life_with_a_full_disk_is_written_without_a_recording(tmp_path):

@@ -8,13 +8,12 @@ import pytest
 
 from starhil.emulator.cli.endurance import run_once
 from starhil.emulator.endurance.unit_under_test import UnitUnderTest
-from starhil.hil_tests.attitude import Quaternion, conjugate, product
-from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
+from starhil.hil_tests.attitude import Quaternion, conjugate, from_rotation_vector, product
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
 from starhil.hil_tests.endurance.life import Life
 from starhil.hil_tests.endurance.node import Node
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.run import ORION
-from starhil.hil_tests.endurance.truth import Motion, frame_turned
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.hil_tests.judge.rows import PARAMETER
@@ -353,7 +352,7 @@ def reading_of(q, *, valid=True, unit=UNIT, stars=()):
 
 
 def turned(q, arcsec, axis=(1.0, 0.0, 0.0)):
-    return product(frame_turned(axis, math.radians(arcsec / 3600.0)), q)
+    return product(from_rotation_vector([math.radians(-arcsec / 3600.0) * part for part in axis]), q)
 
 
 def judge(read, *, imaging=True, now_s=10.0, dark_since_s=None, unit=UNIT, forget=()):
