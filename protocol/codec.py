@@ -491,14 +491,6 @@ class Row(RowKeys):
             values[name] = item.to_physical(number)
         return values
 
-    def clipped(self, values: Mapping[str, Value]) -> list[str]:
-        """Return the names of the numbers that telemetry would send as the nearest limit."""
-        return [
-            name
-            for name, item in self.named_fields.items()
-            if item.kind in ("integer", "float") and item.clips(float(values.get(name, item.empty)))
-        ]
-
     def sample(self) -> dict[str, Value]:
         """Return values that show how the row is packed: neighbouring bytes differ, flags alternate."""
         values = {name: item.sample(index) for index, (name, item) in enumerate(self.named_fields.items())}
