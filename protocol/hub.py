@@ -52,9 +52,6 @@ python-can's client rejects the answer to `< rawmode >` if a frame follows it in
 the client sends shows that it has read the answer, and ends the wait.
 """
 
-FLUSH_LOG_S: Final = 0.5
-"""Longest time that a logged frame stays in the buffer."""
-
 
 @dataclass(slots=True)
 class HubStatistics:
@@ -228,7 +225,6 @@ class CanHub:
         self._now = now
         self._server: asyncio.Server | None = None
         self._clients: list[_Client] = []
-        self._flusher: asyncio.TimerHandle | None = None
 
     async def start(self) -> None:
         """Listen. Raises ProtocolError if the address or the log is not available."""
@@ -245,16 +241,15 @@ class CanHub:
         self.port = self._server.sockets[0].getsockname()[1]
         if self._log_path is not None:
             try:
-                self._log = self._log_path.open("w", encoding="ascii")
+                self._log = self._log_path.open(
+                    "w", encoding="ascii", buffering=1
+                )  # a batch is written at once
             except OSError as error:
                 await self.close()
                 raise ProtocolError(f"CAN hub: cannot write {self._log_path}: {error.strerror}") from None
-            self._flush_log()
 
     async def close(self) -> None:
         """Stop listening and drop all clients."""
-        if self._flusher is not None:
-            self._flusher.cancel()
         if self._server is not None:
             self._server.close()
             self._server = None
@@ -263,10 +258,7 @@ class CanHub:
         while self._clients:
             await asyncio.sleep(0)
         if self._log is not None:
-            try:
-                self._log.close()
-            except OSError as error:
-                self._abandon_log(error)
+            self._log.close()
             self._log = None
 
     def join(self, client: _Client) -> None:
@@ -296,26 +288,13 @@ class CanHub:
             self.statistics.dropped += dropped
         if self._log is not None:
             bus = sender.bus or DEFAULT_BUS
+            text = "".join(format_candump(replace(frame, timestamp=seconds), bus) + "\n" for frame in frames)
             try:
-                for frame in frames:
-                    self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
+                self._log.write(text)
             except OSError as error:
-                self._abandon_log(error)
-
-    def _flush_log(self) -> None:
-        if self._log is None:
-            return
-        try:
-            self._log.flush()
-        except OSError as error:
-            self._abandon_log(error)
-        else:
-            self._flusher = asyncio.get_running_loop().call_later(FLUSH_LOG_S, self._flush_log)
-
-    def _abandon_log(self, error: OSError) -> None:
-        """Report once that the CAN log ends here; the bus continues without it."""
-        log, self._log = self._log, None
-        _LOGGER.warning("CAN hub: log %s ends here: %s; the bus continues", self._log_path, reason(error))
-        if log is not None:
-            with contextlib.suppress(OSError):  # its buffer cannot be written either
-                log.close()
+                _LOGGER.warning(
+                    "CAN hub: log %s ends here: %s; the bus continues", self._log_path, reason(error)
+                )
+                with contextlib.suppress(OSError):  # its buffer cannot be written either
+                    self._log.close()
+                self._log = None

@@ -60,7 +60,7 @@ def test_a_hub_that_stops_reading_neither_blocks_nor_fills_memory() -> None:
             if number % 500 == 0:
                 await asyncio.sleep(0)
         assert transport.statistics.dropped == 1
-        assert transport._connection.transport.get_write_buffer_size() < HUB_BACKLOG + 100_000  # type: ignore[attr-defined]
+        assert transport._writer.transport.get_write_buffer_size() < HUB_BACKLOG + 100_000  # type: ignore[attr-defined]
         await transport.close()
         server.close()
 

@@ -155,7 +155,7 @@ def test_a_line_carries_only_bytes_sent_after_the_peer_returned(kind: str, tmp_p
         await peer.leave()
         await until(lambda: line.statistics.dropped > 0)
         line.send(b"to nobody")
-        await until(lambda: _backlog(line) == 0)
+        await until(lambda: line._backlog == 0)  # type: ignore[attr-defined]
         peer.got.clear()
         await peer.come(line.description)
         await _hears(peer, line)
@@ -164,11 +164,6 @@ def test_a_line_carries_only_bytes_sent_after_the_peer_returned(kind: str, tmp_p
         await line.close()
 
     asyncio.run(main())
-
-
-def _backlog(line: SerialTransport) -> int:
-    writer = line._writer  # type: ignore[attr-defined]
-    return 0 if writer is None else writer.backlog
 
 
 async def _hears(peer: Peer, line: SerialTransport) -> None:
