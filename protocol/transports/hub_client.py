@@ -40,7 +40,7 @@ class HubTransport(ReconnectingTransport[CanFrame]):
         self._reading: asyncio.Task[None] | None = None
         self._outbox: list[bytes] = []
 
-    async def _connect(self) -> None:
+    async def _open(self) -> None:
         try:
             reader, writer = await asyncio.open_connection(self._host, self._port)
         except (OSError, ValueError) as error:  # an invalid host name raises ValueError
@@ -164,9 +164,9 @@ class AutoHubTransport(HubTransport):
         super().__init__(host, port, DEFAULT_BUS)
         self._hub: CanHub | None = None
 
-    async def _connect(self) -> None:
+    async def _open(self) -> None:
         await self._ensure_hub()
-        await super()._connect()
+        await super()._open()
 
     async def _ensure_hub(self) -> None:
         if self._hub is not None or (self._port and await self._is_served()):

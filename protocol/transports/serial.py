@@ -94,7 +94,7 @@ class TtyTransport(PacedTransport, ReconnectingTransport[bytes]):
         self._baud = baud
         self._port: serial.Serial | None = None
 
-    async def _connect(self) -> None:
+    async def _open(self) -> None:
         path = Path(self._path)
         if path.exists() and not path.is_char_device():
             raise TransportError(
@@ -244,7 +244,7 @@ class _ConnectTransport(_TcpTransport):
 
     scheme = "socket"
 
-    async def _connect(self) -> None:
+    async def _open(self) -> None:
         loop = asyncio.get_running_loop()
         try:
             await loop.create_connection(lambda: self, self._host, self._port)
@@ -260,7 +260,7 @@ class _ListenTransport(_TcpTransport):
     scheme = "listen"
     _server: asyncio.Server | None = None
 
-    async def _connect(self) -> None:
+    async def _open(self) -> None:
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: self, self._host, self._port)
