@@ -23,6 +23,7 @@ from starhil.protocol.canopen.communication import (
     variable,
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Entry, Value, encode, type_size
+from starhil.protocol.canopen.pdo_mapping import Direction, resolve_all
 from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
@@ -62,6 +63,12 @@ class DeviceDictionary(Dictionary):
         tpdos = [self._mapped(model) for model in layout.tpdo]
         add_communication(objects, layout, rpdos, tpdos)
         super().__init__(objects, entries)
+        for direction, pdos in ((Direction.RECEIVE, rpdos), (Direction.TRANSMIT, tpdos)):
+            for model, mapping in pdos:
+                try:
+                    resolve_all(self, mapping, direction)
+                except SdoAbortError as refusal:
+                    raise IcdError(f"canopen.toml: PDO {model.name}: {refusal}") from None
 
     def row_bytes(self, row: Row) -> bytes:
         """Return the bytes of a telemetry row, read from the application once per sampling instant."""
