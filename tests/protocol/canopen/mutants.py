@@ -164,12 +164,12 @@ MUTANTS = (
     Mutant("restore changes nothing", "store", "store", "self._for_groups(subindex, self._storage.clear,", "self._for_groups(subindex, self._storage.load,"),
     Mutant("restore counts at once", "store", "store", "self._for_groups(subindex, self._storage.clear,", "self._for_groups(subindex, lambda group: (self._storage.clear(group), self.set_defaults(group)),"),
     Mutant("groups are not kept apart", "store", "store", "            if subindex in {ALL, number}:", "            if True:"),
-    Mutant("LSS selected by part of the identity", "lss", "lss", "if step != self._selected or number != self._identity(step):", "if step != self._selected:"),
+    Mutant("LSS selected by part of the identity", "lss", "lss", "matches=number == self._identity(step)", "matches=True"),
     Mutant("LSS obeys while it waits", "lss", "lss", "        elif self.configuring:\n            self._configuration", "        elif True:\n            self._configuration"),
     Mutant("LSS takes any node-ID", "lss", "lss", "valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED", "valid = True"),
     Mutant("LSS node-ID never used", "lss", "slave", "        context.node_id = self.lss.pending_node_id\n", ""),
     Mutant("LSS reports the pending node-ID", "lss", "lss", "self._send(command, bytes([self._context.node_id]))", "self._send(command, bytes([self.pending_node_id ^ 1]))"),
-    Mutant("LSS takes reserved bit rates", "lss", "lss", "BIT_RATES.get(data[2]) if data[1] == 0 else None", "BIT_RATES.get(data[2], 125_000) if data[1] == 0 else None"),
+    Mutant("LSS takes reserved bit rates", "lss", "lss", "BIT_RATES.get(data[2], 0)", "BIT_RATES.get(data[2], 125_000)"),
     Mutant("LSS identify ignores ranges", "lss", "lss", "number <= own if step % 2 == 0 else number >= own", "True"),
     Mutant("LSS identify answered by another command", "lss", "lss", "    IDENTIFIED = 0x4F\n", "    IDENTIFIED = 0x47 + 1\n"),
     Mutant("configured node answers fastscan", "lss", "lss", "if not self._unconfigured or self.configuring:", "if self.configuring:"),
@@ -179,8 +179,8 @@ MUTANTS = (
     Mutant("EDS with wrong defaults", "od", "eds", 'number = f"0x{item.default:X}" if item.default >= 0 else str(item.default)', 'number = f"0x{item.default ^ 1:X}"'),
     Mutant("EDS leaves out an object", "eds", "eds", '        lists[f"{kind}Objects"].append(index)\n', '        if index != 0x1005:\n            lists[f"{kind}Objects"].append(index)\n'),
     Mutant("EDS with another number of PDOs", "eds", "eds", "tpdos=information.nr_of_TXPDO", "tpdos=information.nr_of_TXPDO + 1"),
-    Mutant("EDS with high limits too low", "eds", "eds", "(key, str(int(limit)))", "(key, str(int(limit) // 1000))"),
-    Mutant("EDS calls everything mappable", "tpdo", "eds", '("PDOMapping", str(int(item.pdo_mappable)))', '("PDOMapping", "1")'),
+    Mutant("EDS with high limits too low", "eds", "eds", "key: str(int(limit))", "key: str(int(limit) // 1000)"),
+    Mutant("EDS calls everything mappable", "tpdo", "eds", '{"PDOMapping": str(int(item.pdo_mappable))}', '{"PDOMapping": "1"}'),
 )  # fmt: skip
 
 
