@@ -39,6 +39,11 @@ class LinkOptions:
     timeout_s: float = DEFAULT_TIMEOUT_S
     retries: int = 0
 
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links in use: `serial`, `can` or both."""
+        return tuple(name for name in ("serial", "can") if getattr(self, name) is not None)
+
 
 class Bench:
     """Clients of one unit: a context manager that opens them on first use and closes them all.
@@ -57,17 +62,13 @@ class Bench:
         log_folder: Path | None = None,
     ) -> None:
         self.options = options
+        self.links = options.links
         self.icd = icd
         self.emulator = emulator
         self.log_folder = log_folder
         self.logs: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
         self._started = False
-
-    @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the links in use: `serial`, `can` or both."""
-        return tuple(name for name in ("serial", "can") if getattr(self.options, name) is not None)
 
     def client(self, link: str) -> ObcClient:
         """Return the client on a link, opened at the first call."""

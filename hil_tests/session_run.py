@@ -27,8 +27,9 @@ from starhil.hil_tests.results import (
     write_junit,
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.script import Control, Restart, Script, load_script
+from starhil.hil_tests.script import Script, load_script
 from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.steps import Control, Listen
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
@@ -79,9 +80,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     script = load_script(path, icd)
     if request.keep_going:
         script.defaults.keep_going = True
-    if not request.start:
-        _reject_emulator_steps(path, script)
     options = _options(request, script)
+    _check_steps(path, script, icd, options.links, start=request.start)
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -117,13 +117,18 @@ def run_session(request: SessionRequest) -> SessionResult:
     return result
 
 
-def _reject_emulator_steps(path: Path, script: Script) -> None:
-    """Raise ScriptError if a step needs an emulator that the bench started."""
-    for step in script.steps:
-        if isinstance(step, Control | Restart):
-            action = "control" if isinstance(step, Control) else "restart"
+def _check_steps(
+    path: Path, script: Script, icd: InterfaceDefinition, links: tuple[str, ...], *, start: bool
+) -> None:
+    """Raise ScriptError if a step can never pass on these links, or needs an emulator that the bench starts."""
+    for step, link in script.planned(links):
+        why = ""
+        if step.needs_emulator and not start:
             why = "only an emulator that the bench started can do this: use --start"
-            raise ScriptError(f"{path.name}: step {step.number}: {action}: {why}")
+        elif isinstance(step, Listen) and link == "can" and icd.link.can is None:
+            why = f"unit {icd.name} has only CANopen on CAN, where no row is sent without a request; read it"
+        if why:
+            raise ScriptError(f"{path.name}: step {step.number}: {type(step).__name__.lower()}: {why}")
 
 
 def _failed(
@@ -166,7 +171,7 @@ def _shown_on_console(
         return show
     address = console_address(view, bench.emulator)
     unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
-    planned = len(script.steps) * (len(bench.links) if script.defaults.link == "both" else 1)
+    planned = len(script.planned(bench.links))
     feed = stack.enter_context(
         RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
     )

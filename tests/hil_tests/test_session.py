@@ -250,6 +250,18 @@ def test_the_attitude_is_compared_with_the_truth_of_its_time_in_a_file(play, dev
     assert not play(text).passed
 
 
+def test_a_truth_log_that_is_given_takes_the_place_of_the_truth_of_the_script(device, tmp_path):
+    script, log = tmp_path / "s.toml", tmp_path / "truth.csv"
+    script.write_text(TRUTH + "[[step]]\nread = 'precise_attitude'\nattitude = { within_arcsec = 1 }")
+    device.telemetry["precise_attitude"] = attitude_values()
+    rows = [f"{t}," + ",".join(map(repr, from_radec_roll(10.0, 20.0, 30.0))) for t in (100, 101)]
+    log.write_text("\n".join(["time_of_exposure_s,true_qx,true_qy,true_qz,true_qw", *rows]))
+    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
+        for truth, status in ((None, "passed"), (log, "failed")):
+            runner = SessionRunner(load_script(script, ICD), bench, tmp_path, truth_path=truth)
+            assert runner.run().results[0].status == status
+
+
 @pytest.mark.parametrize("own", ["", "truth.kind=rate"])
 def test_the_truth_of_a_script_points_the_emulator_that_is_started(own, tmp_path):
     path = tmp_path / "trial.toml"
