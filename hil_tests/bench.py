@@ -14,7 +14,7 @@ from starhil.hil_tests.control import ControlClient
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
-from starhil.hil_tests.wire_log import CandumpLog, SerialLog, WireLog
+from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.candump import bus_name
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
@@ -79,39 +79,28 @@ class Bench:
         return self._clients[link]
 
     def _open(self, link: str) -> ObcClient:
-        options = self.options
-        spec = self._spec(link)
-        common = {"unit": self.icd, "timeout_s": options.timeout_s, "retries": options.retries}
-        log = self._log(link)
-        if link == "serial":
-            return ObcClient.open(serial=spec, dialect=options.dialect, baud=options.baud, log=log, **common)  # type: ignore[arg-type]
-        return ObcClient.open(
-            can=spec,
-            host_address=options.host_address,
-            device_address=options.device_address,
-            log=log,
-            **common,  # type: ignore[arg-type]
-        )
+        port = self._port(link)
+        if self.log_folder is not None and link not in self.logs:
+            bus = bus_name(port) if link == "can" else ""
+            self.logs[link] = WireLog(self.log_folder / f"{link}.log", bus)
+        options = {**vars(self.options), "serial": None, "can": None, link: port}
+        return ObcClient.open(**options, unit=self.icd, log=self.logs.get(link))
 
-    def _spec(self, link: str) -> str:
-        spec = str(getattr(self.options, link))
-        if self.emulator is None or spec != "auto":
-            return spec
+    def _port(self, link: str) -> str:
+        port = str(getattr(self.options, link))
+        if self.emulator is None or port != "auto":
+            return port
         if link not in self.emulator.ready:
             raise BenchError(
                 f"the emulator did not open a {link} link; its ready line has {self.emulator.ready}"
             )
         return self.emulator.ready[link]
 
-    def _log(self, link: str) -> WireLog | None:
-        if self.log_folder is None:
-            return None
-        if link not in self.logs:
-            path = self.log_folder / f"{link}.log"
-            self.logs[link] = (
-                SerialLog(path) if link == "serial" else CandumpLog(path, bus_name(self._spec(link)))
-            )
-        return self.logs[link]
+    @property
+    def _own_emulator(self) -> EmulatorProcess:
+        if self.emulator is None:
+            raise BenchError("only an emulator that the bench started can do this: use --start")
+        return self.emulator
 
     def close_clients(self) -> None:
         """Close all clients; they are opened again on next use."""
@@ -124,9 +113,7 @@ class Bench:
 
         Raises BenchError: the request was rejected, or the unit is not an emulator that the bench started.
         """
-        if self.emulator is None:
-            raise BenchError("only an emulator that the bench started has a control channel: use --start")
-        with ControlClient(self.emulator.ready["control"]) as channel:
+        with ControlClient(self._own_emulator.ready["control"]) as channel:
             return channel.do(action, **keys)
 
     def restart(self, how: str) -> None:
@@ -134,11 +121,10 @@ class Bench:
 
         Raises BenchError: the unit is not an emulator that the bench started.
         """
-        if self.emulator is None:
-            raise BenchError("only an emulator that the bench started can be restarted: use --start")
+        emulator = self._own_emulator
         self.close_clients()
         self._started = False  # a failed restart has already cleaned up and raised its error
-        self.emulator.restart(SIGNAL_NUMBERS[how])
+        emulator.restart(SIGNAL_NUMBERS[how])
         self._started = True
 
     def __enter__(self) -> Self:
