@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Final, Self
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S
@@ -17,7 +19,6 @@ from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAUL
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.candump import bus_name
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import ProtocolError
 
 SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 
@@ -68,7 +69,7 @@ class Bench:
         self.log_folder = log_folder
         self.logs: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
-        self._started = False
+        self._stack = ExitStack()
 
     def client(self, link: str) -> ObcClient:
         """Return the client on a link, opened at the first call."""
@@ -82,7 +83,7 @@ class Bench:
         port = self._port(link)
         if self.log_folder is not None and link not in self.logs:
             bus = bus_name(port) if link == "can" else ""
-            self.logs[link] = WireLog(self.log_folder / f"{link}.log", bus)
+            self.logs[link] = self._stack.enter_context(WireLog(self.log_folder / f"{link}.log", bus))
         options = {**vars(self.options), "serial": None, "can": None, link: port}
         return ObcClient.open(**options, unit=self.icd, log=self.logs.get(link))
 
@@ -123,32 +124,17 @@ class Bench:
         """
         emulator = self._own_emulator
         self.close_clients()
-        self._started = False  # a failed restart has already cleaned up and raised its error
         emulator.restart(SIGNAL_NUMBERS[how])
-        self._started = True
 
     def __enter__(self) -> Self:
         if self.log_folder is not None:
             self.log_folder.mkdir(parents=True, exist_ok=True)
         if self.emulator is not None:
-            self.emulator.start()
-            self._started = True
+            self._stack.enter_context(self.emulator)
+        self._stack.callback(self.close_clients)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
-        try:
-            self.close_clients()
-        finally:
-            for log in self.logs.values():
-                log.close()
-            self._end_emulator(kind)
-
-    def _end_emulator(self, kind: type[BaseException] | None) -> None:
-        """End the emulator; report that it ended unexpectedly, which may have caused the current error."""
-        if self.emulator is None or not self._started:
-            return
-        caused_by_emulator = kind is not None and issubclass(kind, BenchError | ProtocolError)
-        if kind is None or (caused_by_emulator and not self.emulator.running):
-            self.emulator.stop()
-        else:
-            self.emulator.kill()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)

@@ -175,6 +175,16 @@ class Session:
     step_begin_s: float = 0.0
     """Begin of the present step, on `time.monotonic`."""
 
+    def truth_of(self, reading: Reading) -> Quaternion:
+        """Return the true attitude at the time of a reading."""
+        if self.truth is None:
+            raise BenchError("no truth to compare the attitude with")
+        if not isinstance(self.truth, TruthLogReader):
+            return self.truth
+        if "time_of_exposure" not in reading.values:
+            raise BenchError(f"{reading.name} has no time; read precise_attitude")
+        return self.truth.at(float(reading["time_of_exposure"]))
+
     @property
     def variables(self) -> dict[str, Value]:
         """The captured values and the time."""
@@ -289,13 +299,7 @@ class Step(Keys):
         if self.expect and not problems:
             attempt.detail = " ".join(f"{name}={show(reading[name])}" for name in self.expect)
         if self.attitude is not None and not problems:
-            truth = self.attitude.attitude or session.truth
-            if isinstance(truth, TruthLogReader):
-                if "time_of_exposure" not in reading.values:
-                    raise BenchError(f"step {self.number}: {reading.name} has no time; read precise_attitude")
-                truth = truth.at(float(reading["time_of_exposure"]))
-            if truth is None:
-                raise BenchError(f"step {self.number}: no truth to compare the attitude with")
+            truth = self.attitude.attitude or session.truth_of(reading)
             error, problem = self.attitude.judge(reading.values, truth, session.bench.icd.conventions)
             if error is not None:
                 attempt.figures.update(vars(error))
@@ -354,17 +358,12 @@ class Command(RequestStep):
                     yield str(error)
 
     def run(self, session: Session, link: str) -> Attempt:
-        """Send the telecommand; whole numbers that were captured as floats are sent as integers."""
+        """Send the telecommand."""
         data = self.raw
         if data is None:
             variables = session.variables
-            found = {name: resolve(value, variables) for name, value in self.values.items()}
-            whole = {
-                name: int(value)
-                for name, value in found.items()
-                if isinstance(value, float) and value.is_integer()
-            }
-            data = self.row.encode({**found, **whole}, check=self.refused is None)
+            values = {name: resolve(value, variables) for name, value in self.values.items()}
+            data = self.row.encode(values, check=self.refused is None)
         return self.exchange(session.bench.client(link).command_raw, self.row.name, data)[0]
 
 
@@ -461,10 +460,8 @@ class Sample(ReadingStep):
             writer.writerow(["obc_time_s", "latency_ms", *fields])
             while time.monotonic() - begin < self.for_s or not latencies:
                 reading = client.read(self.row.name, **self.patience)
-                values = [_csv_text(reading[name]) for name in fields]
-                writer.writerow(
-                    [f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}", *values]
-                )
+                head = f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}"
+                writer.writerow([*head, *(_in_csv(reading[name]) for name in fields)])
                 latencies.append(reading.latency_s)
                 last = self.judged(session, reading)
                 if last.problem is not None:
@@ -592,7 +589,8 @@ class Send(Step):
         """Send the data and compare what comes back."""
         wanted = self.answer or ()
         client = session.bench.client(link)
-        seen = send_and_listen(client, self.data, self.listen_s, wanted, self.timeout_s)
+        listening = send_and_listen(client.core, self.data, self.listen_s, wanted, self.timeout_s)
+        seen = client.run(listening)
         shown = ", ".join(text for text in seen if text) or "nothing"
         if self.answer is None:
             return Attempt(detail=f"came back: {shown}")
@@ -660,13 +658,11 @@ ACTIONS: Final[Mapping[str, type[Step]]] = {
 """Key of an action → its class."""
 
 
-def _csv_text(value: Value) -> str:
-    """Format a value for a CSV file, with all digits."""
-    if isinstance(value, bool):
-        return str(int(value))
-    if isinstance(value, float):
-        return repr(value)
-    return value.hex() if isinstance(value, bytes) else str(value)
+def _in_csv(value: Value) -> Value:
+    """Return a value as it stands in a CSV file, where a flag is 0 or 1; numbers keep all digits."""
+    if isinstance(value, bytes):
+        return value.hex()
+    return int(value) if isinstance(value, bool) else value
 
 
 # --- expectations and fields of the definition ---

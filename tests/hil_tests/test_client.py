@@ -263,13 +263,14 @@ def test_raw_bytes_and_frames_can_be_sent(pair):
     device.telemetry["boot_status"] = {"boot_count": 0x1F}
     if client.core.link.name == "can":
         answer = ("058104" + "01#001F00000000",)
-        assert send_and_listen(client, [CanFrame(0x04810104)], 0.0, answer, PATIENCE_S) == answer
+        sent = [CanFrame(0x04810104)]
     else:
         start, identifier = {Dialect.A: ("7F", "81"), Dialect.B: ("7F", ""), Dialect.C: ("07", "81")}[
             device.dialect
         ]
         answer = (f"1F{start}{identifier}001F1F000000001FFF",)
-        assert send_and_listen(client, [b"\x1f\x7f", b"\x81\x1f\xff"], 0.0, answer, PATIENCE_S) == answer
+        sent = [b"\x1f\x7f", b"\x81\x1f\xff"]
+    assert client.run(send_and_listen(client.core, sent, 0.0, answer, PATIENCE_S)) == answer
 
 
 def test_ports_that_are_not_available_are_rejected_in_one_line():

@@ -60,7 +60,7 @@ def test_settings_are_those_of_the_emulator_that_conformance_starts(monkeypatch)
         "parameters.update_rate=3",
     )
     assert str(run_command(*words, "--start").exception) == "enough"
-    assert given["settings"] == ("truth.kind=rate", "parameters.update_rate=3")
+    assert given["settings"] == ["truth.kind=rate", "parameters.update_rate=3"]
     assert "--set needs --start" in str(run_command(*words[:2], "/dev/ttyX", *words[3:]).exception)
 
 

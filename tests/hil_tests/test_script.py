@@ -180,7 +180,11 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ("[emulator]\nseed = 'x'\n[[step]]\nwait_s = 1", ["emulator.seed: must be a whole number"]),
         (
             "[truth]\nquaternion_xyzw = [1, 'x']\n[[step]]\nwait_s = 1",
-            ["truth.quaternion_xyzw: must be a list of 4"],
+            ["truth.quaternion_xyzw.1: must be a number"],
+        ),
+        (
+            "[truth]\nquaternion_xyzw = [1, 0]\n[[step]]\nwait_s = 1",
+            ["truth.quaternion_xyzw: must have at least 4 items, not 2"],
         ),
         ("[[step]]\ncommand = 'xyzzy'", ["no telecommand named 'xyzzy'; `starhil icd list` lists all"]),
         ("[[step]]\nread = 'xyzzy'", ["no telemetry row named 'xyzzy'; `starhil icd list` lists all"]),

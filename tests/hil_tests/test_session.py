@@ -10,6 +10,7 @@ from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
@@ -21,7 +22,7 @@ from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import SessionRunner
-from starhil.hil_tests.session_run import SessionRequest, _emulator, _printer, run_session
+from starhil.hil_tests.session_run import SessionRequest, _emulator, _print_result, run_session
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from tests.candump import read_candump
@@ -95,7 +96,7 @@ def test_a_time_in_seconds_keeps_its_fraction_in_the_junit_file(play, device):
 def test_a_message_uses_one_time_unit(play, device, capsys):
     result = play("[[step]]\nread = 'rates'\nmax_latency_s = 0.0\nwithin_s = 0.1\nevery_s = 0.01\n")
     assert result.results[0].detail.startswith("not within 0.1 s: latency 0.")
-    _printer(quiet=False)(result.results[0])
+    _print_result(Console(highlight=False), result.results[0])
     line = capsys.readouterr().out
     assert " s" in line
     assert " ms" not in line
@@ -554,6 +555,13 @@ def test_the_command_prints_a_line_for_each_error_of_a_script(tmp_path):
     assert isinstance(outcome.exception, BenchError)
     lines = outcome.exception.args
     assert [line.split(": ")[:2] for line in lines] == [["s.toml", f"step {n}"] for n in (1, 2, 3)]
+
+
+def test_listening_where_no_row_comes_without_a_request_is_rejected_before_the_first_step(tmp_path):
+    script = tmp_path / "s.toml"
+    script.write_text("[[step]]\nwait_s = 0\n[[step]]\nlisten = 'scet'\n")
+    outcome = run_command(script, "--unit", "oresat", "--can", "virtual:none", "--log", tmp_path / "log")
+    assert str(outcome.exception).startswith("s.toml: step 2: listen: unit oresat has only CANopen on CAN")
 
 
 @pytest.mark.parametrize(

@@ -75,7 +75,7 @@ def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp
             obc.set_parameter("exposure", 2000 + turn)
             save = frame_request(obc.icd.telecommands["save_parameters"].id)
             # the cut comes before, while or after the last one is stored
-            (answered,) = send_and_listen(obc, [save], rng.random() * 0.01)
+            (answered,) = obc.run(send_and_listen(obc.core, [save], rng.random() * 0.01))
             allowed = {2000 + turn} if answered else {kept, 2000 + turn}
         emulator.restart(signal.SIGKILL)
     emulator.stop()
