@@ -25,7 +25,7 @@ from starhil.protocol.link_schema import (
     LengthFraming,
     SlipFraming,
 )
-from starhil.protocol.messages import FaultKind, LinkFault, check_receiver_limits
+from starhil.protocol.messages import FaultKind, LinkFault
 from starhil.protocol.plugin import guarded
 from starhil.protocol.values import IcdError
 
@@ -77,7 +77,6 @@ class _Collector(Deframer[_Message]):
     """Base of the deframers that collect bytes until a message is complete."""
 
     def __init__(self, receiving: Receiving[_Message]) -> None:
-        check_receiver_limits(receiving.max_size, receiving.timeout_s)
         self._interpret = receiving.interpret
         self._measure = receiving.measure
         self._max_size = receiving.max_size

@@ -35,7 +35,6 @@ from starhil.protocol.link_schema import (
 from starhil.protocol.message_format import Formats, MessageFormat
 from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
-    FIRST_TELEMETRY_ID,
     ErrorCode,
     FaultKind,
     LinkFault,
@@ -359,7 +358,7 @@ class SerialStack:
     def kind_of(self, row_id: int, klass: str = "") -> RequestKind | None:
         """Return the kind of a row, which need not exist; None if it is unknown."""
         if self.dialects:
-            return RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
+            return RequestKind.of(row_id)
         item = self.classes.by_name.get(klass)
         row = self.row(klass, row_id)
         return item.kind if item is not None else row.kind if row is not None else None
