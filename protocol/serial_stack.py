@@ -405,7 +405,7 @@ class HostReceiver:
         """Whether a message is incomplete, so that `flush` may become due."""
         return self._deframer.busy
 
-    def feed(self, data: bytes, now: float) -> list[Reply | LinkFault]:
+    def feed(self, data: bytes, now: float) -> Sequence[Reply | LinkFault]:
         """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
         return self._deframer.feed(data, now)
 
