@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -26,7 +27,6 @@ from starhil.hil_tests.attitude import (
     from_vector_part,
     to_radec_roll,
     unit,
-    wrapped_difference,
 )
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.conventions import Conventions
@@ -153,7 +153,7 @@ class Conditions(Keys):
         if isinstance(value, int) and self.within is None:
             tolerance = 0.0
         angle = self.angle_deg is not None
-        distance = wrapped_difference(float(value), wanted) if angle else abs(float(value) - wanted)
+        distance = abs(math.remainder(float(value) - wanted, 360.0)) if angle else abs(float(value) - wanted)
         if distance <= tolerance:
             return None
         text = show(wanted if self.plus else expected)

@@ -380,4 +380,4 @@ def _inside(parameter: Parameter, present: float) -> list[float]:
     if parameter.enum is not None:
         return [float(number) for number in parameter.enum.values()]
     greatest = [] if parameter.name in UNSET else [parameter.maximum]
-    return [parameter.minimum, *greatest, parameter.default]
+    return [parameter.minimum, *greatest, parameter.default_number]
