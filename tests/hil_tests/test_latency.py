@@ -13,7 +13,7 @@ from starhil.hil_tests.console_viewer import ROWS, view
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.latency import Echo, Viewers, ask_in_turn, exchange, measure
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
-from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from tests.hil_tests.fake_device import FakeDevice
@@ -119,8 +119,8 @@ def test_a_refusal_has_a_latency_but_no_reply(device):
 
 def test_requests_on_a_lost_bus_have_no_reply():
     async def main():
-        with HubThread() as hub:
-            client = AsyncObcClient(CanHostLink(hub.channel), ICD, timeout_s=0.02)
+        with hub_thread() as channel:
+            client = AsyncObcClient(CanHostLink(channel), ICD, timeout_s=0.02)
             await client.start()
         for _ in range(2):
             assert await exchange(client, ICD.request(ROW), ROW.name) == (math.inf, None)
