@@ -72,8 +72,12 @@ def _load(path: Path) -> InterfaceDefinition:
 
 
 def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDefinition, list[str]]:
-    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each."""
-    files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
+    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each.
+
+    Files `*_cases.toml` in a folder are conformance cases, and no part of the definition.
+    """
+    found = sorted(path.glob("*.toml")) if path.is_dir() else [path]
+    files = [file for file in found if file is path or not file.stem.endswith("_cases")]
     reader = _Reader(path, files, run_plugin=run_plugin)
     definition = reader.definition()
     errors = reader.errors if files else [f"{path}: no .toml file in this folder"]
