@@ -2,7 +2,7 @@
 
 The keys of a class are the keys of its step, and a validated step is what the session runs. Rows, fields, parameters
 and names in enumerations are those of the interface definition, which validation takes from its context: `icd`;
-`captured`, the variables of earlier steps; `has_truth`; `number` of the step; and `broken`, its keys that are wrong.
+`captured`, the variables of earlier steps; `has_truth`; and `broken`, the keys of the step that are wrong.
 """
 
 from __future__ import annotations
@@ -229,16 +229,10 @@ class Step(Keys):
     timeout_s: Positive | None = None
     retries: Annotated[int, Field(ge=0)] = 0
     max_latency_s: NonNegative | None = None
-    _number: int = 0
 
     @abstractmethod
     def run(self, session: Session, link: str) -> Attempt:
         """Try the action once on a link; `link` is empty for a step that needs none."""
-
-    @property
-    def number(self) -> int:
-        """Place in the script, from 1 on."""
-        return self._number
 
     @property
     def pause_s(self) -> float:
@@ -260,7 +254,6 @@ class Step(Keys):
         problems = [*self._problems(info)]
         if problems:
             raise ValueError(*problems)
-        self._number = (info.context or {})["number"]
         self.name = self.name or self.default_name.format(self=self)
         return self
 
@@ -441,27 +434,23 @@ class Sample(ReadingStep):
             return table
         return {**table, **{"sample" if key == "telemetry" else key: value for key, value in inner.items()}}
 
-    @model_validator(mode="after")
-    def _named_for_its_row(self) -> Self:
-        self.file = self.file or f"{self.row.name}.csv"
-        return self
-
     def run(self, session: Session, link: str) -> Attempt:
         """Read the row for some time; write the values, and judge each reading."""
         client = session.bench.client(link)
+        name = self.file or f"{self.row.name}.csv"
         fields = list(self.row.named_fields)
         latencies: list[float] = []
         crosses: list[float] = []
         problems: list[str] = []
         last = Attempt()
         begin = time.monotonic()
-        with (session.folder / self.file).open("w", newline="", encoding="utf-8", buffering=1) as stream:
+        with (session.folder / name).open("w", newline="", encoding="utf-8", buffering=1) as stream:
             writer = csv.writer(stream)
             writer.writerow(["obc_time_s", "latency_ms", *fields])
             while time.monotonic() - begin < self.for_s or not latencies:
                 reading = client.read(self.row.name, **self.patience)
                 head = f"{reading.received_unix_s:.6f}", f"{reading.latency_s * MS_PER_S:.3f}"
-                writer.writerow([*head, *(_in_csv(reading[name]) for name in fields)])
+                writer.writerow([*head, *(_in_csv(reading[field]) for field in fields)])
                 latencies.append(reading.latency_s)
                 last = self.judged(session, reading)
                 if last.problem is not None:
@@ -476,8 +465,8 @@ class Sample(ReadingStep):
         if crosses:
             measured["cross_boresight_median_arcsec"] = percentile(crosses, 0.5)
             measured["cross_boresight_max_arcsec"] = max(crosses)
-        shown = " ".join(f"{name}={value:.4g}" for name, value in measured.items())
-        detail = f"{count} samples in {self.file}, {count - len(problems)} good, {shown}"
+        shown = " ".join(f"{key}={value:.4g}" for key, value in measured.items())
+        detail = f"{count} samples in {name}, {count - len(problems)} good, {shown}"
         good_share = (count - len(problems)) / count
         problem = None
         if good_share < self.at_least:
