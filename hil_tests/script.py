@@ -39,7 +39,7 @@ class EmulatorRequest(Keys):
     """How `--start` starts the emulator for this script."""
 
     profile: str | None = None
-    settings: Texts = Field((), alias="set")
+    settings: Texts = Field([], alias="set")
     seed: Annotated[int, Field(ge=0)] | None = None
 
 
