@@ -180,14 +180,8 @@ def _shown_on_console(
 
     def show_on_both(result: StepResult) -> None:
         show(result)
-        feed.result(
-            result.name,
-            result.status,
-            result.detail,
-            identity=str(result.number),
-            link=result.link,
-            seconds=result.seconds,
-        )
+        shown = {key: getattr(result, key) for key in ("name", "status", "detail", "link", "seconds")}
+        feed.result(id=str(result.number), **shown)
 
     return show_on_both
 
@@ -197,12 +191,9 @@ def _options(request: SessionRequest, script: Script) -> LinkOptions:
     if options.serial is None and options.can is None:
         if not request.start:
             raise BenchError("no link: use --serial DEV, --can CHANNEL, both, or --start")
-        wanted = {None: ("serial",), "both": ("serial", "can")}.get(
-            script.defaults.link, (script.defaults.link,)
-        )
-        options = replace(
-            options, serial="auto" if "serial" in wanted else None, can="auto" if "can" in wanted else None
-        )
+        wanted = script.defaults.link or "serial"
+        serial, can = ("auto" if wanted in (link, "both") else None for link in ("serial", "can"))
+        options = replace(options, serial=serial, can=can)
     if not request.start and options.serial == "auto":
         raise BenchError("--serial auto needs --start; otherwise name the port")
     return replace(options, timeout_s=script.defaults.timeout_s, retries=script.defaults.retries)
@@ -213,6 +204,7 @@ def _emulator(
 ) -> EmulatorProcess:
     """Prepare an emulator for the session, with an empty parameter store."""
     wanted = script.emulator
+    beside = find_script(request.script).parent / (wanted.profile or "")
     truth_log = None
     if script.truth.file is not None and request.truth is None:
         truth_log = folder / script.truth.file
@@ -220,7 +212,7 @@ def _emulator(
     extra += ["--control", "auto"] if any(isinstance(step, Control) for step in script.steps) else []
     return EmulatorProcess(
         emulator_command(
-            profile=request.profile or _beside(wanted.profile, request.script),
+            profile=request.profile or (str(beside) if beside.is_file() else wanted.profile),
             unit=request.unit,
             serial=options.serial or "off",
             can=options.can or "off",
@@ -232,14 +224,6 @@ def _emulator(
             extra=extra,
         )
     )
-
-
-def _beside(profile: str | None, script: Path) -> str | None:
-    """Return the profile of a script: the file that its relative path names beside the script, or else its name."""
-    if profile is None:
-        return None
-    path = find_script(script).parent / profile
-    return str(path) if path.is_file() else profile
 
 
 def _print_result(console: Console, result: StepResult) -> None:

@@ -220,12 +220,12 @@ def _shown_on_console(
         if outcome.status == FAILED:
             detail = f"expected {outcome.expected}; seen {outcome.seen}"
         feed.result(
-            outcome.title,
-            outcome.status,
-            detail,
-            identity=outcome.id,
+            id=outcome.id,
+            name=outcome.title,
+            status=outcome.status,
+            detail=detail,
             seconds=outcome.seconds,
-            traffic=outcome.log if outcome.status == FAILED else (),
+            log=outcome.log if outcome.status == FAILED else (),
         )
 
     return record_on_both
