@@ -131,7 +131,7 @@ class EmergencyProducer:
         """When the next waiting message may be sent."""
         return self._free_at if self._queue and self._context.communicates else None
 
-    def flush(self) -> None:
+    def tick(self) -> None:
         """Send waiting messages, as state and inhibit time allow."""
         while self._queue and self._context.communicates and self._context.now >= self._free_at:
             message = self._queue.popleft()
@@ -148,7 +148,7 @@ class EmergencyProducer:
     def _enqueue(self, code: int, data: bytes) -> None:
         fields = {"code": code, "register": self._register_bits(), "data": data[:5]}
         self._queue.append(MESSAGE.build(fields))
-        self.flush()
+        self.tick()
 
     def _read_history(self, position: int) -> bytes:
         if position >= len(self._history):

@@ -77,10 +77,8 @@ class ErrorControl:
 
     def receive_heartbeat(self, node_id: int, data: bytes) -> None:
         """Process an error control message of another node (heartbeat or boot-up)."""
-        if len(data) != 1:
-            return
         monitor = self._monitors.get(node_id)
-        if monitor is None:
+        if monitor is None or len(data) != 1 or node_id == self._context.node_id:
             return
         if data[0] == 0:
             self._context.report(EventKind.NODE_BOOTED, node_id)

@@ -19,7 +19,7 @@ from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.emergency import EmergencyProducer
 from starhil.protocol.canopen.error_control import ErrorControl
 from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
-from starhil.protocol.canopen.pdo import PdoService, ReceivePdo
+from starhil.protocol.canopen.pdo import PdoService
 from starhil.protocol.canopen.sdo import SdoServer
 from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, ParameterStorage
 from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
@@ -85,10 +85,11 @@ class CanopenSlave:
         self.lss = LssSlave(context, self.store, self._activate_node_id, bit_rates)
         self.emergency = EmergencyProducer(context)
         self.sdo = SdoServer(context, sdo_timeout_s)
-        self.sync = SyncService(context, self.emergency)
+        self.pdos = PdoService(context, self.emergency)
+        self.sync = SyncService(context, self.emergency, self.pdos.synchronise)
         self.time = TimeConsumer(context)
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
-        self.pdos = PdoService(context, self.emergency)
+        self._timed = (self.sdo, self.error_control, self.sync, self.pdos, self.emergency)
         self._on_reset = on_reset
         self._clock_offset_us = 0
         self._routes: dict[int, list[Handler]] = {}
@@ -128,21 +129,15 @@ class CanopenSlave:
         """Act on the timers that have expired."""
         self._begin_instant(now)
         if self._context.state is not NmtState.INITIALISING and not self.lss.silent:
-            self.sdo.tick()
-            self.error_control.tick()
-            counter = self.sync.tick()
-            if counter is not None:
-                self.pdos.synchronise(counter)
-            self.pdos.tick()
-            self.emergency.flush()
+            for service in self._timed:
+                service.tick()
         return self._collect_frames()
 
     def next_deadline(self) -> float | None:
         """Return the time at which `tick` must be called, on the caller's clock; None if nothing is due."""
         if self.lss.silent or self._context.state is NmtState.INITIALISING:
             return self.lss.next_deadline
-        services = (self.sdo, self.error_control, self.sync, self.pdos, self.emergency)
-        return min((time for item in services if (time := item.next_deadline) is not None), default=None)
+        return min((time for item in self._timed if (time := item.next_deadline) is not None), default=None)
 
     def notify(self, keys: frozenset[tuple[int, int]] | set[tuple[int, int]], now: float) -> list[CanFrame]:
         """Report new values of objects: event-driven TPDOs are sent, acyclic ones wait for SYNC."""
@@ -232,19 +227,18 @@ class CanopenSlave:
             return
         handlers: list[tuple[int | None, Handler]] = [
             (NMT, self._on_nmt),
-            (self.sync.can_id, self._on_sync),
+            (self.sync.can_id, self.sync.receive),
             (self.time.can_id, self.time.receive),
             (SDO_RECEIVE + self.node_id, self.sdo.receive),
-            *((ERROR_CONTROL + other, partial(self._on_heartbeat, other)) for other in range(1, 128)),
-            *((pdo.can_id, partial(self._on_pdo, pdo)) for pdo in self.pdos.receiving if pdo.exists),
+            *(
+                (ERROR_CONTROL + other, partial(self.error_control.receive_heartbeat, other))
+                for other in range(1, 128)
+            ),
+            *((pdo.can_id, pdo.receive) for pdo in self.pdos.receiving if pdo.exists),
         ]
         for can_id, handler in handlers:
             if can_id is not None:
                 self._routes.setdefault(can_id, []).append(handler)
-
-    def _on_pdo(self, pdo: ReceivePdo, data: bytes) -> None:
-        if self.state is NmtState.OPERATIONAL:
-            pdo.receive(data)
 
     def _on_nmt(self, data: bytes) -> None:
         if len(data) != 2 or data[1] not in {0, self.node_id}:
@@ -254,15 +248,6 @@ class CanopenSlave:
             self._enter(STATE_COMMANDS[command])
         elif command in {RESET_NODE, RESET_COMMUNICATION}:
             self._reset(application=command == RESET_NODE)
-
-    def _on_sync(self, data: bytes) -> None:
-        counter = self.sync.receive(data)
-        if counter is not None:
-            self.pdos.synchronise(counter)
-
-    def _on_heartbeat(self, node_id: int, data: bytes) -> None:
-        if node_id != self.node_id and self.state is not NmtState.INITIALISING:
-            self.error_control.receive_heartbeat(node_id, data)
 
     def _on_communication_error(self) -> None:
         behaviour = self.dictionary.find(*ERROR_BEHAVIOUR).number()
@@ -284,7 +269,7 @@ class CanopenSlave:
             self.sdo.reset()
         elif old is NmtState.STOPPED:
             self.sync.restart_counter()
-            self.emergency.flush()
+            self.emergency.tick()
         if state is NmtState.OPERATIONAL:
             self.pdos.start()
             self.pdos.tick()
