@@ -56,7 +56,10 @@ class Command(IntEnum):
 
 
 class LssSlave:
-    """Answers the LSS master, which may set the allowed bit rates, bit/s; what it has stored before takes effect.
+    """Answers the LSS master, which may set the allowed bit rates, bit/s.
+
+    Node ID and bit rate are pending until the next reset of communication or the command to activate the bit rate; until
+    they are stored, a reset of the node discards them.
 
     `on_node_id` is called with the ID of a node that had none.
     """
@@ -72,19 +75,18 @@ class LssSlave:
         self._store = store
         self._on_node_id = on_node_id
         self._allowed = allowed_bit_rates
-        self.bit_rate = DEFAULT_BIT_RATE
-        """Current bit rate, bit/s."""
-        stored = store.load_lss()
-        if stored is not None:
-            context.node_id, self.bit_rate = stored
-        self.pending_node_id = context.node_id
-        self.pending_bit_rate = self.bit_rate
         self._silence: tuple[float, float] | None = None
         """When the bit rate is switched, and when the node may send again."""
         self.configuring = False
         self._matched = dict.fromkeys((SWITCH_SELECTIVE, IDENTIFY), 0)
         """Number of frames in order that matched."""
         self._scan_position = 0
+        self.restart(context.node_id)
+
+    def restart(self, node_id: int) -> None:
+        """Start with what is stored, or with this node ID and the default bit rate; discard what is only configured."""
+        self.pending_node_id, self.bit_rate = self._store.load_lss() or (node_id, DEFAULT_BIT_RATE)
+        self.pending_bit_rate = self.bit_rate
 
     def receive(self, data: bytes) -> None:
         """Process a frame of the LSS master; ignore any length other than 8."""

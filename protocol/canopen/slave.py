@@ -82,7 +82,9 @@ class CanopenSlave:
         self.store = ParameterStore(
             context, ParameterStorage() if storage is None else storage, on_save, on_restore
         )
+        self._default_node_id = node_id
         self.lss = LssSlave(context, self.store, self._activate_node_id, bit_rates)
+        context.node_id = self.lss.pending_node_id
         self.emergency = EmergencyProducer(context)
         self.sdo = SdoServer(context, sdo_timeout_s)
         self.pdos = PdoService(context, self.emergency)
@@ -174,7 +176,7 @@ class CanopenSlave:
         A `node_id` applies from now on, unless LSS has stored one.
         """
         self._begin_instant(now)
-        self._prepare_node_id(node_id)
+        self._default_node_id = node_id or self._default_node_id
         self._initialise(application=True)
         return self._collect_frames()
 
@@ -278,17 +280,15 @@ class CanopenSlave:
         kind = EventKind.RESET_NODE if application else EventKind.RESET_COMMUNICATION
         self._context.report(kind)
         if application and self._on_reset is not None:
-            self._prepare_node_id(self._on_reset())
+            self._default_node_id = self._on_reset() or self._default_node_id
         self._initialise(application=application)
-
-    def _prepare_node_id(self, node_id: int | None) -> None:
-        if node_id is not None and self.store.load_lss() is None:
-            self.lss.pending_node_id = node_id
 
     def _initialise(self, *, application: bool) -> None:
         """Load the stored parameters, send the boot-up message, enter PRE-OPERATIONAL."""
         context = self._context
         context.state = NmtState.INITIALISING
+        if application:
+            self.lss.restart(self._default_node_id)
         context.node_id = self.lss.pending_node_id
         self.lss.configuring = False
         self.sdo.reset()

@@ -167,7 +167,7 @@ MUTANTS = (
     Mutant("LSS selected by part of the identity", "lss", "lss", "matches=number == self._identity(step)", "matches=True"),
     Mutant("LSS obeys while it waits", "lss", "lss", "        elif self.configuring:\n            self._configuration", "        elif True:\n            self._configuration"),
     Mutant("LSS takes any node-ID", "lss", "lss", "valid = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED", "valid = True"),
-    Mutant("LSS node-ID never used", "lss", "slave", "        context.node_id = self.lss.pending_node_id\n", ""),
+    Mutant("LSS node-ID never used", "lss", "slave", "            self.lss.restart(self._default_node_id)\n        context.node_id = self.lss.pending_node_id\n", "            pass\n"),
     Mutant("LSS reports the pending node-ID", "lss", "lss", "self._send(command, bytes([self._context.node_id]))", "self._send(command, bytes([self.pending_node_id ^ 1]))"),
     Mutant("LSS takes reserved bit rates", "lss", "lss", "BIT_RATES.get(data[2], 0)", "BIT_RATES.get(data[2], 125_000)"),
     Mutant("LSS identify ignores ranges", "lss", "lss", "number <= own if step % 2 == 0 else number >= own", "True"),

@@ -193,6 +193,22 @@ def test_store_survives_the_power_cycle(new_bench):
     assert again.slave.lss.bit_rate == 250_000
 
 
+@pytest.mark.parametrize(("stored", "node_id", "bit_rate"), [(False, 0x2C, 1_000_000), (True, 0x30, 250_000)])
+def test_a_reset_of_the_node_discards_what_is_not_stored(bench, stored, node_id, bit_rate):
+    lss(bench, "04 01")
+    if stored:
+        lss(bench, "11 30")
+        lss(bench, "13 00 03")
+        lss(bench, "17")
+    lss(bench, "11 21")
+    lss(bench, "13 00 02")
+    assert bench.nmt(129) == [(0x700 + node_id, b"\0")]
+    bench.node = node_id
+    lss(bench, "04 01")
+    assert lss(bench, "17") == ["1700000000000000"]
+    assert bench.slave.store.load_lss() == (node_id, bit_rate)
+
+
 def test_store_that_fails(new_bench):
     storage = ParameterStorage()
     storage.save = Mock(side_effect=StorageError("disk full"))
