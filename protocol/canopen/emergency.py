@@ -94,20 +94,19 @@ class EmergencyProducer:
         if application:
             self._history.clear()
 
-    def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> bool:
-        """Report an error unless it is already active; return whether it is new.
+    def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> None:
+        """Report an error unless it is already active.
 
         `bits` are set in the error register, besides the generic one; `data` are up to 5 manufacturer-specific bytes;
         `key` distinguishes errors with the same code: a PDO number, a node ID.
         """
         if (code, key) in self._active:
-            return False
+            return
         self._active[code, key] = bits | ErrorRegister.GENERIC
         self._history.insert(0, code | int.from_bytes(data[:2].ljust(2, b"\0"), "little") << 16)
         del self._history[self._capacity :]
         self._context.report(EventKind.EMERGENCY, code, f"error 0x{code:04X} data {data.hex() or '-'}")
         self._enqueue(code, data)
-        return True
 
     def communication_error(
         self, code: EmergencyCode, data: bytes = b"", *, key: bytes = b"", active: bool = True
@@ -118,13 +117,12 @@ class EmergencyProducer:
         else:
             self.clear_error(code, key=key)
 
-    def clear_error(self, code: int, *, key: bytes = b"") -> bool:
+    def clear_error(self, code: int, *, key: bytes = b"") -> None:
         """Report a cleared error: code 0, and its code in the manufacturer-specific bytes."""
         if self._active.pop((code, key), None) is None:
-            return False
+            return
         self._context.report(EventKind.EMERGENCY, 0, f"error 0x{code:04X} gone")
         self._enqueue(EmergencyCode.RESET, code.to_bytes(2, "little"))
-        return True
 
     @property
     def next_deadline(self) -> float | None:

@@ -107,7 +107,7 @@ MUTANTS = (
     Mutant("watched node's silence not noticed", "error-control", "error_control", "monitor.deadline = self._context.now + monitor.period_s", "monitor.deadline = None"),
     Mutant("watched node's return not noticed", "error-control", "error_control", "        if monitor.lost:\n", "        if False:\n"),
     Mutant("error behaviour ignored", "error-control", "slave", "if behaviour == 0 and", "if behaviour != 2 and"),
-    Mutant("one node watched twice", "error-control", "error_control", "if value & 0xFFFF and any(", "if False and any("),
+    Mutant("one node watched twice", "error-control", "error_control", "if period_ms and any(", "if False and any("),
     # SYNC, TIME, EMCY
     Mutant("SYNC of wrong length taken", "sync", "sync", "wrong = len(data) != (1 if self._overflow.number() else 0)", "wrong = False"),
     Mutant("counter overflow of 1 taken", "sync", "sync", "if data[0] == 1 or data[0] > LARGEST_OVERFLOW:", "if data[0] > LARGEST_OVERFLOW:"),
@@ -118,7 +118,7 @@ MUTANTS = (
     Mutant("extended identifiers taken", "sync", "cob", "if cob_id & EXTENDED or can_id > 0x7FF:", "if False:"),
     Mutant("TIME moved while it is consumed", "time", "timestamp", "enabled=lambda value: bool(value & CONSUMES)", "enabled=lambda value: False"),
     Mutant("EMCY without the generic bit", "emcy", "emergency", "= bits | ErrorRegister.GENERIC", "= bits & ~ErrorRegister.GENERIC"),
-    Mutant("EMCY repeated", "emcy", "emergency", "        if (code, key) in self._active:\n            return False\n", ""),
+    Mutant("EMCY repeated", "emcy", "emergency", "        if (code, key) in self._active:\n            return\n", ""),
     Mutant("EMCY of 7 bytes", "emcy", "emergency", "construct.Padded(5, construct.GreedyBytes)", "construct.Padded(4, construct.GreedyBytes)"),
     Mutant("error register stays", "emcy", "emergency", "if self._active.pop((code, key), None) is None:", "if (code, key) not in self._active:"),
     Mutant("history oldest first", "emcy", "emergency", "self._history.insert(0, code |", "self._history.append(code |"),
