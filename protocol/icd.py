@@ -72,8 +72,12 @@ def _load(path: Path) -> InterfaceDefinition:
 
 
 def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDefinition, list[str]]:
-    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each."""
-    files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
+    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each.
+
+    Files `*_cases.toml` in a folder are conformance cases, and no part of the definition.
+    """
+    found = sorted(path.glob("*.toml")) if path.is_dir() else [path]
+    files = [file for file in found if file is path or not file.stem.endswith("_cases")]
     reader = _Reader(path, files, run_plugin=run_plugin)
     definition = reader.definition()
     errors = reader.errors if files else [f"{path}: no .toml file in this folder"]
@@ -89,10 +93,6 @@ def _place(problem: Problem) -> tuple[int | str, ...]:
     if len(location) > 3 and location[2] == "fields":
         return location[:4]
     return location[: 2 if isinstance(location[1 % len(location)], int) else 1]
-
-
-def _order(place: tuple[int | str, ...]) -> tuple[tuple[int, str], ...]:
-    return tuple((step, "") if isinstance(step, int) else (-1, step) for step in place)
 
 
 def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
@@ -165,7 +165,8 @@ class _Reader:
                 if not said:  # later ones may be caused by what was removed
                     self.errors += [f"{file}: {problem}" for problem in found]
                 said = True
-                for place in sorted({_place(problem) for problem in found}, key=_order, reverse=True):
+                places = sorted(map(_place, found), key=lambda place: [f"{step:>9}" for step in place])
+                for place in reversed(dict.fromkeys(places)):  # from the last: the other indices stay
                     self._remove(file, document, place)
         for name, given in tables:
             listed = given if isinstance(given, list) else [] if given is None else [given]

@@ -100,6 +100,7 @@ class LinkProbe(ABC):
     """Talks to a unit over a link.
 
     `settings` are what a run restores; by default, those that can be read. The run sets `truth` if the true attitude is known.
+    `unsolicited` has the unsolicited telemetry since `drain` or `receive_unsolicited`: messages on serial, frames on CAN.
     """
 
     link: str
@@ -120,6 +121,7 @@ class LinkProbe(ABC):
         self.settings = settings or ReadableSettings()
         self.truth: TruthSource | None = None
         self.log: list[str] = []
+        self.unsolicited: list[Any] = []
         self._prepared = False
 
     @cached_property
@@ -134,40 +136,39 @@ class LinkProbe(ABC):
         """Send a request without waiting; `answered` unless no answer is expected."""
 
     @abstractmethod
-    def send_text(self, text: str) -> None:
-        """Send hexadecimal bytes, or a CAN frame in which HH and DD are the addresses of host and device."""
+    def exchange(self, sent: str, answers: Sequence[str]) -> None:
+        """Send raw traffic, and take the answers to it, which must be these; both in the format of `case_file`."""
 
     @abstractmethod
-    def expecting(self, *answers: str) -> None:
-        """Record the rows that raw traffic is going to request, in order."""
+    def _answer_within(self, seconds: float) -> Answer | None:
+        """Return the next unread answer that arrives within a time; unsolicited telemetry is put aside."""
 
-    @abstractmethod
-    def expect_exactly(self, answer: str) -> None:
-        """Take the next answer to raw traffic, given by row ID on serial and as a frame pattern on CAN."""
-
-    @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next unread answer; unsolicited telemetry is put aside."""
+        """Return the next unread answer; none, which names one that comes after the time-out."""
+        began = self.now()
+        answer = self._answer_within(self.times.answer_s if timeout_s is None else timeout_s)
+        if answer is not None:
+            return answer
+        late = self._answer_within(LATE_S)
+        seconds = self.now() - began
+        return Answer("none", fault=f"late: {late} after {seconds:.1f} s; see --time-out" if late else "")
 
-    @abstractmethod
     def unexpected_answer(self, quiet_s: float) -> Answer:
         """Return an unexpected answer within a time."""
+        self.sleep(quiet_s)
+        return self._answer_within(0.0) or Answer("none")
 
     def receive_unsolicited(self, seconds: float, after: Callable[[], None] | None = None) -> list[Answer]:
         """Return the messages of unsolicited telemetry that arrive within a time, counted from the end of an action."""
-        self._clear_unsolicited()
+        self.unsolicited.clear()
         if after is not None:
             after()
         self.sleep(seconds)
         return self._unsolicited_answers()
 
     @abstractmethod
-    def _clear_unsolicited(self) -> None:
-        """Discard the messages of unsolicited telemetry."""
-
-    @abstractmethod
     def _unsolicited_answers(self) -> list[Answer]:
-        """Return the messages of unsolicited telemetry since they were discarded."""
+        """Return the messages in `unsolicited`."""
 
     def check_numbers(self, answers: Sequence[Answer]) -> None:
         """Fail the case unless the numbers that the unit has given successive messages are successive."""
@@ -227,9 +228,12 @@ class LinkProbe(ABC):
     def ask(self, row: Row | int, data: bytes = b"", klass: str = "") -> Answer:
         """Send a request and return the answer; of an answer in several parts, the last."""
         self.post(row, data, klass)
-        answer = self.next_answer()
-        while not answer.final:
-            answer = self.next_answer()
+        return self.last_answer()
+
+    def last_answer(self) -> Answer:
+        """Return the next answer; of one in several parts, the last."""
+        while not (answer := self.next_answer()).final:
+            pass
         return answer
 
     def data_of(self, row: Row) -> bytes:
@@ -282,12 +286,14 @@ class LinkProbe(ABC):
             self.expect_silence(f"no answer can express the refusal of {what} on this link")
             self.check_reported(request.id, error)
             return
-        answer = self.ask(row, data, klass)
-        wanted = f"refusal of {what}"
-        if self.has_codes:
-            wanted += f" with code {self.unit.code(error)}"
-        refused = answer.kind == "nack" and (not self.has_codes or answer.code == self.unit.code(error))
-        check(refused, wanted, answer)
+        self.post(row, data, klass)
+        self.expect_nack(f"refusal of {what}", error)
+
+    def expect_nack(self, what: str, error: str) -> None:
+        """Take the next answer, which must be a refusal with the code of an error, if refusals have one on this link."""
+        answer, code = self.last_answer(), self.unit.code(error) if self.has_codes else None
+        refused = answer.kind == "nack" and code in (None, answer.code)
+        check(refused, what if code is None else f"{what} with code {code}", answer)
 
     def expect_refused(self, name: str, error: str, **values: Value) -> None:
         """Send a telecommand by name, which must be refused with a code."""
@@ -403,11 +409,6 @@ class LinkProbe(ABC):
             self.recover()
             self.drain()
             self.settings.restore(self)
-
-
-def late(answer: Answer, seconds: float) -> Answer:
-    """Return no answer, which names the one that came after the time-out, seconds after it was awaited."""
-    return Answer("none", fault=f"late: {answer} after {seconds:.1f} s; see --time-out")
 
 
 def checked_values(row: Row, data: bytes) -> dict[str, Value]:

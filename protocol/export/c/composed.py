@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from starhil.protocol.checks import reversed_bits
 from starhil.protocol.conventions import Order
-from starhil.protocol.envelope import Header, HeaderField
+from starhil.protocol.envelope import Header
 from starhil.protocol.export.packets import check_one_format, row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
 from starhil.protocol.link_schema import (
@@ -15,6 +15,7 @@ from starhil.protocol.link_schema import (
     DelimitedFraming,
     EscapedFraming,
     FletcherCheck,
+    HeaderFieldModel,
     SlipFraming,
     SumCheck,
     XorCheck,
@@ -34,15 +35,15 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
     """
     check_one_format(stack, "C")
     framing = "counted" if stack.link.framing.kind in ("length", "fixed") else stack.link.framing.kind
-    header = max(stack.request_header.size(name) for name in ("", *stack.classes.by_name))
-    marks = len(stack.framing.start) + len(stack.framing.end) + _MARKS
+    header = max(stack.requests.header.size(name) for name in ("", *stack.classes.by_name))
+    marks = len(stack.requests.framing.start) + len(stack.requests.framing.end) + _MARKS
     sizes = {
         "MAX_MESSAGE": stack.max_size,
         "BUFFER": (2 if framing == "delimited" else 1) * stack.max_size + marks,
-        "OVERHEAD": header + stack.check.size,
+        "OVERHEAD": header + stack.requests.check.size,
         "MARKS": marks,
         "HEADER": max(header, 1),
-        "CHECK": max(stack.check.size, 1),
+        "CHECK": max(stack.requests.check.size, 1),
     }
     helpers = fill("c/composed_helpers.c.j2", **_rows(stack), **_headers(stack), **_check(stack)).strip("\n")
     source = "\n".join(
@@ -67,11 +68,11 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
 def _constants(stack: SerialStack) -> dict[str, str]:
     """Return the declarations of the constants that the code uses, by name."""
     found = {
-        "START_SIZE": f"static const size_t START_SIZE = {len(stack.framing.start)}u;",
-        "END_SIZE": f"static const size_t END_SIZE = {len(stack.framing.end)}u;",
-        "CHECK_SIZE": f"static const size_t CHECK_SIZE = {stack.check.size}u;",
-        "start_bytes": f"static const uint8_t start_bytes[] = {{{_bytes(stack.framing.start)}}};",
-        "end_bytes": f"static const uint8_t end_bytes[] = {{{_bytes(stack.framing.end)}}};",
+        "START_SIZE": f"static const size_t START_SIZE = {len(stack.requests.framing.start)}u;",
+        "END_SIZE": f"static const size_t END_SIZE = {len(stack.requests.framing.end)}u;",
+        "CHECK_SIZE": f"static const size_t CHECK_SIZE = {stack.requests.check.size}u;",
+        "start_bytes": f"static const uint8_t start_bytes[] = {{{_bytes(stack.requests.framing.start)}}};",
+        "end_bytes": f"static const uint8_t end_bytes[] = {{{_bytes(stack.requests.framing.end)}}};",
     }
     match stack.link.framing:
         case SlipFraming() as model:
@@ -88,7 +89,7 @@ def _constants(stack: SerialStack) -> dict[str, str]:
     if isinstance(stack.link.check, FletcherCheck):
         macros["MODULUS"] = stack.link.check.modulus
     if isinstance(stack.link.check, CrcCheck):
-        bits = 8 * stack.check.size
+        bits = 8 * stack.requests.check.size
         poly = stack.link.check.poly
         macros |= {
             "CRC_BITS": bits, "CRC_MASK": (1 << bits) - 1, "CRC_REFLECTED": int(stack.link.check.reflect),
@@ -100,8 +101,8 @@ def _constants(stack: SerialStack) -> dict[str, str]:
 def _rows(stack: SerialStack) -> dict[str, Any]:
     """Return the functions of a row's key: tests of its kind, and its sizes."""
     rows = {row_key(stack.classes.classes, row.klass, row.id): row for row in stack.rows}
-    headers = {key: stack.request_header.size(row.klass) for key, row in rows.items()}
-    requests = {key: headers[key] + row.request_size + stack.check.size for key, row in rows.items()}
+    headers = {key: stack.requests.header.size(row.klass) for key, row in rows.items()}
+    requests = {key: headers[key] + row.request_size + stack.requests.check.size for key, row in rows.items()}
     return {
         "tests": {
             "is_row": list(rows),
@@ -119,23 +120,23 @@ def _rows(stack: SerialStack) -> dict[str, Any]:
 
 def _headers(stack: SerialStack) -> dict[str, Any]:
     classes = stack.classes.by_name
-    coded = "class" in stack.request_header.roles
+    coded = "class" in stack.requests.header.roles
 
     def role(name: str | None, default: int, mask: int = -1) -> str:
         if name == "id":
             return "id & 0xFFu" if coded else "id"
         return "id >> 8" if name == "class" else _number(default & mask)
 
-    def packed(field: HeaderField) -> str:
+    def packed(field: HeaderFieldModel) -> str:
         if field.bits:
             return " | ".join(
-                f"(uint64_t)({role(bit.role, bit.default)}) << {bit.shift}" for bit in field.bits
+                f"(uint64_t)({role(bit.role, bit.initial)}) << {shift}" for bit, shift in field.placed_bits
             )
         if field.role == "length":
             return "request_length(header_size(id), size)"
-        return role(field.role, field.default, (1 << 8 * field.size) - 1)
+        return role(field.role, field.initial, (1 << 8 * field.size) - 1)
 
-    def class_test(field: HeaderField, code: str) -> str:
+    def class_test(field: HeaderFieldModel, code: str) -> str:
         return " || ".join(f"({code}) == {classes[name].code or 0}u" for name in sorted(field.classes or ()))
 
     replies = []
@@ -148,15 +149,15 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
         "number": _number,
         "packed": packed,
         "class_test": class_test,
-        "suffix": lambda field: _suffix(field.order),
-        "requests": stack.request_header,
-        "replies": stack.reply_header,
+        "suffix": lambda field: _suffix(field.order or stack.byte_order),
+        "requests": stack.requests.header,
+        "replies": stack.replies.header,
         "reply_classes": replies,
-        "address": stack.reply_header.defaults.get("address"),
+        "address": stack.replies.header.defaults.get("address"),
         "coded": coded,
         "lengths": {
-            "request_length": _length(stack.request_header),
-            "length_of": _length(stack.reply_header),
+            "request_length": _length(stack.requests.header),
+            "length_of": _length(stack.replies.header),
         },
     }
 
@@ -174,7 +175,7 @@ def _length(header: Header) -> str:
 
 
 def _check(stack: SerialStack) -> dict[str, Any]:
-    model, check = stack.link.check, stack.check
+    model, check = stack.link.check, stack.requests.check
     initial, result = "0u", "state"
     order: Order = getattr(model, "order", None) or stack.byte_order
     kind: str = model.kind

@@ -42,7 +42,7 @@ def link_text(stack: SerialStack) -> str:
 
 
 def _framing(stack: SerialStack) -> dict[str, Any]:
-    constants: dict[str, Any] = {"START": stack.framing.start, "END": stack.framing.end}
+    constants: dict[str, Any] = {"START": stack.requests.framing.start, "END": stack.requests.framing.end}
     model = stack.link.framing
     if isinstance(model, SlipFraming | EscapedFraming):
         constants["ESCAPE"] = bytes((model.escape,))
@@ -58,8 +58,8 @@ def _check(stack: SerialStack) -> dict[str, Any]:
     order = stack.byte_order if isinstance(model, NoCheck) else model.order or stack.byte_order
     settings = {_NAMES.get(name, name.upper()): value for name, value in model.model_dump().items()}
     return {
-        "CHECK_SIZE": stack.check.size,
-        "CHECK_COVERS": sorted(stack.check.covers),
+        "CHECK_SIZE": stack.requests.check.size,
+        "CHECK_COVERS": sorted(stack.requests.check.covers),
         "CHECK_ORDER": order,
         **settings,
     }
@@ -71,16 +71,16 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
     coded = [item for item in classes if item.code is not None]
     reply = {item.reply_code: item.code for item in coded}
     unsolicited = {item.unsolicited: item.code for item in coded if item.unsolicited is not None}
-    length = [field for field in stack.reply_header.fields if field.role == "length"]
+    length = [field for field in stack.replies.header.fields if field.role == "length"]
     return {
         "CLASS_SHIFT": CLASS_SHIFT,
-        "ADDRESS": stack.reply_header.defaults.get("address"),
+        "ADDRESS": stack.replies.header.defaults.get("address"),
         "REPLY_CLASSES": reply | unsolicited,
         "UNSOLICITED": sorted(unsolicited),
         "LENGTH_INCLUDES": sorted(length[0].includes) if length else [],
         "LENGTH_OFFSET": length[0].offset if length else 0,
-        "REQUEST_HEADER": list(_fields(stack.request_header, codes)),
-        "REPLY_HEADER": list(_fields(stack.reply_header, codes)),
+        "REQUEST_HEADER": list(_fields(stack.requests.header, codes)),
+        "REPLY_HEADER": list(_fields(stack.replies.header, codes)),
     }
 
 
@@ -89,13 +89,13 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
         yield {
             "role": field.role,
             "size": field.size,
-            "order": field.order,
+            "order": field.order or header.byte_order,
             "const": None if field.role == "address" else field.const,
-            "default": 0 if field.bits else field.default,
+            "default": 0 if field.bits else field.initial,
             "classes": None if field.classes is None else sorted(codes[name] for name in field.classes),
             "includes": sorted(field.includes) if field.role == "length" else [],
             "offset": field.offset,
-            "bits": [(bit.role, bit.mask.bit_length(), bit.default) for bit in field.bits],
+            "bits": [(bit.role, bit.width, bit.initial) for bit in field.bits],
         }
 
 
