@@ -193,19 +193,16 @@ class Slip(Framing):
 
     def bodies(self, text: bytes) -> Iterator[bytes | LinkFault]:
         """Yield the body of the bytes between two end bytes, if there are any, or its fault."""
-        if text:
-            yield self._unescaped(text)
-
-    def _unescaped(self, text: bytes) -> bytes | LinkFault:
-        first, *rest = text.split(self.escape)
-        body = [first]
+        body, *rest = text.split(self.escape)
         for piece in rest:
             original = self._originals.get(piece[0]) if piece else None
             if original is None:
                 found = f"byte {piece[0]:02X}" if piece else "the end of the message"
-                return LinkFault(FaultKind.UART_PROTOCOL, f"{found} after an escape byte within a message")
-            body += (original, piece[1:])
-        return b"".join(body)
+                yield LinkFault(FaultKind.UART_PROTOCOL, f"{found} after an escape byte within a message")
+                return
+            body += original + piece[1:]
+        if text:
+            yield body
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer for the messages between end bytes."""

@@ -26,11 +26,11 @@ from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd_bindings import check_row
 from starhil.protocol.icd_layout import NUMBER, Layout, enum_of
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
+from starhil.protocol.message_format import words
 from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
 from starhil.protocol.serial_stack import SerialStack
-from starhil.protocol.text_messages import words
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
 from starhil.protocol.values import FieldError, IcdError, Located, MissingNameError, Parameter, Section

@@ -121,30 +121,27 @@ class ByteStuffing(DefinitionModel):
     """Bits in which the bytes of the range differ; only they are sent after `escape`."""
 
 
-class LengthFraming(DefinitionModel):
+class _SizedFraming(DefinitionModel):
+    kind: str
+    """Selects this framing."""
+    start: list[Byte] = []
+    """Bytes before the header."""
+    end: list[Byte] = []
+    """Bytes after the checksum."""
+    stuffing: ByteStuffing | None = None
+    """Byte stuffing between `start` and `end`; sizes and checksums are those of the message before it."""
+
+
+class LengthFraming(_SizedFraming):
     """`start`, a message whose header field `length` gives its size, then `end`."""
 
     kind: Literal["length"]
-    """Selects this framing."""
-    start: list[Byte] = []
-    """Bytes before the header."""
-    end: list[Byte] = []
-    """Bytes after the checksum."""
-    stuffing: ByteStuffing | None = None
-    """Byte stuffing between `start` and `end`; sizes and checksums are those of the message before it."""
 
 
-class FixedFraming(DefinitionModel):
+class FixedFraming(_SizedFraming):
     """`start`, a message of the size that its row has, then `end`."""
 
     kind: Literal["fixed"]
-    """Selects this framing."""
-    start: list[Byte] = []
-    """Bytes before the header."""
-    end: list[Byte] = []
-    """Bytes after the checksum."""
-    stuffing: ByteStuffing | None = None
-    """Byte stuffing between `start` and `end`; sizes and checksums are those of the message before it."""
     request_size: Annotated[int, Field(ge=1, le=4096)] | None = None
     """Bytes between `start` and `end` if all requests have the same size."""
 

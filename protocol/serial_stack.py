@@ -31,7 +31,7 @@ from starhil.protocol.link_schema import (
     MessageClass,
     SerialLinkModel,
 )
-from starhil.protocol.message_format import Formats, MessageFormat
+from starhil.protocol.message_format import Formats, MessageFormat, TextReplies, words
 from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
     ErrorCode,
@@ -43,7 +43,6 @@ from starhil.protocol.messages import (
     RequestKind,
     error_code,
 )
-from starhil.protocol.text_messages import TextReplies, words
 from starhil.protocol.values import IcdError
 
 LINK_FORMAT: Final = FormatModel()
