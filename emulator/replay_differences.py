@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from starhil.emulator.errors import explained
-from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text, cansend
+from starhil.emulator.links.traffic import Decoder, WireItem, canopen_text
 from starhil.emulator.truth_log import WALL_TIMES
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.messages import Reply, ReplyKind
@@ -120,7 +120,7 @@ def _message_difference(
             old, new = recorded.data[number], changed.data[number]
             return f"{where}, {changed.name}, byte {number}: recorded {old:02x}, now {new:02x}"
     if not isinstance(now[at], int):
-        return f"{where}, {changed.name}: recorded frame {cansend(before[at])}, now {cansend(now[at])}"
+        return f"{where}, {changed.name}: recorded frame {before[at]}, now {now[at]}"
     number = at - changed.begin
     place = f"byte {number} of the message"
     wire = bytes(now[changed.begin : changed.end])

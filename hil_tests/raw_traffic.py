@@ -37,12 +37,6 @@ def parse_frame(text: str) -> CanFrame:
         raise BenchError(f"{text!r}: {error}") from None
 
 
-def format_frame(frame: CanFrame) -> str:
-    """Format a frame for `cansend`."""
-    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    return f"{can_id}#{'R' if frame.remote else frame.data.hex().upper()}"
-
-
 def pattern(text: str) -> str:
     """Normalise the pattern of an answer: capitals without blanks; `..` matches any byte.
 
@@ -96,4 +90,4 @@ def _format_received(link: SerialHostLink | CanHostLink, seen: list[bytes | CanF
         return (b"".join(item for item in seen if isinstance(item, bytes)).hex().upper(),)
     device = link.device_address
     frames = [item for item in seen if isinstance(item, CanFrame) and item.extended]
-    return tuple(format_frame(frame) for frame in frames if frame.id >> 8 & 0xFF == device)
+    return tuple(str(frame) for frame in frames if frame.id >> 8 & 0xFF == device)

@@ -69,6 +69,11 @@ class CanFrame:
         if self.remote and self.data:
             raise ProtocolError("CAN remote frame with data")
 
+    def __str__(self) -> str:
+        """Return the frame as an argument of `cansend`: `123#DEAD`, `06000104#R`."""
+        can_id = f"{self.id:08X}" if self.extended else f"{self.id:03X}"
+        return f"{can_id}#{'R' if self.remote else self.data.hex().upper()}"
+
 
 class MessageType(IntEnum):
     """Message types: bits 28 to 24 of the CAN ID."""

@@ -9,9 +9,7 @@ from starhil.protocol.can_framing import CanFrame
 
 def format_candump(frame: CanFrame, channel: str) -> str:
     """Format a frame as a line of a candump log; a frame without a timestamp gets 0."""
-    can_id = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    data = "R" if frame.remote else frame.data.hex().upper()
-    return f"({frame.timestamp or 0.0:017.6f}) {channel} {can_id}#{data}"
+    return f"({frame.timestamp or 0.0:017.6f}) {channel} {frame}"
 
 
 def bus_name(channel: str) -> str:

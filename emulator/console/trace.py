@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, Final
 
-from starhil.emulator.links.traffic import Decoder, Traffic, WireItem, cansend
+from starhil.emulator.links.traffic import Decoder, Traffic, WireItem
 from starhil.protocol.can_framing import CanFrame, encode_request_frames
 from starhil.protocol.candump import bus_name, format_candump
 from starhil.protocol.canopen.cob import SDO_RECEIVE
@@ -123,5 +123,5 @@ class RequestEncoder:
         return {
             "data": data.hex(" ").upper(),
             "serial": "" if self._stack is None else self._stack.encode_request(request).hex(" ").upper(),
-            "cansend": [cansend(frame) for frame in frames],
+            "cansend": [str(frame) for frame in frames],
         }

@@ -86,7 +86,7 @@ class Decoder:
         found = [self._text(event) for event in events] or [("part", self._part(item))]
         kind, text = found[-1][0], "; ".join(text for _, text in found)
         if isinstance(item, CanFrame):
-            raw = cansend(item)
+            raw = str(item)
             if item.extended and self._icd.link.can is not None:
                 can_id = CanId.unpack(item.id)
                 text = f"{can_id.source}→{can_id.destination} {text}"
@@ -208,9 +208,3 @@ def canopen_text(frame: CanFrame) -> str:
                 return "SYNC" if node == 0 else f"node {node} EMCY"
             return f"node {node} {name}"
     return f"COB-ID {frame.id:03X}"
-
-
-def cansend(frame: CanFrame) -> str:
-    """Return a frame as an argument of cansend."""
-    number = f"{frame.id:08X}" if frame.extended else f"{frame.id:03X}"
-    return f"{number}#{'R' if frame.remote else frame.data.hex().upper()}"

@@ -10,7 +10,7 @@ from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
-from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
+from starhil.hil_tests.raw_traffic import matches, parse_frame, pattern
 
 
 class CanProbe(LinkProbe):
@@ -43,7 +43,7 @@ class CanProbe(LinkProbe):
 
     def send(self, frame: CanFrame) -> None:
         """Send a raw frame."""
-        self.log.append(f"{self.now():.4f} -> {format_frame(frame)}")
+        self.log.append(f"{self.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
     def exchange(self, sent: str, answers: Sequence[str]) -> None:
@@ -53,7 +53,7 @@ class CanProbe(LinkProbe):
         for answer in answers:
             wanted = pattern(self._with_addresses(answer))
             frame = self.next_frame()
-            seen = "nothing" if frame is None else format_frame(frame)
+            seen = "nothing" if frame is None else str(frame)
             check(matches(wanted, seen), wanted, seen)
 
     def _with_addresses(self, text: str) -> str:
@@ -68,7 +68,7 @@ class CanProbe(LinkProbe):
             return False
         if not frame.extended or frame.remote or frame.id >> 8 & 0xFF != self.device:
             return True
-        self.log.append(f"{self.now():.4f} <- {format_frame(frame)}")
+        self.log.append(f"{self.now():.4f} <- {frame!s}")
         (self.unsolicited if frame.id >> 24 in can.UNSOLICITED else self._frames).append(frame)
         return True
 

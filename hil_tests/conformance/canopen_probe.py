@@ -29,7 +29,6 @@ from starhil.hil_tests.judge.canopen import (
     upload,
     upload_request,
 )
-from starhil.hil_tests.raw_traffic import format_frame
 
 T = TypeVar("T")
 
@@ -196,14 +195,14 @@ class CanopenProbe:
         """Send a frame; text is hexadecimal."""
         payload = bytes.fromhex(data) if isinstance(data, str) else data
         frame = CanFrame(can_id, payload, extended=extended, remote=remote)
-        self.log.append(f"{self.port.now():.4f} -> {format_frame(frame)}")
+        self.log.append(f"{self.port.now():.4f} -> {frame!s}")
         self.port.send(frame)
 
     def receive(self, timeout_s: float) -> CanFrame | None:
         """Return the next frame, or None if none arrives in time."""
         frame = self.port.receive(timeout_s)
         if frame is not None:
-            self.log.append(f"{self.port.now():.4f} <- {format_frame(frame)}")
+            self.log.append(f"{self.port.now():.4f} <- {frame!s}")
         return frame
 
     def drain(self) -> None:

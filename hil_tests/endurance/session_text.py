@@ -10,7 +10,6 @@ from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Request
 from starhil.hil_tests.judge.serial import SerialLine
-from starhil.hil_tests.raw_traffic import format_frame
 from starhil.protocol.can_framing import CanFrame
 
 LONGEST_WAIT_S = 3600.0
@@ -40,7 +39,7 @@ def session_of(life: Life, definition: Unit, violation: str) -> str:
                 if step["link"] == "serial":
                     sent = [SerialLine(definition).encode(request).hex(" ")]
                 else:
-                    sent = [format_frame(CanFrame(*frame)) for frame in can.frames_of(request, HOST, 4)]
+                    sent = [str(CanFrame(*frame)) for frame in can.frames_of(request, HOST, 4)]
                 lines += ["", "[[step]]", name, f'link = "{step["link"]}"', f"send = {json.dumps(sent)}"]
             case _:
                 lines += ["", f"# step {number}, not possible in a session: {json.dumps(step)}"]
