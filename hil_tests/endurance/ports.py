@@ -6,7 +6,7 @@ Requests are encoded and answers decoded by the judge, not by the product's code
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from starhil.hil_tests.judge import can, canopen
 from starhil.hil_tests.judge.definition import Unit
@@ -19,22 +19,6 @@ HOST: Final = 1
 Heard = tuple[float, Answer]
 Deliver = Callable[[Any], None]
 Take = Callable[[], Sequence[tuple[float, Any]]]
-
-
-class Port(Protocol):
-    """An OBC on one link."""
-
-    def ask(self, *requests: Request) -> None:
-        """Send requests without a pause; raise ValueError or OverflowError for one that cannot be written."""
-        ...
-
-    def cut(self, request: Request, share: float) -> None:
-        """Send the first part of a request, as a client that goes away."""
-        ...
-
-    def answers(self) -> list[Heard]:
-        """Return what has arrived."""
-        ...
 
 
 class SerialPort:
@@ -191,6 +175,9 @@ class CanopenPort:
     def set_state(self, command: int) -> None:
         """Send an NMT command to the node."""
         self._deliver(CanFrame(canopen.NMT, bytes((command, self.node)), extended=False))
+
+
+Port = SerialPort | CanPort | CanopenPort
 
 
 def objects_of(unit: Unit) -> Objects:

@@ -26,6 +26,13 @@ SIZES: Final = {
     "u8": 1, "i8": 1, "u16": 2, "i16": 2, "u24": 3, "i24": 3, "u32": 4, "i32": 4, "u64": 8, "i64": 8, "f32": 4, "f64": 8,
 }  # fmt: skip
 """Bytes of each type of number."""
+FORMATS: Final = {
+    ("little", "f32"): "<f",
+    ("little", "f64"): "<d",
+    ("big", "f32"): ">f",
+    ("big", "f64"): ">d",
+}
+"""Format of floating types in `struct`, by byte order."""
 LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
 """Largest finite number of each floating type; any finite number fits f64."""
 PARAMETER: Final = "parameter."
@@ -155,9 +162,7 @@ class Field:
 
     def bytes_of_float(self, raw: float) -> bytes:
         """Return the bytes of a raw floating-point number."""
-        return struct.pack(
-            ("<" if self.order == "little" else ">") + {"f32": "f", "f64": "d"}[self.type], raw
-        )
+        return struct.pack(FORMATS[self.order, self.type], raw)
 
     def bytes_of_raw(self, raw: int) -> bytes:
         """Return the bytes of a raw integer."""
@@ -179,10 +184,7 @@ class Field:
         if self.type == "bytes":
             return piece
         if self.type in LARGEST:
-            (number,) = struct.unpack(
-                ("<" if self.order == "little" else ">") + {"f32": "f", "f64": "d"}[self.type], piece
-            )
-            return float(number)
+            return float(struct.unpack(FORMATS[self.order, self.type], piece)[0])
         number = int.from_bytes(piece, self.order, signed=self.type.startswith("i") and not self.width)
         return number >> self.shift & (1 << self.width) - 1 if self.width else number
 
@@ -219,28 +221,41 @@ class Field:
             inside = self.raw_limits[0] <= raw <= self.raw_limits[1]
         return None if inside else f"outside {low:g} to {high:g}"
 
-    def any_value(self, special: bytes, turn: int, rng: random.Random) -> Value:
-        """Return a value within the limits, if possible made of special bytes in the first two turns, else random."""
-        size = self.size
-        pattern = (special * (turn + size))[turn:][:size] if turn < 2 and special else rng.randbytes(size)
+    def random_value(self, rng: random.Random, *, at_limit: bool = False) -> Value:
+        """Return a value within the limits; of a number, a limit (or 0 or 1 of a float) if wanted."""
         match self.kind:
             case "bytes":
-                return pattern
+                return rng.randbytes(self.size)
             case "text":
-                return "star"[:size]
+                return "x" * rng.randint(0, self.size)
             case "flag":
                 return rng.random() < 0.5
             case "enum":
-                return rng.choice(list(self.enum or {"": 0}))
+                return rng.choice(list(self.enum or ()))
             case "float":
+                low, high = self.limits
+                edges = [edge for edge in (low, high, 0.0, 1.0) if low <= edge <= high and abs(edge) < 1e30]
+                at_limit = at_limit or high - low > 1e9
+                return rng.choice(edges) if at_limit and edges else rng.uniform(low, high)
+            case _:
+                return self.physical(
+                    rng.choice(self.raw_limits) if at_limit else rng.randint(*self.raw_limits)
+                )
+
+    def any_value(self, special: bytes, turn: int, rng: random.Random) -> Value:
+        """Return a value within the limits, if possible made of special bytes in the first two turns, else random."""
+        if turn < 2 and special:
+            pattern = (special * (turn + self.size))[turn:][: self.size]
+            if self.kind == "bytes":
+                return pattern
+            if self.kind == "float":
                 number = float(self.read(bytes(self.offset) + pattern))
                 low, high = self.limits
                 return min(max(number if abs(number) < 1e30 else 0.0, low), high)
-            case _:
-                low_raw, high_raw = self.raw_limits
-                raw = int.from_bytes(pattern, self.order)
-                chosen = raw if low_raw <= raw <= high_raw else rng.randint(low_raw, high_raw)
-                return self.physical(chosen)
+            raw = int.from_bytes(pattern, self.order)
+            if self.kind in ("integer", "bits") and self.raw_limits[0] <= raw <= self.raw_limits[1]:
+                return self.physical(raw)
+        return self.random_value(rng)
 
 
 def single(number: float) -> float:

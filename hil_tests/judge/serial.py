@@ -27,7 +27,7 @@ from functools import partial
 from typing import Any, Final, NamedTuple
 
 from starhil.hil_tests.judge.checks import check_function, described
-from starhil.hil_tests.judge.definition import Unit, plugin_check, plugin_framing
+from starhil.hil_tests.judge.definition import PluginFraming, Unit
 from starhil.hil_tests.judge.framings import Framing, Taken
 from starhil.hil_tests.judge.framings.counted import Counted
 from starhil.hil_tests.judge.framings.delimited import Delimited
@@ -222,7 +222,7 @@ def _framing(unit: Unit, model: Any) -> Framing:
         case "delimited":
             return Delimited(model)
         case _:
-            return plugin_framing(unit)
+            return PluginFraming(unit)
 
 
 class Headed:
@@ -241,13 +241,13 @@ class Headed:
         classes: tuple[str, ...],
         elsewhere: tuple[str, ...],
     ) -> None:
-        link = unit.serial
+        link, order = unit.serial, unit.conventions.byte_order
         self._unit = unit
         self._klass = classes[0] if len(classes) == 1 else ""
         self._classes, self._elsewhere = classes, elsewhere
         self._start = framing.start
         self._check = described(check)
-        self._compute = check_function(check, unit.byte_order, partial(plugin_check, unit))
+        self._compute = check_function(check, order, unit.plugin)
         self.covers = getattr(check, "covers", [])
         self.check_size = len(self._compute(b""))
         sizes = {"start": len(self._start), "check": self.check_size, "end": len(framing.end)}
@@ -256,8 +256,8 @@ class Headed:
         replies = [(item.name, item.code if item.reply is None else item.reply) for item in coded]
         self._unsolicited = {item.unsolicited for item in coded if item.unsolicited is not None}
         replies += [(item.name, item.unsolicited) for item in coded if item.unsolicited is not None]
-        self.requests = Header(link.request_header, unit.byte_order, requests, sizes)
-        self.replies = Header(link.reply_header, unit.byte_order, replies, sizes)
+        self.requests = Header(link.request_header, order, requests, sizes)
+        self.replies = Header(link.reply_header, order, replies, sizes)
         self._codes = dict(requests)
         self.has_codes = "status" in self.replies.roles() or CODE in (link.refusal or "")
         self.sequence_bits = self.requests.width("sequence")
