@@ -131,25 +131,24 @@ class Obc:
 
     async def request(self, link: str, row: Sequence[Any], data: str = "") -> None:
         """Send a request, data in hexadecimal, and judge the answers."""
-        await self._request(link, row, bytes.fromhex(data))
-
-    async def _request(self, link: str, key: Sequence[Any], data: bytes) -> None:
-        klass, row_id, kind = key
-        row = self._definition.by_key.get((klass, row_id))
-        if row is not None and row.kind != kind:
-            row = None
-        if link == "canopen" and not self._in_dictionary(row, data):
+        klass, row_id, kind = row
+        request = Request(row_id, bytes.fromhex(data), klass, telemetry=kind == "telemetry")
+        known = self._definition.by_key.get((klass, row_id))
+        if known is not None and known.kind != kind:
+            known = None
+        if link == "canopen" and not self._in_dictionary(known, request):
             return
-        verdict = self._oracle.verdict(row, kind, data)
-        request = Request(row_id, data, klass, telemetry=kind == "telemetry")
+        verdict = self._oracle.verdict(known, request)
         try:
             self._ports[link].ask(request)
         except (ValueError, OverflowError):
             return  # the header has no room for such an ID
         self._outcome.requests += 1
-        counts = link != "canopen" or (kind == "telecommand" and not self._oracle.is_outside(row, data))
+        counts = link != "canopen" or not (
+            request.telemetry or known is None or self._oracle.is_outside(known, request.data)
+        )
         if counts and not self._oracle.stuck:
-            self._oracle.counted(kind)
+            self._oracle.counted(request)
         answers = self._answers(link)
         if self._oracle.stuck:
             if answers:
@@ -158,11 +157,11 @@ class Obc:
         elif link in self._oracle.disturbed:
             await self._unknown_outcome(link, request)
         else:
-            await self._judge(link, row, request, verdict, answers, counts=counts)
+            await self._judge(link, known, request, verdict, answers, counts=counts)
 
-    def _in_dictionary(self, row: Row | None, data: bytes) -> bool:
+    def _in_dictionary(self, row: Row | None, request: Request) -> bool:
         """Return whether a request can be made by SDO."""
-        if row is None or len(data) != (row.size if row.kind == "telecommand" else 0):
+        if row is None or len(request.data) != (0 if row.is_telemetry else row.size):
             return False
         return (row.kind, row.name) in self._objects
 
@@ -198,7 +197,8 @@ class Obc:
         what = f"{link}: {row.name if row is not None else request.id}"
         sent = f"{what} {request.data.hex()}".rstrip()
         expected = self._expected_answers(link, row)
-        self._check_form(sent, replies)
+        if malformed := [reply for reply in replies if reply.kind == "malformed"]:
+            raise Violation(f"{sent}: {malformed[0]}")
         nack = next((reply for reply in replies if reply.kind == "nack"), None)
         silent = not replies or tuple(expected) == ("echo",)
         if nack is not None:
@@ -227,11 +227,6 @@ class Obc:
             if reply.kind == "telemetry" and verdict in (None, "ok"):
                 self._read(what, row, request, reply)
 
-    def _check_form(self, sent: str, replies: list[Answer]) -> None:
-        for reply in replies:
-            if reply.kind == "malformed":
-                raise Violation(f"{sent}: {reply}")
-
     def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
         if row is None:
             return ("reply",)
@@ -258,7 +253,7 @@ class Obc:
 
     async def _executed(self, row: Row | None, request: Request, code: str, *, sure: bool) -> None:
         oracle = self._oracle
-        oracle.executed(row, request.id, request.data, code, sure=sure)
+        oracle.executed(row, request, code, sure=sure)
         if row is None or code != "ok":
             return
         if row.action == "reset":
@@ -299,33 +294,32 @@ class Obc:
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
         known = [self._definition.by_key[klass, row_id] for klass, row_id, _ in rows]
-        asked = [row for row in known if self._oracle.verdict(row, "telemetry", b"") == "ok"]
+        asked = [row for row in known if self._oracle.verdict(row, self._definition.request(row)) == "ok"]
         self._outcome.requests += len(asked)
-        self._ports[link].ask(*(Request(row.id, klass=row.klass, telemetry=True) for row in asked))
+        self._ports[link].ask(*(self._definition.request(row) for row in asked))
         replies = self._answers(link)
         if len(replies) != len(asked) or any(reply.kind != "telemetry" for reply in replies):
             raise Violation(f"{link}: {len(replies)} answers to {len(asked)} requests")
         for row, reply in zip(asked, replies, strict=True):
-            self._oracle.counted("telemetry")
+            self._oracle.counted(self._definition.request(row))
             if reply.row_id not in (None, row.id) or len(reply.data) != row.size:
                 raise Violation(f"{link}: {reply} where {row.name} was next")
             self._oracle.read(row, reply.data)
 
     async def flood(self, link: str, row: Sequence[Any], count: int, data: str = "") -> None:
         """Send the same request many times, each judged, so that counters of 16 bits wrap."""
-        content = bytes.fromhex(data)
         for _ in range(count):
             if self._oracle.stuck or link in self._oracle.disturbed:
                 return
-            await self._request(link, row, content)
+            await self.request(link, row, data)
 
     async def cut(self, link: str, row: Sequence[Any], share: float) -> None:
         """Send the first part of a request, as a client that goes away, which a bus must not see answered."""
         if link in self._oracle.disturbed:
             return
         known = self._definition.by_key[row[0], row[1]]
-        content = bytes(known.size) if known.kind == "telecommand" else b""
-        self._ports[link].cut(Request(known.id, content, known.klass, known.kind == "telemetry"), share)
+        content = b"" if known.is_telemetry else bytes(known.size)
+        self._ports[link].cut(self._definition.request(known, content), share)
         if link != "serial":
             await self.pass_time(TIME_OUT_S)
             return
@@ -356,9 +350,10 @@ class Obc:
     async def expect_valid(self, row: Row, field: str, recovery_s: float) -> None:
         """Read a row, whose attitude must be valid."""
         link = self._unit.links[0]
-        self._ports[link].ask(Request(row.id, klass=row.klass, telemetry=True))
+        request = self._definition.request(row)
+        self._ports[link].ask(request)
         if link != "canopen":
-            self._oracle.counted("telemetry")
+            self._oracle.counted(request)
         replies = [answer for answer in self._answers(link) if answer.kind == "telemetry"]
         if not replies:
             raise Violation(f"{link}: {row.name}: no answer after all faults have ended")

@@ -16,7 +16,7 @@ from typing import Any, Final
 from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
 from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.messages import Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
 from starhil.protocol.units_of_measure import factor
 
@@ -158,11 +158,12 @@ class Oracle:
 
     # --- requests ---
 
-    def verdict(self, row: Row | None, kind: str, data: bytes) -> str | None:
+    def verdict(self, row: Row | None, request: Request) -> str | None:
         """Return "ok" if a request must be accepted, the error with which it must be refused, or None: either."""
+        data = request.data
         if row is None:
             return "invalid_id"
-        if kind == "telemetry":
+        if request.telemetry:
             images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())
             return "invalid_length" if data else None if images else "ok"
         if len(data) != row.size:
@@ -189,9 +190,9 @@ class Oracle:
             case _:
                 return None
 
-    def is_outside(self, row: Row | None, data: bytes) -> bool:
+    def is_outside(self, row: Row, data: bytes) -> bool:
         """Return whether a value of a telecommand is outside its limits."""
-        return row is not None and any(field.fault(field.read(data)) for field in row.named.values())
+        return any(field.fault(field.read(data)) for field in row.named.values())
 
     def _mode_verdict(self, wanted: str) -> str | None:
         votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
@@ -206,17 +207,17 @@ class Oracle:
             return "invalid_parameter"
         return None if parameter.name in _BOUND else "ok"
 
-    def counted(self, kind: str) -> None:
+    def counted(self, request: Request) -> None:
         """A request was received."""
-        name = "telecommands" if kind == "telecommand" else "telemetry"
+        name = "telemetry" if request.telemetry else "telecommands"
         count = self.counts[name]
         self.counts[name] = None if count is None else (count + 1) & 0xFFFF
 
-    def executed(self, row: Row | None, row_id: int, data: bytes, code: str, *, sure: bool) -> None:
+    def executed(self, row: Row | None, request: Request, code: str, *, sure: bool) -> None:
         """A telecommand was answered with a code, which is the one expected or not for sure."""
-        self._last = (row_id, code) if sure else None
+        self._last = (request.id, code) if sure else None
         if row is not None and code == "ok":
-            self._take_effect(row, self._arguments(row, data))
+            self._take_effect(row, self._arguments(row, request.data))
 
     def _take_effect(self, row: Row, arguments: Mapping[str, Any]) -> None:
         match row.action:
