@@ -63,7 +63,8 @@ class LifeRun:
                 await self._actions[step["do"]](**{key: value for key, value in step.items() if key != "do"})
                 self._obc.hear()
                 self._oracle.time_passed(unit.now_s)
-                if outcome.violation := unit.defect():
+                outcome.violation = unit.defect()
+                if outcome.violation:
                     break
         except Violation as violation:
             outcome.violation = str(violation)
