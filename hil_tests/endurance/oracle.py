@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion, Readings
 from starhil.hil_tests.endurance.violation import Known, Violation
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Request, Value
@@ -57,7 +57,7 @@ class Oracle:
         self.modes: set[str] = {"boot"}
         self.counts: dict[str, int | None] = {}
         self._boot_count: int | None = None
-        self.attitudes: Final = AttitudeJudge(definition.conventions, sigma_arcsec)
+        self.attitudes: Final = AttitudeJudge(definition.conventions, self.values, sigma_arcsec)
         self.disk_full = False
         self.stuck = False
         self.disturbed: set[str] = set()
@@ -97,7 +97,7 @@ class Oracle:
 
     def _start(self, at_s: float) -> None:
         self._started_s: float | None = at_s
-        self.values = {**self._defaults, **self._stored}
+        self.values.update({**self._defaults, **self._stored})
         self._at_start = {name: self.values[name] for name in AT_START}
         self.modes = {"boot"}
         self.counts = {"telecommands": 0, "telemetry": 0}
@@ -110,7 +110,7 @@ class Oracle:
         self._selected = next(iter(self._definition.parameters_by_id), None)
         self._last = None
         self.bursts = self._subscribed = False
-        self.attitudes.started(at_s, self.values)
+        self.attitudes.started(at_s)
 
     def time_passed(self, now_s: float) -> None:
         """Simulation time has passed."""
@@ -142,14 +142,14 @@ class Oracle:
 
     def forget(self) -> None:
         """Nothing is known of parameters and counters any more, because a request had an unknown outcome."""
-        self.values = dict.fromkeys(self.values)
+        self.values.update(dict.fromkeys(self.values))
         self._at_start = dict.fromkeys(AT_START)
         self._stored = dict.fromkeys(self.values)
         self.counts = dict.fromkeys(self.counts)
         self._clock = self._boot_count = self._selected = self._last = self._started_s = None
         self.modes = {"boot", "standby", "error", *IMAGING}
         self.bursts = self._subscribed = True
-        self.attitudes.retimed(self.now_s, self.values)
+        self.attitudes.retimed(self.now_s)
 
     def in_use(self, name: str) -> Value | None:
         """Return the value of a parameter that the unit works with, None if it is not known."""
@@ -271,7 +271,7 @@ class Oracle:
     def _set(self, changes: Mapping[str, Known | None]) -> None:
         self.values.update(changes)
         if changes.keys() & _TIMING:
-            self.attitudes.retimed(self.now_s, self.values)
+            self.attitudes.retimed(self.now_s)
 
     def _set_clock(self, arguments: Mapping[str, Any]) -> None:
         if self._definition.conventions.epoch_ns is None:  # the day is that of the clock
@@ -295,7 +295,7 @@ class Oracle:
         """Judge the telemetry of a row, received now."""
         if len(data) != row.size:
             raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
-        by_quantity: dict[str, tuple[Field, Value]] = {}
+        by_quantity: Readings = {}
         for name, value in row.decode(data).items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise Violation(f"{row.name}.{name}: {value}")
@@ -303,7 +303,7 @@ class Oracle:
         self.judge(row.name, by_quantity)
         self.judge_attitude(row.name, by_quantity)
 
-    def judge(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+    def judge(self, name: str, read: Readings) -> None:
         """Judge the quantities of a row or PDO, received now, apart from its attitude."""
         for quantity, (field, value) in read.items():
             where = f"{name}.{field.name}"
@@ -316,11 +316,11 @@ class Oracle:
             elif isinstance(value, int) and field.raw_limits[1] >= 0xFFFF:
                 self._learn(quantity, value)
 
-    def judge_attitude(self, name: str, read: Mapping[str, tuple[Field, Value]]) -> None:
+    def judge_attitude(self, name: str, read: Readings) -> None:
         """Judge the attitude in a row, or in the PDOs of an instant."""
         if "attitude.valid" in read:
             imaging = bool(self.modes & IMAGING)
-            self.attitudes.judge(name, read, self.now_s, self.values, imaging=imaging)
+            self.attitudes.judge(name, read, self.now_s, imaging=imaging)
 
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
         known = self.values[name]
@@ -428,7 +428,7 @@ class Oracle:
             self._frames = value
 
     def _check_period(self, where: str, field: Field, value: Value) -> None:
-        self.attitudes.check_period(where, field, value, self.now_s, self.values)
+        self.attitudes.check_period(where, field, value, self.now_s)
 
     def _check_error(self, where: str, _field: Field, value: Value) -> None:
         if self._last is not None and isinstance(value, str) and value != self._last[1]:

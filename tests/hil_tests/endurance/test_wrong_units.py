@@ -362,7 +362,7 @@ def judge(read, *, imaging=True, now_s=10.0, dark_since_s=None, unit=UNIT, forge
     oracle.values |= dict.fromkeys(forget)
     attitudes = oracle.attitudes
     attitudes.dark_since_s = dark_since_s
-    attitudes.judge("row", read, now_s, oracle.values, imaging=imaging)
+    attitudes.judge("row", read, now_s, imaging=imaging)
     return attitudes.count
 
 
@@ -421,9 +421,10 @@ def test_a_right_attitude_is_compared_where_it_can_be(name):
 )
 def test_three_numbers_are_an_attitude_if_the_scalar_is_known(sign, scalar, counted):
     q = Quaternion(math.sqrt(1.0 - scalar**2), 0.0, 0.0, scalar)
-    judge_ = AttitudeJudge(UNIT.conventions.model_copy(update={"scalar_sign": sign}), SIGMA_ARCSEC)
+    conventions = UNIT.conventions.model_copy(update={"scalar_sign": sign})
+    judge_ = AttitudeJudge(conventions, oracle_of().values, SIGMA_ARCSEC)
     judge_.motions = [Motion(0.0, q, (0.0, 0.0, 0.0))]
-    judge_.judge("row", reading_of(q[:3]), 10.0, oracle_of().values, imaging=True)
+    judge_.judge("row", reading_of(q[:3]), 10.0, imaging=True)
     assert judge_.count == counted
 
 
