@@ -11,7 +11,7 @@ from starhil.hil_tests import latency
 from starhil.hil_tests.console_viewer import ROWS, view
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.latency import EchoRequester, HubRequester, SerialRequester, Viewers, measure
-from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.protocol.can_framing import encode_reply_frames
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import Reply, ReplyKind
@@ -30,8 +30,8 @@ def reply_to(destination):
 
 
 def test_replies_to_other_nodes_are_ignored():
-    with HubThread() as hub:
-        own, other = HubRequester(hub.channel, ICD), HubRequester(hub.channel, ICD)
+    with hub_thread() as channel:
+        own, other = HubRequester(channel, ICD), HubRequester(channel, ICD)
         other._socket.sendall(reply_to(253) * 3)
         assert own.ask(ROW.name) is None
         other._socket.sendall(reply_to(253) + reply_to(1))
@@ -140,12 +140,11 @@ def test_an_echo_that_does_not_come_is_none(monkeypatch):
 
 
 def test_a_hub_that_ends_is_reported():
-    with HubThread() as hub:
-        requester = HubRequester(hub.channel, ICD)
-        hub.stop()
-        with pytest.raises(BenchError, match="CAN hub: closed the connection"):
-            requester.ask(ROW.name)
-        requester.close()
+    with hub_thread() as channel:
+        requester = HubRequester(channel, ICD)
+    with pytest.raises(BenchError, match="CAN hub: closed the connection"):
+        requester.ask(ROW.name)
+    requester.close()
 
 
 def test_viewers_end_with_the_measurement():

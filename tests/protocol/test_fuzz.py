@@ -88,7 +88,7 @@ def test_serial_device_receiver() -> None:
             if isinstance(event, Request):
                 assert event == Request.of(event.id, event.data)
                 assert len(event.data) < MAX_SIZE
-        assert len(receiver._body) <= MAX_SIZE
+        assert len(receiver._buffer) <= 2 + 2 * MAX_SIZE + 1  # start, doubled bytes, one escape byte
         if number % 100 == 0:
             assert receiver.feed(CUBESPACE.encode_request(GOOD), number * 0.01 + 0.5)[-1] == GOOD
 
