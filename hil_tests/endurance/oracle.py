@@ -72,11 +72,13 @@ class Oracle:
             "mode": self._check_mode,
             "error.active": self._check_in_error,
             "frame.counter": self._check_frames,
-            "frame.period": self._check_period,
+            "frame.period": lambda where, field, value: self.attitudes.check_period(
+                where, field, value, self.now_s
+            ),
             "request.error": self._check_error,
             **{name: partial(self._check_fraction, name) for name in _FRACTIONS},
         }
-        self._start(0.0)
+        self.restarted(0.0)
 
     # --- what happens to the unit ---
 
@@ -89,13 +91,10 @@ class Oracle:
         self.disturbed.clear()
         self.attitudes.dark_since_s = None
         self.attitudes.motions = [motion]
-        self._start(0.0)
+        self.restarted(0.0)
 
     def restarted(self, at_s: float) -> None:
-        """The unit has restarted by itself at a time."""
-        self._start(at_s)
-
-    def _start(self, at_s: float) -> None:
+        """The unit has started at a time: at power-on, or again by itself."""
         self._started_s: float | None = at_s
         self.values.update({**self._defaults, **self._stored})
         self._at_start = {name: self.values[name] for name in AT_START}
@@ -426,9 +425,6 @@ class Oracle:
             if self._frames is not None and value < self._frames and self._frames - value < 128:
                 raise Violation(f"{where}: {value} after {self._frames}")
             self._frames = value
-
-    def _check_period(self, where: str, field: Field, value: Value) -> None:
-        self.attitudes.check_period(where, field, value, self.now_s)
 
     def _check_error(self, where: str, _field: Field, value: Value) -> None:
         if self._last is not None and isinstance(value, str) and value != self._last[1]:

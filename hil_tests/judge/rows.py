@@ -144,11 +144,7 @@ class Field:
                 return next(iter(self.enum or {}), 0)
             case _:
                 low, high = self.limits
-                return (
-                    min(max(0.0, low), high)
-                    if self.kind == "float" or self.scale != 1.0
-                    else min(max(0, low), high)
-                )
+                return min(max(0.0 if self.kind == "float" or self.scale != 1.0 else 0, low), high)
 
     def bytes_of(self, value: Value) -> bytes:
         """Return the bytes of a field that shares them with no other."""
