@@ -7,7 +7,7 @@ What comes without a request is heard at the end of each step, in the order of i
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, Final
 
@@ -20,7 +20,6 @@ from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request, Value
 from starhil.hil_tests.judge.rows import Row
-from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
 
 TIME_OUT_S: Final = 0.7
@@ -39,7 +38,6 @@ class Obc:
         self._outcome = outcome
         serial = definition.serial
         self._fixed_framing = serial is not None and serial.framing.kind == "fixed"
-        self._line = None if serial is None else SerialLine(definition)
         self._objects = {} if definition.canopen is None else objects_of(definition)
         self._node = None if definition.canopen is None else Node(definition)
         self._ports: dict[str, Port] = {}
@@ -195,31 +193,18 @@ class Obc:
         counts: bool,
     ) -> None:
         what = f"{link}: {row.name if row is not None else request.id}"
-        sent = f"{what} {request.data.hex()}".rstrip()
+        for fault in self._faults(link, row, request, verdict, replies):
+            raise Violation(f"{f'{what} {request.data.hex()}'.rstrip()}: {fault}")
         expected = self._expected_answers(link, row)
-        if malformed := [reply for reply in replies if reply.kind == "malformed"]:
-            raise Violation(f"{sent}: {malformed[0]}")
-        nack = next((reply for reply in replies if reply.kind == "nack"), None)
-        silent = not replies or tuple(expected) == ("echo",)
-        if nack is not None:
-            self._judge_refusal(sent, link, nack, verdict)
-            if len(replies) != 1:
-                raise Violation(f"{sent}: {len(replies)} answers to a refused request")
-        elif silent:
-            if expected and not replies:
-                self._judge_silence(sent, verdict, refusable=self._can_refuse(link, request.klass))
-            if verdict is None and expected:
-                await self._unknown_outcome(link, request)
-                return
-        elif verdict not in (None, "ok"):
-            self._judge_acceptance(sent, link, row)
-        elif sum(reply.final for reply in replies) != 1:
-            raise Violation(f"{sent}: {sum(reply.final for reply in replies)} answers")
+        refused = any(reply.kind == "nack" for reply in replies)
+        silent = not refused and (not replies or expected == ("echo",))
+        if silent and verdict is None and expected:
+            await self._unknown_outcome(link, request)
+            return
         if counts and not request.telemetry:
-            refused_code = "internal" if nack is not None else "ok"
-            sure = verdict is not None or not (nack or silent)
-            await self._executed(row, request, verdict or refused_code, sure=sure)
-        if silent and nack is None and verdict != "ok":
+            sure = verdict is not None or not (refused or silent)
+            await self._executed(row, request, verdict or ("internal" if refused else "ok"), sure=sure)
+        if silent and verdict != "ok":
             await self.settle(link)
             if self._fixed_framing:
                 self._oracle.forget()
@@ -227,29 +212,44 @@ class Obc:
             if reply.kind == "telemetry" and verdict in (None, "ok"):
                 self._read(what, row, request, reply)
 
+    def _faults(
+        self, link: str, row: Row | None, request: Request, verdict: str | None, replies: list[Answer]
+    ) -> Iterator[str]:
+        """Yield what is wrong with the answers to a request."""
+        port, expected = self._ports[link], self._expected_answers(link, row)
+        line = port.line if isinstance(port, SerialPort) else None
+        yield from (str(reply) for reply in replies if reply.kind == "malformed")
+        nack = next((reply for reply in replies if reply.kind == "nack"), None)
+        if nack is not None:
+            if verdict == "ok":
+                yield f"refused with {nack.code}, must be accepted"
+            elif verdict is not None and not self._is_code(nack.code, verdict, port):
+                yield f"refused with {nack.code}, not {self._definition.code(verdict)}"
+            if len(replies) != 1:
+                yield f"{len(replies)} answers to a refused request"
+        elif not replies:
+            if expected and verdict == "ok":
+                yield "no answer"
+            refusable = (line is None or line.envelope.can_refuse(request.klass)) and not self._fixed_framing
+            if expected and verdict is not None and refusable:
+                yield "no answer, must be refused"
+        elif expected != ("echo",) and verdict not in (None, "ok"):
+            # in dialects a and b, data and the code of a refusal may both be one byte
+            if line is None or line.dialect not in ("a", "b") or row is None or row.size != 1:
+                yield "accepted, must be refused"
+        elif expected != ("echo",) and sum(reply.final for reply in replies) != 1:
+            yield f"{sum(reply.final for reply in replies)} answers"
+
     def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
         if row is None:
             return ("reply",)
-        return () if link == "serial" and row.name in self._definition.unanswered else row.answers
+        return tuple(self._definition.serial_answers(row) if link == "serial" else row.answers)
 
-    def _judge_silence(self, sent: str, verdict: str | None, *, refusable: bool) -> None:
-        if verdict == "ok":
-            raise Violation(f"{sent}: no answer")
-        if verdict is not None and refusable and not self._fixed_framing:
-            raise Violation(f"{sent}: no answer, must be refused")
-
-    def _judge_acceptance(self, sent: str, link: str, row: Row | None) -> None:
-        """Judge data in answer to what must be refused; in dialects a and b, both may be one byte."""
-        port = self._ports[link]
-        ambiguous = isinstance(port, SerialPort) and port.dialect in ("a", "b")
-        if row is None or row.size != 1 or not ambiguous:
-            raise Violation(f"{sent}: accepted, must be refused")
-
-    def _judge_refusal(self, sent: str, link: str, nack: Answer, verdict: str | None) -> None:
-        if verdict == "ok":
-            raise Violation(f"{sent}: refused with {nack.code}, must be accepted")
-        if verdict is not None and not self._same_code(link, nack, verdict):
-            raise Violation(f"{sent}: refused with {nack.code}, not {self._definition.code(verdict)}")
+    def _is_code(self, code: int, error: str, port: Port) -> bool:
+        """Return whether a refusal has the code of an error; aborts have codes of their own, some lines have none."""
+        if isinstance(port, SerialPort) and not port.line.envelope.has_codes:
+            return True
+        return code != 0 if isinstance(port, CanopenPort) else code == self._definition.code(error)
 
     async def _executed(self, row: Row | None, request: Request, code: str, *, sure: bool) -> None:
         oracle = self._oracle
@@ -276,16 +276,6 @@ class Obc:
             raise Violation(f"{what}: {reply}")
         self._outcome.readings += 1
         self._oracle.read(other, reply.data)
-
-    def _same_code(self, link: str, nack: Answer, verdict: str) -> bool:
-        if link == "serial" and self._line is not None and not self._line.envelope.has_codes:
-            return True
-        if link == "canopen":
-            return nack.code != 0  # aborts have codes of their own
-        return nack.code == self._definition.code(verdict)
-
-    def _can_refuse(self, link: str, klass: str) -> bool:
-        return link != "serial" or self._line is None or self._line.envelope.can_refuse(klass)
 
     # --- many requests, parts of requests, and other input ---
 

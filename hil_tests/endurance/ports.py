@@ -26,21 +26,20 @@ class SerialPort:
 
     def __init__(self, unit: Unit, deliver: Deliver, take: Take, dialect: str | None) -> None:
         self._deliver, self._take = deliver, take
-        self._line = SerialLine(unit, dialect)
-        self.dialect = self._line.dialect
+        self.line = SerialLine(unit, dialect)
 
     def ask(self, *requests: Request) -> None:
         """Send requests in one piece."""
-        self._deliver(b"".join(self._line.post(request) for request in requests))
+        self._deliver(b"".join(self.line.post(request) for request in requests))
 
     def cut(self, request: Request, share: float) -> None:
         """Send the first bytes of a request."""
-        data = self._line.encode(request)
+        data = self.line.encode(request)
         self._deliver(data[: max(1, int(share * len(data)))])
 
     def answers(self) -> list[Heard]:
         """Return what has arrived."""
-        return [(at_s, answer) for at_s, chunk in self._take() for answer in self._line.feed(chunk)]
+        return [(at_s, answer) for at_s, chunk in self._take() for answer in self.line.feed(chunk)]
 
 
 class CanPort:
