@@ -146,33 +146,34 @@ class Field:
                 low, high = self.limits
                 return min(max(0.0 if self.kind == "float" or self.scale != 1.0 else 0, low), high)
 
-    def bytes_of(self, value: Value) -> bytes:
-        """Return the bytes of a field that shares them with no other."""
+    def raw_of(self, value: Value) -> int | float | bytes:
+        """Return the raw value of a physical one; a member of an enumeration by its name or number."""
         if isinstance(value, bytes):
-            return value.ljust(self.size, b"\0")
+            if self.type != "bytes":
+                raise TypeError(f"{self.name}: bytes are not a number")
+            return value
         if self.kind == "text":
-            return str(value).encode("latin-1").ljust(self.size, b"\0")
-        if self.kind == "float":
-            return self.bytes_of_float((float(value) - self.bias) / self.scale)
-        return self.bytes_of_raw(self.raw_of(value))
-
-    def bytes_of_float(self, raw: float) -> bytes:
-        """Return the bytes of a raw floating-point number."""
-        return struct.pack(FORMATS[self.order, self.type], raw)
-
-    def bytes_of_raw(self, raw: int) -> bytes:
-        """Return the bytes of a raw integer."""
-        return raw.to_bytes(self.size, self.order, signed=self.type.startswith("i"))
-
-    def raw_of(self, value: Value) -> int:
-        """Return the raw number of a flag, a member of an enumeration, or a physical number."""
+            return str(value).encode("latin-1")
         if isinstance(value, str) or (isinstance(value, bool) and self.enum is not None):
             return (self.enum or {})[str(value).lower() if isinstance(value, bool) else value]
-        if isinstance(value, bytes):
-            raise TypeError(f"{self.name}: bytes are not a number")
+        if self.kind == "float":
+            return (value - self.bias) / self.scale
         if self.kind in ("enum", "flag") or (self.scale == 1.0 and self.bias == 0.0):
             return round(value)
         return round((value - self.bias) / self.scale)
+
+    def write(self, data: bytearray, raw: float | bytes) -> None:
+        """Write a raw value to the bytes of a row; zeros complete raw bytes and text."""
+        place = slice(self.offset, self.offset + self.size)
+        if isinstance(raw, bytes):
+            data[place] = raw.ljust(self.size, b"\0")
+        elif self.type in LARGEST:
+            data[place] = struct.pack(FORMATS[self.order, self.type], raw)
+        elif self.width:
+            others = int.from_bytes(data[place], self.order) & ~((1 << self.width) - 1 << self.shift)
+            data[place] = (others | int(raw) << self.shift).to_bytes(self.size, self.order)
+        else:
+            data[place] = int(raw).to_bytes(self.size, self.order, signed=self.type.startswith("i"))
 
     def read(self, data: bytes) -> int | float | bytes:
         """Return the raw value in the bytes of a row."""
@@ -196,8 +197,7 @@ class Field:
             return next(
                 (members.get(name, name) for name, number in names.items() if number == raw), int(raw)
             )
-        scaled = self.scale != 1.0 or self.bias != 0.0
-        return raw * self.scale + self.bias if scaled else raw
+        return raw * self.scale + self.bias if self.scale != 1.0 or self.bias != 0.0 else raw
 
     def fault(self, raw: float | bytes) -> str | None:
         """Return what is wrong with a received raw value; None if it is as defined."""
@@ -321,12 +321,7 @@ class Row:
             raise LookupError(f"{self.name} has no field {', '.join(given.keys() - self.named.keys())}")
         data = bytearray(self.size)
         for name, item in self.named.items():
-            place = slice(item.offset, item.offset + item.size)
-            if item.width:
-                whole = int.from_bytes(data[place], item.order) | item.raw_of(given[name]) << item.shift
-                data[place] = whole.to_bytes(item.size, item.order)
-            else:
-                data[place] = item.bytes_of(given[name])
+            item.write(data, item.raw_of(given[name]))
         return bytes(data)
 
     def decode(self, data: bytes) -> dict[str, Value]:
@@ -349,27 +344,23 @@ class Row:
         """Yield data of a telecommand with one field outside its limits, each with a name of what is wrong."""
         good = self.encode()
 
-        def placed(piece: bytes) -> bytes:
-            return good[: item.offset] + piece + good[item.offset + item.size :]
-
-        def with_raw(raw: int) -> bytes:
-            if item.width:
-                whole = int.from_bytes(good[item.offset : item.offset + item.size], item.order)
-                raw = whole & ~((1 << item.width) - 1 << item.shift) | raw << item.shift
-            return placed(item.bytes_of_raw(raw))
+        def with_raw(raw: float | bytes) -> bytes:
+            data = bytearray(good)
+            item.write(data, raw)
+            return bytes(data)
 
         if item.kind == "float":
             low, high = item.limits
             step = 0.1 * max(abs(low), abs(high), 1.0)
-            yield "nan", placed(item.bytes_of_float(math.nan))
-            yield "infinite", placed(item.bytes_of_float(math.inf))
+            yield "nan", with_raw(math.nan)
+            yield "infinite", with_raw(math.inf)
             if item.minimum is not None:
-                yield "low", placed(item.bytes_of(low - step))
+                yield "low", with_raw(item.raw_of(low - step))
             if item.maximum is not None:
-                yield "high", placed(item.bytes_of(high + step))
+                yield "high", with_raw(item.raw_of(high + step))
         elif item.kind == "enum" and not item.width:
             known = set((item.enum or {}).values())
-            yield "unknown", placed(item.bytes_of_raw(next(n for n in range(255, -1, -1) if n not in known)))
+            yield "unknown", with_raw(next(n for n in range(255, -1, -1) if n not in known))
         elif item.kind in ("integer", "bits"):
             (low_raw, high_raw), (least, greatest) = item.raw_limits, item.type_limits
             if low_raw > least:
