@@ -36,7 +36,7 @@ def units_sent(items: Iterable[WireItem]) -> Iterator[Any]:
     """
     for each in items:
         if each.outgoing:
-            yield from (each.item if isinstance(each.item, bytes) else (replace(each.item, timestamp=None),))
+            yield from (each.item if isinstance(each.item, bytes) else (each.item,))
 
 
 @dataclass

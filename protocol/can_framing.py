@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Final, TypeVar
 
@@ -49,14 +49,14 @@ MAX_OPEN_MESSAGES: Final = 32
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """One classic CAN data or remote frame."""
+    """One classic CAN data or remote frame; frames with the same content are equal, whenever they came."""
 
     id: int
     """CAN ID, 11 or 29 bits."""
     data: bytes = b""
     extended: bool = True
     remote: bool = False
-    timestamp: float | None = None
+    timestamp: float | None = field(default=None, compare=False)
     """Time of reception, seconds since 1970, or None."""
 
     def __post_init__(self) -> None:

@@ -4,7 +4,6 @@ import asyncio
 import csv
 import re
 import resource
-from functools import partial
 
 import pytest
 
@@ -15,7 +14,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.messages import PipelineReady
-from starhil.emulator.profile import Profile, RunConfig
+from starhil.emulator.profile import Profile
+from starhil.emulator.profile_sections import RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
@@ -23,7 +23,6 @@ from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import bundled
-from starhil.protocol.transports import open_can
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 
@@ -365,7 +364,7 @@ def test_auto_is_a_new_hub_if_an_address_is_in_use_on_the_usual_bus(run, monkeyp
     with hub_thread() as channel:  # its port is free again afterwards
         usual = int(re.split("[:/]", channel)[2])
     monkeypatch.setattr("starhil.protocol.transports.can.kernel_can_is_up", lambda _: False)
-    monkeypatch.setattr("starhil.protocol.transports.can.open_can", partial(open_can, hub_port=usual))
+    monkeypatch.setattr("starhil.protocol.transports.can.DEFAULT_PORT", usual)
 
     async def scenario(first, _line):
         both = [other, can_links("auto", address=6)]
