@@ -279,11 +279,9 @@ class Headed:
 
     def closed(self, header: bytes, data: bytes) -> bytes:
         """Return header, data and check."""
-        return header + data + self._compute(self._covered(header, data))
-
-    def _covered(self, header: bytes, data: bytes) -> bytes:
         parts = {"start": self._start, "header": header, "data": data}
-        return b"".join(parts[name] for name in ("start", "header", "data") if name in self.covers)
+        covered = b"".join(part for name, part in parts.items() if name in self.covers)
+        return header + data + self._compute(covered)
 
     def size(self, begun: bytes, asked: Request | None) -> int | None:
         """Return the size of header, data and check."""
@@ -324,7 +322,7 @@ class Headed:
         if opened is None or request is None:
             return malformed()
         header, data = taken.body[: opened.size], taken.body[opened.size : end]
-        computed = self._compute(self._covered(header, data))
+        computed = self.closed(header, data)[len(header) + len(data) :]
         if computed != taken.body[end:]:
             received = taken.body[end:].hex(" ")
             return malformed(fault=f"check {self._check}: computed {computed.hex(' ')}, received {received}")
@@ -451,4 +449,8 @@ class Dialect:
 
 
 Envelope = Headed | Dialect
-"""What surrounds the data of a message within its framing."""
+"""What surrounds the data of a message within its framing.
+
+`sequence_bits` is the width of the number of a request, 0 without one; `numbers` is how many numbers an answer may have;
+`has_codes` is whether a refusal carries a code.
+"""
