@@ -203,6 +203,10 @@ OF_FAULTS: Final = dict.fromkeys(
     _A_FAULT,
 )  # fmt: skip
 """Keys of faults, which a profile does not have, and the hint for whoever writes one there."""
+OF_ATTITUDES: Final = {
+    key: f"; did you mean attitude.{key}?" for key in ("ra_deg", "dec_deg", "roll_deg", "quaternion_xyzw")
+}
+"""Keys of an attitude, and the hint for whoever writes one outside its table."""
 
 
 def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] = ()) -> Profile:
@@ -225,7 +229,7 @@ def load_profile(name_or_path: str = DEFAULT_PROFILE, overrides: Sequence[str] =
     try:
         profile = Profile.model_validate(values)
     except ValidationError as error:
-        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS)
+        listed = problems(error, Profile, values, also=("extends",), hints=OF_FAULTS | OF_ATTITUDES)
         found += [(problem.location, str(problem)) for problem in listed]
     name = str(values.get("unit", DEFAULT_UNIT))
     unit = _path_of_unit(name, path.parent)

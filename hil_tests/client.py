@@ -8,6 +8,7 @@ from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S, AsyncObcClient
 from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
+from starhil.hil_tests.images import download_image
 from starhil.hil_tests.links import (
     DEFAULT_BAUD,
     DEFAULT_DEVICE_ADDRESS,
@@ -32,7 +33,7 @@ T = TypeVar("T")
 def _synchronous(
     method: Callable[Concatenate[AsyncObcClient, Parameters], Coroutine[Any, Any, T]],
 ) -> Callable[Concatenate[ObcClient, Parameters], T]:
-    """Return a method of `ObcClient` that runs a method of `AsyncObcClient` in the client's loop."""
+    """Return a method of `ObcClient` that runs one of `AsyncObcClient`, or a function of one, in the client's loop."""
 
     @functools.wraps(method)
     def run(client: ObcClient, /, *args: Parameters.args, **fields: Parameters.kwargs) -> T:
@@ -136,7 +137,7 @@ class ObcClient:
     read_parameter = _synchronous(AsyncObcClient.read_parameter)
     wait_for = _synchronous(AsyncObcClient.wait_for)
     wait_unsolicited = _synchronous(AsyncObcClient.wait_unsolicited)
-    download_image = _synchronous(AsyncObcClient.download_image)
+    download_image = _synchronous(download_image)
 
     def request(
         self, identifier: int, data: bytes = b"", *, klass: str | None = None, timeout_s: float | None = None
