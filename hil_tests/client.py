@@ -54,26 +54,19 @@ class ObcClient:
             print(obc.wait_for("precise_attitude", lambda reading: reading["valid"], within_s=20))
     """
 
-    def __init__(
-        self,
-        link: HostLink[Any],
-        icd: InterfaceDefinition,
-        *,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-        retries: int = 0,
-    ) -> None:
-        self.core = AsyncObcClient(link, icd, timeout_s=timeout_s, retries=retries)
-        self.icd = icd
+    def __init__(self, core: AsyncObcClient) -> None:
+        self.core = core
+        self.icd = core.icd
         """The interface definition of the unit."""
-        self.transactions = self.core.transactions
+        self.transactions = core.transactions
         """The latest requests, with outcome and latency."""
-        self.faults = self.core.faults
+        self.faults = core.faults
         """The latest invalid inputs."""
-        self.stray_replies = self.core.stray_replies
+        self.stray_replies = core.stray_replies
         """The latest replies without a request."""
         self._loop = LoopThread("obc-client")
         try:
-            self.run(self.core.start())
+            self.run(core.start())
         except BaseException:
             self._loop.close()
             raise
@@ -110,7 +103,7 @@ class ObcClient:
             link = CanopenHostLink(icd, str(can), log=log)
         else:
             link = CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
-        return cls(link, icd, timeout_s=timeout_s, retries=retries)
+        return cls(AsyncObcClient(link, icd, timeout_s=timeout_s, retries=retries))
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the client's loop and return its result."""
