@@ -217,12 +217,12 @@ def _shown_on_console(
     def record_on_both(outcome: Outcome) -> None:
         record(outcome)
         feed.result(
-            outcome.title,
-            outcome.status,
-            outcome.detail,
-            identity=outcome.id,
+            id=outcome.id,
+            name=outcome.title,
+            status=outcome.status,
+            detail=outcome.detail,
             seconds=outcome.seconds,
-            traffic=outcome.log if outcome.status == FAILED else (),
+            log=outcome.log if outcome.status == FAILED else (),
         )
 
     return record_on_both
