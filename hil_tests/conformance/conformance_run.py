@@ -216,12 +216,12 @@ def truth_source(text: str) -> TruthSource:
 
 def _send_to_console(feed: RunFeed, outcome: Outcome) -> None:
     feed.result(
-        outcome.title,
-        outcome.status,
-        outcome.detail,
-        identity=outcome.id,
+        id=outcome.id,
+        name=outcome.title,
+        status=outcome.status,
+        detail=outcome.detail,
         seconds=outcome.seconds,
-        traffic=outcome.log if outcome.status == FAILED else (),
+        log=outcome.log if outcome.status == FAILED else (),
     )
 
 
