@@ -186,16 +186,6 @@ PATHS: Final = frozenset(
 )
 """Keys of files and folders, which refer to the folder of the profile that has them."""
 
-LINK_PARAMETERS: Final[dict[str, str]] = {
-    "serial_dialect": "links.serial.dialect",
-    "serial_baud": "links.serial.baud",
-    "can_address": "links.can.address",
-    "host_address": "links.can.host_address",
-    "canopen_node": "links.canopen.node",
-}
-"""Device parameters whose defaults are set under another key of a profile."""
-
-
 _A_FAULT: Final = "; this is a fault, which belongs in a scenario (--scenario) or on the control channel"
 OF_FAULTS: Final = dict.fromkeys(
     ("fault", "faults", "optical", "serial", "can", "stuck", "error", "reset", "upset", "drop", "corrupt", "junk",
@@ -293,10 +283,10 @@ def _problems_of_keys(
 
 def _check_parameters(known: Mapping[str, Parameter], table: Mapping[str, Any]) -> None:
     for name, value in table.items():
-        if name in LINK_PARAMETERS:
-            raise EmulatorError(f"parameters.{name}: set {LINK_PARAMETERS[name]} instead")
         if name not in known:
             raise EmulatorError(f"parameters.{name}: unknown key{remedy(name, known)}")
+        if known[name].profile_key:
+            raise EmulatorError(f"parameters.{name}: set {known[name].profile_key} instead")
         try:
             known[name].check(value)
         except ProtocolError as error:
