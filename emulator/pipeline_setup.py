@@ -43,5 +43,6 @@ def pipeline_setup(profile: Profile, *, repeatable: bool = False, previews: bool
         build_in_background=profile.run.clock != "stepped" and not repeatable,
         previews=previews,
         dark_frames=profile.device.dark_frames,
+        calibration=profile.calibration.matrix(),
         images=profile.images.resolved(profile.folder),
     )

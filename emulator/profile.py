@@ -6,13 +6,22 @@ is validated; an error names the file, the key and the remedy.
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from itertools import permutations
+from itertools import permutations, product
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Self
 
-from pydantic import Field, PrivateAttr, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    PrivateAttr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from starhil.emulator.errors import EmulatorError
 from starhil.emulator.toml_file import find_toml, read_toml
@@ -49,6 +58,8 @@ ParticleRate = Annotated[float, Field(ge=0.0, le=1e6)]
 FocalLength = Annotated[float, Field(ge=1.0, le=1e6)]
 PixelPosition = Annotated[float, Field(ge=-1e4, le=1e4)]
 DistortionTerm = Annotated[float, Field(ge=-1e6, le=1e6)]
+OfCamera = Field(min_length=9, max_length=9)
+"""One item for each of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3."""
 
 
 class RunConfig(Strict):
@@ -123,6 +134,44 @@ class DeviceConfig(Strict):
     """Number of valid frames from which the body rate is estimated, if the star identifier does not do so."""
     dark_frames: Annotated[int, Field(ge=0, le=100)] = 0
     """Number of frames averaged into the dark frame that the unit subtracts from each image; 0: none."""
+
+
+class CalibrationConfig(BaseModel):
+    """Errors of the camera's parameters as known from its calibration; other keys are notes by `starid calibrate`."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    sigma: Annotated[list[Annotated[float, Field(ge=0.0, le=1e4)]], OfCamera] | None = None
+    """Standard deviations of fx, fy, cx, cy (pixels), k1, k2, p1, p2, k3. They are independent, but fx and fy have
+    the same relative error."""
+    covariance: (
+        Annotated[list[Annotated[list[Annotated[float, Field(ge=-1e8, le=1e8)]], OfCamera]], OfCamera] | None
+    ) = None
+    """Covariance of the same parameters; if it is given, `sigma` is not used."""
+
+    @field_validator("covariance")
+    @classmethod
+    def _check_covariance(cls, rows: list[list[float]] | None) -> list[list[float]] | None:
+        if rows is None:
+            return None
+        for i, j in product(range(9), repeat=2):
+            possible = (
+                min(rows[i][i], rows[j][j]) >= 0.0 and rows[i][j] ** 2 <= 1.000001 * rows[i][i] * rows[j][j]
+            )
+            if not possible or not math.isclose(rows[i][j], rows[j][i], rel_tol=1e-6):
+                raise ValueError(f"row {i + 1}, column {j + 1} is not that of a covariance matrix")
+        return rows
+
+    def matrix(self) -> list[list[float]] | None:
+        """Return the covariance; None if no errors are known."""
+        if self.covariance is not None or self.sigma is None:
+            return self.covariance
+        rows = [
+            [sigma**2 if row == column else 0.0 for column in range(9)]
+            for row, sigma in enumerate(self.sigma)
+        ]
+        rows[0][1] = rows[1][0] = self.sigma[0] * self.sigma[1]
+        return rows
 
 
 class PowerConfig(Strict):
@@ -305,8 +354,9 @@ class Profile(Strict):
     """Particles along the orbit."""
     links: LinksConfig = LinksConfig()
     """Serial line, CAN and CANopen."""
-    calibration: dict[str, Any] = Field(default_factory=dict)
-    """Notes by `starid calibrate` for the reader; not used."""
+    calibration: CalibrationConfig = CalibrationConfig()
+    """Known errors of the calibrated camera, as `starid calibrate` writes them. They increase the uncertainty that the
+    unit states, and change nothing else. Other keys are notes."""
     health: dict[str, float] = Field(default_factory=dict)
     """Numbers reported as the quantities `health.NAME`, such as temperatures, in the unit of the field.
     Default: in °C, V, A or W what `[thermal]` and `[power]` give, otherwise 0."""
@@ -552,7 +602,8 @@ def _read_extended(path: Path, depth: int) -> list[Layer]:
 
 
 def _drop_parameters_of_camera(values: dict[str, Any]) -> None:
-    """Remove the device parameters that belong to a camera that is going to be replaced."""
+    """Remove what the device knows of a camera that is going to be replaced: its parameters and their errors."""
+    values.pop("calibration", None)
     parameters = values.get("parameters")
     if isinstance(parameters, dict):
         values["parameters"] = {key: value for key, value in parameters.items() if key not in OF_CAMERA}

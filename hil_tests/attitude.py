@@ -82,6 +82,22 @@ def conjugate(q: Sequence[float]) -> Quaternion:
     return Quaternion(-x, -y, -z, w)
 
 
+def from_rotation_vector(vector: Sequence[float]) -> Quaternion:
+    """Return the rotation about the direction of a vector by its length, rad; a frame turned so has the conjugate."""
+    angle = math.hypot(*vector)
+    scale = math.sin(0.5 * angle) / angle if angle else 0.5
+    x, y, z = (scale * part for part in vector)
+    return Quaternion(x, y, z, math.cos(0.5 * angle))
+
+
+def rotation_vector(q: Sequence[float]) -> Vector:
+    """Return the direction of the axis of a rotation times its angle, at most half a turn, rad."""
+    x, y, z, w = q
+    sine = math.copysign(math.hypot(x, y, z), w)
+    scale = 2.0 * math.atan2(abs(sine), abs(w)) / sine if sine else 2.0
+    return scale * x, scale * y, scale * z
+
+
 def as_reported(attitude: Quaternion, conventions: Conventions) -> Quaternion:
     """Return an attitude from ICRS to the sensor with the direction and axes of a unit's `[conventions]`."""
     turned = product(from_matrix(conventions.rows), attitude)
@@ -126,6 +142,24 @@ def from_matrix(rows: Sequence[Sequence[float]]) -> Quaternion:
     return Quaternion(*(part / length for part in parts))
 
 
+def cross(a: Vector, b: Vector) -> Vector:
+    """Return the vector product a × b."""
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def from_directions(seen: tuple[Vector, Vector], known: tuple[Vector, Vector]) -> Quaternion:
+    """Return the attitude with which two directions in ICRS are seen in the sensor (TRIAD, Black 1964)."""
+
+    def triad(first: Vector, second: Vector) -> list[list[float]]:
+        third = cross(first, second)
+        return [[part / math.hypot(*axis) for part in axis] for axis in (first, third, cross(first, third))]
+
+    pairs = list(zip(triad(*seen), triad(*known), strict=True))
+    return from_matrix(
+        [[sum(a[row] * b[column] for a, b in pairs) for column in range(3)] for row in range(3)]
+    )
+
+
 def to_matrix(q: Quaternion) -> tuple[Vector, Vector, Vector]:
     """Return the rows of the matrix that rotates vectors as a quaternion does: the sensor's axes in ICRS."""
     x, y, z, w = q
@@ -159,18 +193,6 @@ def attitude_error(measured: Quaternion, truth: Quaternion) -> AttitudeError:
 
 
 def interpolate(first: Quaternion, second: Quaternion, fraction: float) -> Quaternion:
-    """Return the attitude at `fraction` of the shortest rotation from `first` to `second` (slerp)."""
-    dot = math.fsum(p * q for p, q in zip(first, second, strict=True))
-    target = second if dot >= 0.0 else Quaternion(*(-v for v in second))
-    angle = math.acos(min(1.0, abs(dot)))
-    if angle < 1e-9:
-        return second if fraction >= 0.5 else first
-    sine = math.sin(angle)
-    a, b = math.sin((1.0 - fraction) * angle) / sine, math.sin(fraction * angle) / sine
-    return unit([a * p + b * q for p, q in zip(first, target, strict=True)])
-
-
-def wrapped_difference(value: float, expected: float) -> float:
-    """Return the absolute difference of two angles in degrees, at most half a turn."""
-    difference = math.fmod(abs(value - expected), 360.0)
-    return min(difference, 360.0 - difference)
+    """Return the attitude at `fraction` of the shortest rotation from `first` to `second`."""
+    whole = rotation_vector(product(second, conjugate(first)))
+    return product(from_rotation_vector([fraction * part for part in whole]), first)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Final, Self
 
 from starhil.hil_tests.async_client import DEFAULT_TIMEOUT_S
@@ -14,10 +16,9 @@ from starhil.hil_tests.control import ControlClient
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import DEFAULT_BAUD, DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS
-from starhil.hil_tests.wire_log import CandumpLog, SerialLog, WireLog
+from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.candump import bus_name
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.errors import ProtocolError
 
 SIGNAL_NUMBERS: Final = {"term": signal.SIGTERM, "kill": signal.SIGKILL}
 
@@ -39,6 +40,11 @@ class LinkOptions:
     timeout_s: float = DEFAULT_TIMEOUT_S
     retries: int = 0
 
+    @property
+    def links(self) -> tuple[str, ...]:
+        """Names of the links in use: `serial`, `can` or both."""
+        return tuple(name for name in ("serial", "can") if getattr(self, name) is not None)
+
 
 class Bench:
     """Clients of one unit: a context manager that opens them on first use and closes them all.
@@ -57,17 +63,13 @@ class Bench:
         log_folder: Path | None = None,
     ) -> None:
         self.options = options
+        self.links = options.links
         self.icd = icd
         self.emulator = emulator
         self.log_folder = log_folder
         self.logs: dict[str, WireLog] = {}
         self._clients: dict[str, ObcClient] = {}
-        self._started = False
-
-    @property
-    def links(self) -> tuple[str, ...]:
-        """Names of the links in use: `serial`, `can` or both."""
-        return tuple(name for name in ("serial", "can") if getattr(self.options, name) is not None)
+        self._stack = ExitStack()
 
     def client(self, link: str) -> ObcClient:
         """Return the client on a link, opened at the first call."""
@@ -78,39 +80,28 @@ class Bench:
         return self._clients[link]
 
     def _open(self, link: str) -> ObcClient:
-        options = self.options
-        spec = self._spec(link)
-        common = {"unit": self.icd, "timeout_s": options.timeout_s, "retries": options.retries}
-        log = self._log(link)
-        if link == "serial":
-            return ObcClient.open(serial=spec, dialect=options.dialect, baud=options.baud, log=log, **common)  # type: ignore[arg-type]
-        return ObcClient.open(
-            can=spec,
-            host_address=options.host_address,
-            device_address=options.device_address,
-            log=log,
-            **common,  # type: ignore[arg-type]
-        )
+        port = self._port(link)
+        if self.log_folder is not None and link not in self.logs:
+            bus = bus_name(port) if link == "can" else ""
+            self.logs[link] = self._stack.enter_context(WireLog(self.log_folder / f"{link}.log", bus))
+        options = {**vars(self.options), "serial": None, "can": None, link: port}
+        return ObcClient.open(**options, unit=self.icd, log=self.logs.get(link))
 
-    def _spec(self, link: str) -> str:
-        spec = str(getattr(self.options, link))
-        if self.emulator is None or spec != "auto":
-            return spec
+    def _port(self, link: str) -> str:
+        port = str(getattr(self.options, link))
+        if self.emulator is None or port != "auto":
+            return port
         if link not in self.emulator.ready:
             raise BenchError(
                 f"the emulator did not open a {link} link; its ready line has {self.emulator.ready}"
             )
         return self.emulator.ready[link]
 
-    def _log(self, link: str) -> WireLog | None:
-        if self.log_folder is None:
-            return None
-        if link not in self.logs:
-            path = self.log_folder / f"{link}.log"
-            self.logs[link] = (
-                SerialLog(path) if link == "serial" else CandumpLog(path, bus_name(self._spec(link)))
-            )
-        return self.logs[link]
+    @property
+    def _own_emulator(self) -> EmulatorProcess:
+        if self.emulator is None:
+            raise BenchError("only an emulator that the bench started can do this: use --start")
+        return self.emulator
 
     def close_clients(self) -> None:
         """Close all clients; they are opened again on next use."""
@@ -123,9 +114,7 @@ class Bench:
 
         Raises BenchError: the request was rejected, or the unit is not an emulator that the bench started.
         """
-        if self.emulator is None:
-            raise BenchError("only an emulator that the bench started has a control channel: use --start")
-        with ControlClient(self.emulator.ready["control"]) as channel:
+        with ControlClient(self._own_emulator.ready["control"]) as channel:
             return channel.do(action, **keys)
 
     def restart(self, how: str) -> None:
@@ -133,35 +122,19 @@ class Bench:
 
         Raises BenchError: the unit is not an emulator that the bench started.
         """
-        if self.emulator is None:
-            raise BenchError("only an emulator that the bench started can be restarted: use --start")
+        emulator = self._own_emulator
         self.close_clients()
-        self._started = False  # a failed restart has already cleaned up and raised its error
-        self.emulator.restart(SIGNAL_NUMBERS[how])
-        self._started = True
+        emulator.restart(SIGNAL_NUMBERS[how])
 
     def __enter__(self) -> Self:
         if self.log_folder is not None:
             self.log_folder.mkdir(parents=True, exist_ok=True)
         if self.emulator is not None:
-            self.emulator.start()
-            self._started = True
+            self._stack.enter_context(self.emulator)
+        self._stack.callback(self.close_clients)
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
-        try:
-            self.close_clients()
-        finally:
-            for log in self.logs.values():
-                log.close()
-            self._end_emulator(kind)
-
-    def _end_emulator(self, kind: type[BaseException] | None) -> None:
-        """End the emulator; report that it ended unexpectedly, which may have caused the current error."""
-        if self.emulator is None or not self._started:
-            return
-        caused_by_emulator = kind is not None and issubclass(kind, BenchError | ProtocolError)
-        if kind is None or (caused_by_emulator and not self.emulator.running):
-            self.emulator.stop()
-        else:
-            self.emulator.kill()
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)

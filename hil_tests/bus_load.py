@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import asyncio
 import multiprocessing as mp
-import random
 import time
-from contextlib import suppress
 from itertools import pairwise
+from math import inf
 from multiprocessing.connection import Connection
 from typing import Final
 
 from starhil.hil_tests.async_client import AsyncObcClient
-from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
+from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.latency import REQUESTED_ROWS, ask_in_turn, exchange
 from starhil.hil_tests.links import DEFAULT_DEVICE_ADDRESS, DEFAULT_HOST_ADDRESS, CanHostLink
 from starhil.hil_tests.load_figures import CanLoad, Spread
 from starhil.hil_tests.realtime import set_realtime_priority
@@ -38,20 +38,6 @@ ECHO: Final = 0x22
 ECHO_ROW: Final = 133
 """Row ID of the other traffic."""
 
-REQUESTED_ROWS: Final = (
-    "identification",
-    "quaternion",
-    "precise_attitude",
-    "star_tracker",
-    "unix_time",
-    "device_status",
-)
-"""Telemetry rows that are requested in turn."""
-PAUSE_S: Final = 0.004
-"""Mean pause between two requests.
-
-The pauses are random so that requests arrive in every phase of image processing.
-"""
 REPLY_WITHIN_S: Final = 2.0
 TICK_S: Final = 0.001
 """Time between two bursts of the other traffic."""
@@ -167,29 +153,22 @@ async def load_can(
         )
         for node in (device, ECHO)
     )
+    wrong = 0
+
+    async def ask(row: Row) -> float:
+        nonlocal wrong
+        latency, reply = await exchange(asker, icd.request(row), row.name)
+        wrong += latency < inf and (reply is None or not _is_right(row, reply))
+        return latency
+
+    async def ask_echo(_row: Row) -> float:
+        return (await exchange(echo, Request.of(ECHO_ROW), "echo"))[0]
+
     await asker.start()
     await echo.start()
     traffic = await asyncio.to_thread(OtherTraffic, spec, rate, realtime=realtime)
-    rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
-    end = time.monotonic() + seconds
-    latencies: list[float] = []
-    echoes: list[float] = []
-    requests = unanswered = wrong = 0
-    while time.monotonic() < end:
-        row = icd.telemetry[REQUESTED_ROWS[requests % len(REQUESTED_ROWS)]]
-        requests += 1
-        try:
-            reply, latency = await asker.transact(icd.request(row), row.name)
-            latencies.append(latency)
-            wrong += not _is_right(row, reply)
-        except NackError:
-            wrong += 1
-        except (NoReplyError, LinkLostError):
-            unanswered += 1
-        await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
-        with suppress(NoReplyError, LinkLostError):
-            echoes.append((await echo.transact(Request.of(ECHO_ROW), "echo"))[1])
-        await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
+    rows = [icd.telemetry[name] for name in REQUESTED_ROWS]
+    latencies = await ask_in_turn({"device": ask, "echo": ask_echo}, rows, seconds)
     duration, sent, lost, disordered, refused = await asyncio.to_thread(traffic.stop)
     await asker.close()
     await echo.close()
@@ -199,9 +178,9 @@ async def load_can(
         sent=sent,
         lost=lost + refused,
         disordered=disordered,
-        requests=requests,
-        unanswered=unanswered,
+        requests=len(latencies["device"]),
+        unanswered=latencies["device"].count(inf),
         wrong=wrong + len(asker.faults) + len(asker.stray_replies),
-        latency=Spread.of(latencies),
-        machine=Spread.of(echoes),
+        latency=Spread.of(latencies["device"]),
+        machine=Spread.of(latencies["echo"]),
     )

@@ -27,12 +27,11 @@ class CanopenHostLink(HostLink[CanFrame]):
     def __init__(
         self, icd: InterfaceDefinition, spec: str, *, node: int | None = None, log: WireLog | None = None
     ) -> None:
-        super().__init__(open_can(spec), f"CANopen {spec}", log)
+        super().__init__(open_can(spec), f"CANopen {spec}", log, lambda: self)
         self._icd = icd
         self._dictionary = build_dictionary(icd)
         self._node = int(icd.device_parameters["canopen_node"].default) if node is None else node
         self._under_way: tuple[Request, SdoTransfer] | None = None
-        self._receiver = self
 
     def request(self, request: Request) -> None:
         """Start the transfers of a request.

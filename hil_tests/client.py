@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import deque
 from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, Self, TypeVar
 
@@ -18,11 +17,10 @@ from starhil.hil_tests.links import (
     SerialHostLink,
 )
 from starhil.hil_tests.loop_thread import LoopThread
-from starhil.hil_tests.transactions import Transaction
 from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import LinkFault, Reply
+from starhil.protocol.messages import Reply
 from starhil.protocol.names import DEFAULT_UNIT
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
@@ -57,26 +55,27 @@ class ObcClient:
 
     def __init__(
         self,
-        make_link: Callable[[], HostLink[Any]],
+        link: HostLink[Any],
         icd: InterfaceDefinition,
         *,
         timeout_s: float = DEFAULT_TIMEOUT_S,
         retries: int = 0,
     ) -> None:
+        self.core = AsyncObcClient(link, icd, timeout_s=timeout_s, retries=retries)
+        self.icd = icd
+        """The interface definition of the unit."""
+        self.transactions = self.core.transactions
+        """The latest requests, with outcome and latency."""
+        self.faults = self.core.faults
+        """The latest invalid inputs."""
+        self.stray_replies = self.core.stray_replies
+        """The latest replies without a request."""
         self._loop = LoopThread("obc-client")
         try:
-            self.core = self.run(self._open(make_link, icd, timeout_s, retries))
+            self.run(self.core.start())
         except BaseException:
             self._loop.close()
             raise
-
-    @staticmethod
-    async def _open(
-        make_link: Callable[[], HostLink[Any]], icd: InterfaceDefinition, timeout_s: float, retries: int
-    ) -> AsyncObcClient:
-        core = AsyncObcClient(make_link(), icd, timeout_s=timeout_s, retries=retries)
-        await core.start()
-        return core
 
     @classmethod
     def open(
@@ -100,19 +99,17 @@ class ObcClient:
         """
         if (serial is None) == (can is None):
             raise BenchError("an OBC client needs either a serial port or a CAN channel")
-
         icd = load_unit(unit) if isinstance(unit, str) else unit
+        link: HostLink[Any]
+        if serial is not None:
+            link = SerialHostLink(icd, serial, dialect=dialect, baud=baud, log=log)
+        elif icd.link.can is None and icd.canopen is not None:
+            from starhil.hil_tests.canopen_link import CanopenHostLink
 
-        def make_link() -> HostLink[Any]:
-            if serial is not None:
-                return SerialHostLink(icd, serial, dialect=dialect, baud=baud, log=log)
-            if icd.link.can is None and icd.canopen is not None:
-                from starhil.hil_tests.canopen_link import CanopenHostLink
-
-                return CanopenHostLink(icd, str(can), log=log)
-            return CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
-
-        return cls(make_link, icd, timeout_s=timeout_s, retries=retries)
+            link = CanopenHostLink(icd, str(can), log=log)
+        else:
+            link = CanHostLink(str(can), host_address=host_address, device_address=device_address, log=log)
+        return cls(link, icd, timeout_s=timeout_s, retries=retries)
 
     def run(self, coroutine: Coroutine[Any, Any, T]) -> T:
         """Run a coroutine in the client's loop and return its result."""
@@ -129,26 +126,6 @@ class ObcClient:
 
     def __exit__(self, *_error: object) -> None:
         self.close()
-
-    @property
-    def icd(self) -> InterfaceDefinition:
-        """The interface definition of the unit."""
-        return self.core.icd
-
-    @property
-    def transactions(self) -> deque[Transaction]:
-        """The latest requests, with outcome and latency."""
-        return self.core.transactions
-
-    @property
-    def faults(self) -> deque[LinkFault]:
-        """The latest invalid inputs."""
-        return self.core.faults
-
-    @property
-    def stray_replies(self) -> deque[Reply]:
-        """The latest replies without a request."""
-        return self.core.stray_replies
 
     read = _synchronous(AsyncObcClient.read)
     telemetry = _synchronous(AsyncObcClient.telemetry)

@@ -7,6 +7,7 @@ import socket
 import time
 from contextlib import ExitStack
 from typing import Any, Final, Self
+from urllib.parse import urlsplit
 
 from starhil.hil_tests.attitude import (
     AttitudeError,
@@ -17,6 +18,7 @@ from starhil.hil_tests.attitude import (
 )
 from starhil.hil_tests.errors import HIDDEN_BEHIND_ONE_LINE, BenchError
 from starhil.protocol.conventions import Conventions
+from starhil.protocol.errors import reason
 
 __tracebackhide__ = HIDDEN_BEHIND_ONE_LINE
 
@@ -35,8 +37,8 @@ class ControlClient:
     def __init__(self, address: str) -> None:
         try:
             self._socket = _connected(address)
-        except OSError as error:
-            raise BenchError(f"control channel {address}: {error.strerror or error}") from None
+        except (OSError, ValueError) as error:
+            raise BenchError(f"control channel {address}: {reason(error)}") from None
         self._lines = self._socket.makefile("rw", encoding="utf-8")
 
     def do(self, action: str, /, **keys: Any) -> dict[str, Any]:
@@ -56,7 +58,7 @@ class ControlClient:
             self._lines.flush()
             line = self._lines.readline()
         except OSError as error:
-            raise BenchError(f"{what}: no answer: {error.strerror or error}") from None
+            raise BenchError(f"{what}: no answer: {reason(error)}") from None
         if not line:
             raise BenchError(f"{what}: closed by the emulator")
         answer: dict[str, Any] = json.loads(line)
@@ -93,8 +95,8 @@ class ControlClient:
 def _connected(address: str) -> socket.socket:
     path = address.removeprefix("unix:")
     if path == address:
-        host, _, port = address.rpartition(":")
-        return socket.create_connection((host, int(port)), ANSWER_WITHIN_S)
+        parts = urlsplit(f"//{address}")
+        return socket.create_connection((parts.hostname, parts.port), ANSWER_WITHIN_S)
     with ExitStack() as stack:
         found = stack.enter_context(socket.socket(socket.AF_UNIX))
         found.settimeout(ANSWER_WITHIN_S)

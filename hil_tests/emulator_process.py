@@ -19,6 +19,7 @@ from urllib.parse import unquote
 
 from starhil.hil_tests.attitude import Quaternion
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
+from starhil.protocol.errors import OneLineError
 from starhil.protocol.names import DEFAULT_UNIT
 
 READY_WITHIN_S: Final = 300.0
@@ -63,17 +64,16 @@ def emulator_command(
     return [*command, *([] if truth_log is None else ["--overwrite"]), *extra]
 
 
-def pointing(attitude: Quaternion, settings: Sequence[str]) -> list[str]:
-    """Return the settings that point an emulator at an attitude, unless its own settings have keys of `truth`."""
-    if any(setting.strip().startswith("truth.") for setting in settings):
-        return []
-    return ["truth.kind=fixed", f"truth.attitude={{ quaternion_xyzw = {list(attitude)} }}"]
+def pointed(attitude: Quaternion | None, settings: Sequence[str]) -> list[str]:
+    """Return settings that also point an emulator at an attitude, unless they have keys of `truth`."""
+    if attitude is None or any(setting.strip().startswith("truth.") for setting in settings):
+        return [*settings]
+    return ["truth.kind=fixed", f"truth.attitude={{ quaternion_xyzw = {list(attitude)} }}", *settings]
 
 
-def hub_command(*, log: Path | None = None) -> list[str]:
+def hub_command() -> list[str]:
     """Return the command line for a CAN hub on a free port that ends with this process."""
-    command = [*_starhil_command(), "hub", "--port", "0"]
-    return command if log is None else [*command, "--log", str(log)]
+    return [*_starhil_command(), "hub", "--port", "0"]
 
 
 def installed_command() -> str:
@@ -111,6 +111,9 @@ def parse_ready_line(line: str) -> dict[str, str]:
 class EmulatorProcess:
     """A running emulator; it also ends with the thread that called `start`.
 
+    A context manager that on exit raises `EmulatorProcessError` if the emulator does not end cleanly, or if it has ended
+    by itself, which may have caused the error of the bench that ends the context.
+
     The command line is that of `emulator_command`; `ready` has the fields of the ready line: serial, can, control, seed …
     """
 
@@ -120,6 +123,8 @@ class EmulatorProcess:
         self.errors: list[str] = []
         self._ready_within_s = ready_within_s
         self._process: subprocess.Popen[str] | None = None
+        self._ended = False
+        """Whether the process was ended by `stop` or `kill`, which have reported how."""
         self._lines: queue.Queue[str | None] = queue.Queue()
         self._readers: list[threading.Thread] = []
 
@@ -155,7 +160,7 @@ class EmulatorProcess:
             )
         except OSError as error:
             raise EmulatorProcessError(f"{self.command[0]}: cannot be started: {error.strerror}") from None
-        self._process = process
+        self._process, self._ended = process, False
         self._readers = [
             threading.Thread(target=self._read_output, args=(process.stdout,), daemon=True),
             threading.Thread(target=self._read_errors, args=(process.stderr,), daemon=True),
@@ -252,6 +257,7 @@ class EmulatorProcess:
     def kill(self) -> None:
         """Kill the process and its workers (SIGKILL) and release the resources."""
         process = self.process
+        self._ended = True
         with contextlib.suppress(ProcessLookupError):  # the whole group has ended
             os.killpg(process.pid, signal.SIGKILL)
         process.wait()
@@ -278,7 +284,10 @@ class EmulatorProcess:
         return self.start()
 
     def __exit__(self, kind: type[BaseException] | None, *_error: object) -> None:
-        if kind is None:
+        if self._ended:
+            return
+        caused_by_emulator = kind is not None and issubclass(kind, OneLineError) and not self.running
+        if kind is None or caused_by_emulator:
             self.stop()
         else:
             self.kill()

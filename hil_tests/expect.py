@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Self
 
@@ -26,7 +27,6 @@ from starhil.hil_tests.attitude import (
     from_vector_part,
     to_radec_roll,
     unit,
-    wrapped_difference,
 )
 from starhil.hil_tests.errors import BenchError
 from starhil.protocol.conventions import Conventions
@@ -132,13 +132,30 @@ class Conditions(Keys):
 
     def mismatch(self, field: str, value: Value, variables: Mapping[str, Value]) -> str | None:
         """Return a description of the mismatch of a field, or None if its value meets the conditions."""
-        for check in (self._equality, self._bounds, self._choices):
-            text = check(value, variables)
-            if text is not None:
-                return f"{field} is {show(value)}, expected {text}"
-        return None
+        wanted = next(self._unmet(value, variables), None)
+        return None if wanted is None else f"{field} is {show(value)}, expected {wanted}"
 
-    def _equality(self, value: Value, variables: Mapping[str, Value]) -> str | None:
+    def _unmet(self, value: Value, variables: Mapping[str, Value]) -> Iterator[str]:
+        """Yield what is expected instead, for each condition that does not hold."""
+        if (text := self._inequality(value, variables)) is not None:
+            yield text
+        bounds: tuple[tuple[Operand | None, Callable[[float, float], bool], str], ...] = (
+            (self.minimum, operator.ge, "at least"),
+            (self.maximum, operator.le, "at most"),
+            (self.above, operator.gt, "more than"),
+        )
+        for limit, holds, words in bounds:
+            if limit is not None:
+                bound = resolve(limit, variables)
+                if not (_is_number(value) and _is_number(bound) and holds(float(value), float(bound))):
+                    yield f"{words} {show(bound)}"
+        allowed = [resolve(item, variables) for item in self.one_of]
+        if allowed and value not in allowed:
+            yield f"one of {', '.join(map(show, allowed))}"
+        if self.differs_from is not None and value == (other := resolve(self.differs_from, variables)):
+            yield f"anything but {show(other)}"
+
+    def _inequality(self, value: Value, variables: Mapping[str, Value]) -> str | None:
         if self.equals is None:
             return None
         expected = resolve(self.equals, variables)
@@ -153,36 +170,11 @@ class Conditions(Keys):
         if isinstance(value, int) and self.within is None:
             tolerance = 0.0
         angle = self.angle_deg is not None
-        distance = wrapped_difference(float(value), wanted) if angle else abs(float(value) - wanted)
+        distance = abs(math.remainder(float(value) - wanted, 360.0)) if angle else abs(float(value) - wanted)
         if distance <= tolerance:
             return None
         text = show(wanted if self.plus else expected)
         return text if self.within is None else f"{text} ± {self.within:g} (off by {distance:.6g})"
-
-    def _bounds(self, value: Value, variables: Mapping[str, Value]) -> str | None:
-        bounds: tuple[tuple[Operand | None, Callable[[float, float], bool], str], ...] = (
-            (self.minimum, operator.ge, "at least"),
-            (self.maximum, operator.le, "at most"),
-            (self.above, operator.gt, "more than"),
-        )
-        for limit, holds, word in bounds:
-            if limit is None:
-                continue
-            bound = resolve(limit, variables)
-            if not (_is_number(value) and _is_number(bound) and holds(float(value), float(bound))):
-                return f"{word} {show(bound)}"
-        return None
-
-    def _choices(self, value: Value, variables: Mapping[str, Value]) -> str | None:
-        if self.one_of:
-            allowed = [resolve(item, variables) for item in self.one_of]
-            if value not in allowed:
-                return f"one of {', '.join(show(item) for item in allowed)}"
-        if self.differs_from is not None:
-            refused = resolve(self.differs_from, variables)
-            if value == refused:
-                return f"anything but {show(refused)}"
-        return None
 
 
 def _is_number(value: Value) -> bool:
@@ -197,20 +189,13 @@ ReadConditions = Annotated[
 # --- attitudes ---
 
 
-def _four_numbers(value: Any) -> list[float]:
-    numbers = value if isinstance(value, list) else []
-    if len(numbers) != 4 or not all(type(number) in (int, float) for number in numbers):
-        raise ValueError("must be a list of 4 numbers")
-    return numbers
-
-
 class StatedAttitude(Keys):
     """An attitude as `ra_deg, dec_deg, roll_deg` or `quaternion_xyzw`, or none."""
 
     ra_deg: float | None = None
     dec_deg: float | None = None
     roll_deg: float | None = None
-    quaternion_xyzw: Annotated[list[float], PlainValidator(_four_numbers)] | None = None
+    quaternion_xyzw: Annotated[list[float], Field(min_length=4, max_length=4)] | None = None
 
     @model_validator(mode="after")
     def _is_an_attitude(self) -> Self:

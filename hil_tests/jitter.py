@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from collections import defaultdict
 from itertools import pairwise
-from math import inf
 from statistics import fmean
-from typing import Final
+from typing import Final, Self
 
 from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError, NackError, NoReplyError
@@ -20,8 +18,7 @@ from starhil.protocol.canopen import cob
 from starhil.protocol.canopen.abort import SdoAbortError
 from starhil.protocol.canopen.sdo_client import SdoTransfer, download, upload
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.messages import Reply, ReplyKind
-from starhil.protocol.transports import CanTransport, open_can
+from starhil.protocol.transports import open_can
 
 WARM_UP: Final = 3
 """Number of messages that are ignored at the start."""
@@ -37,31 +34,18 @@ PRE_OPERATIONAL: Final = 128
 SETTLE_S: Final = 0.2
 
 
-class _Arrivals:
-    """Arrival times of the frames of interest."""
+def _jitter(what: str, times: list[float]) -> Jitter:
+    """Summarise the intervals between messages.
 
-    def __init__(self, wanted: Callable[[CanFrame], bool]) -> None:
-        self._wanted = wanted
-        self.times: list[float] = []
-
-    def on_frame(self, frame: CanFrame) -> None:
-        if self._wanted(frame):
-            self.times.append(time.perf_counter())
-
-    def jitter(self, what: str, end: float = inf) -> Jitter:
-        """Summarise the intervals of the messages before `end`.
-
-        Raises BenchError if there are too few.
-        """
-        times = [moment for moment in self.times[WARM_UP:] if moment < end]
-        if len(times) < 3:
-            raise BenchError(
-                f"jitter of {what}: only {len(self.times)} messages were received; is it switched on?"
-            )
-        intervals = [later - earlier for earlier, later in pairwise(times)]
-        mean = fmean(intervals)
-        deviations = [abs(interval - mean) for interval in intervals]
-        return Jitter(what, round(1e3 * mean, 3), len(times), Spread.of(deviations))
+    Raises BenchError if there are too few.
+    """
+    counted = times[WARM_UP:]
+    if len(counted) < 3:
+        raise BenchError(f"jitter of {what}: only {len(times)} messages were received; is it switched on?")
+    intervals = [later - earlier for earlier, later in pairwise(counted)]
+    mean = fmean(intervals)
+    deviations = [abs(interval - mean) for interval in intervals]
+    return Jitter(what, round(1e3 * mean, 3), len(counted), Spread.of(deviations))
 
 
 async def unsolicited_jitter(
@@ -69,16 +53,7 @@ async def unsolicited_jitter(
 ) -> Jitter:
     """Have a device send its clock unsolicited at a rate, and measure the intervals."""
     row = icd.telemetry["unix_time"]
-    link = CanHostLink(spec, device_address=device)
-    client = AsyncObcClient(link, icd, timeout_s=ANSWER_S)
-    arrivals, on_reply = _Arrivals(lambda _frame: True), link.on_reply
-
-    def take(reply: Reply) -> None:
-        if reply.kind is ReplyKind.UNSOLICITED and reply.id == row.id:
-            arrivals.times.append(time.perf_counter())
-        on_reply(reply)
-
-    link.on_reply = take
+    client = AsyncObcClient(CanHostLink(spec, device_address=device), icd, timeout_s=ANSWER_S)
     await client.start()
     try:
         for rate, pause_s in ((rate_hz, seconds), (0.0, 0.0)):
@@ -92,22 +67,44 @@ async def unsolicited_jitter(
         raise BenchError(f"jitter: the device refuses set_unsolicited with code {error.code}") from None
     finally:
         await client.close()
-    return arrivals.jitter(f"unsolicited telemetry at {rate_hz:g} Hz")
+    arrived = client.unsolicited[row.name]
+    times = [arrived.get_nowait().received_s for _ in range(arrived.qsize())]
+    return _jitter(f"unsolicited telemetry at {rate_hz:g} Hz", times)
 
 
-class _Node:
-    """A minimal CANopen master that configures a node."""
+class _Master:
+    """A minimal CANopen master of a node, which it resets to its stored settings at the end; a context manager."""
 
-    def __init__(self, transport: CanTransport, node: int) -> None:
-        self._transport = transport
+    def __init__(self, spec: str, node: int) -> None:
+        self._transport = open_can(spec)
         self._node = node
         self._answer: asyncio.Future[bytes] | None = None
+        self._times: defaultdict[int, list[float]] = defaultdict(list)
+        """Arrival times of the frames with each 11-bit CAN ID."""
 
-    def on_frame(self, frame: CanFrame) -> None:
-        """Process a frame from the bus."""
-        awaited = frame.id == cob.SDO_TRANSMIT + self._node and not frame.extended
+    async def __aenter__(self) -> Self:
+        await self._transport.start(self._on_frame)
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        self.send(cob.NMT, bytes((RESET_COMMUNICATION, self._node)))
+        await self._transport.drain()
+        await asyncio.sleep(SETTLE_S)
+        await self._transport.close()
+
+    def _on_frame(self, frame: CanFrame) -> None:
+        if frame.extended:
+            return
+        self._times[frame.id].append(time.perf_counter())
+        awaited = frame.id == cob.SDO_TRANSMIT + self._node
         if awaited and self._answer is not None and not self._answer.done():
             self._answer.set_result(frame.data)
+
+    async def arrivals(self, can_id: int, seconds: float) -> list[float]:
+        """Return the arrival times of the frames with a CAN ID within a time."""
+        self._times.clear()
+        await asyncio.sleep(seconds)
+        return self._times.pop(can_id, [])
 
     async def write(self, index: int, subindex: int, value: int, size: int) -> None:
         """Write an entry of up to four bytes; raise BenchError if the node refuses or does not answer."""
@@ -141,6 +138,7 @@ class _Node:
         await self.write(TPDO_COMMUNICATION, 5, event_ms, 2)
         await self.write(TPDO_COMMUNICATION, 1, can_id & ~cob.INVALID, 4)
         self.send(cob.NMT, bytes((OPERATIONAL, self._node)))
+        await asyncio.sleep(SETTLE_S)
         return can_id & MAX_STANDARD_ID
 
     def send(self, can_id: int, data: bytes = b"") -> None:
@@ -148,49 +146,21 @@ class _Node:
         self._transport.send(CanFrame(can_id, data, extended=False))
 
 
-@asynccontextmanager
-async def _joined(spec: str, node: int, take: Callable[[CanFrame], None]) -> AsyncIterator[_Node]:
-    """Join the bus as master of a node; at the end, reset the node to its stored settings."""
-    transport = open_can(spec)
-    master = _Node(transport, node)
-
-    def receive(frame: CanFrame) -> None:
-        take(frame)
-        master.on_frame(frame)
-
-    await transport.start(receive)
-    try:
-        yield master
-        master.send(cob.NMT, bytes((RESET_COMMUNICATION, node)))
-        await transport.drain()
-        await asyncio.sleep(SETTLE_S)
-    finally:
-        await transport.close()
-
-
 async def heartbeat_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
     """Set the heartbeat period of a node and measure the intervals."""
-    arrivals = _Arrivals(lambda frame: frame.id == cob.ERROR_CONTROL + node and not frame.extended)
-    async with _joined(spec, node, arrivals.on_frame) as master:
+    async with _Master(spec, node) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, period_ms, 2)
-        arrivals.times.clear()
-        await asyncio.sleep(seconds)
-        end = time.perf_counter()
-    return arrivals.jitter(f"heartbeat every {period_ms} ms", end)
+        times = await master.arrivals(cob.ERROR_CONTROL + node, seconds)
+    return _jitter(f"heartbeat every {period_ms} ms", times)
 
 
 async def event_timer_jitter(spec: str, seconds: float, period_ms: int, *, node: int) -> Jitter:
     """Have a node send its first TPDO by the event timer, and measure the intervals."""
-    pdo = -1
-    arrivals = _Arrivals(lambda frame: frame.id == pdo and not frame.extended)
-    async with _joined(spec, node, arrivals.on_frame) as master:
+    async with _Master(spec, node) as master:
         await master.write(PRODUCER_HEARTBEAT, 0, 0, 2)
         pdo = await master.prepare_tpdo(EVENT_DRIVEN, period_ms)
-        await asyncio.sleep(SETTLE_S)
-        arrivals.times.clear()
-        await asyncio.sleep(seconds)
-        end = time.perf_counter()
-    return arrivals.jitter(f"TPDO by event timer every {period_ms} ms", end)
+        times = await master.arrivals(pdo, seconds)
+    return _jitter(f"TPDO by event timer every {period_ms} ms", times)
 
 
 async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) -> Jitter:
@@ -200,25 +170,15 @@ async def sync_to_pdo(spec: str, seconds: float, period_s: float, *, node: int) 
     followed by the TPDO.
     """
     delays: list[float] = []
-    sent_at: float | None = None
-    pdo = -1
-
-    def take(frame: CanFrame) -> None:
-        nonlocal sent_at
-        if sent_at is not None and frame.id == pdo and not frame.extended:
-            delays.append(time.perf_counter() - sent_at)
-            sent_at = None
-
     syncs = 0
-    async with _joined(spec, node, take) as master:
+    async with _Master(spec, node) as master:
         pdo = await master.prepare_tpdo(EVERY_SYNC, 0)
-        await asyncio.sleep(SETTLE_S)
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             sent_at = time.perf_counter()
             master.send(cob.SYNC)
             syncs += 1
-            await asyncio.sleep(period_s)
+            delays += [moment - sent_at for moment in (await master.arrivals(pdo, period_s))[:1]]
     if len(delays) < syncs:
         raise BenchError(
             f"jitter: {syncs - len(delays)} of {syncs} SYNCs were not followed by a PDO of node {node}"

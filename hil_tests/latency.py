@@ -7,49 +7,66 @@ is caused by the machine alone and serves as a reference.
 
 from __future__ import annotations
 
-import os
+import asyncio
 import random
-import select
-import socket
 import subprocess
 import sys
 import time
-import tty
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from contextlib import AsyncExitStack, closing
 from dataclasses import dataclass
 from itertools import cycle
-from typing import Final
+from math import inf
+from typing import Any, Final
 
+from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, hub_command
-from starhil.hil_tests.errors import BenchError
+from starhil.hil_tests.errors import BenchError, LinkLostError, NackError, NoReplyError
+from starhil.hil_tests.links import CanHostLink, HostLink, SerialHostLink
 from starhil.hil_tests.load_figures import Spread
-from starhil.protocol.can_framing import CanId, encode_request_frames
+from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import Reply
+from starhil.protocol.messages import Reply, Request
 from starhil.protocol.serial_stack import build_serial_stack
-from starhil.protocol.socketcand import format_send
+from starhil.protocol.transports import open_serial
 
-ROWS: Final = ("identification", "quaternion", "precise_attitude", "star_tracker", "unix_time")
+REQUESTED_ROWS: Final = (
+    "identification",
+    "quaternion",
+    "precise_attitude",
+    "star_tracker",
+    "unix_time",
+    "device_status",
+)
 """Telemetry rows of CubeStar that are requested in turn; for another unit, all rows."""
 
 PAUSE_S: Final = 0.004
-"""Mean pause between two requests, seconds."""
+"""Mean pause between two requests, seconds.
+
+The pauses are random so that requests arrive in every phase of image processing.
+"""
 
 REPLY_WITHIN_S: Final = 1.0
-HOST: Final = 1
-DEVICE: Final = 4
-"""CAN addresses of the OBC and of the device."""
 SETTLE_S: Final = 3.0
 """Time for viewers to start and connect, seconds."""
 BAUD: Final = 921_600
 """High, so that the transmission time (1 ms for the longest reply) is small compared with the latency."""
 
-ECHO: Final = (
-    "import os,sys\nf=int(sys.argv[1])\ntry:\n while d:=os.read(f,4096): os.write(f,d)\nexcept OSError: pass"
-)
+ECHO: Final = """
+import os, sys, tty
+f = os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)
+os.write(f, b"ready")
+while d := os.read(f, 4096):
+    os.write(f, d)
+"""
 """Program of the process that echoes all bytes."""
+
+PAIRS: Final = 4
+"""Number of alternations between measurements without and with viewers."""
+
+Ask = Callable[[Row], Awaitable[float]]
+"""Requests a row; returns the latency in seconds, infinite without a reply."""
 
 
 @dataclass(frozen=True)
@@ -67,14 +84,11 @@ class LatencyRow:
     lost: int
 
     @classmethod
-    def of(
-        cls, link: str, worker: str, rate_hz: float, viewers: int, taken: Sequence[float | None]
-    ) -> LatencyRow:
-        """Summarise latencies in seconds; None stands for a lost reply."""
-        found = [latency for latency in taken if latency is not None]
-        figures = Spread.of(found)
+    def of(cls, link: str, worker: str, rate_hz: float, viewers: int, taken: Sequence[float]) -> LatencyRow:
+        """Summarise latencies in seconds, infinite for a lost reply."""
+        figures, lost = Spread.of(taken), taken.count(inf)
         three = (figures.p50_ms, figures.p99_ms, figures.max_ms)
-        return cls(link, worker, rate_hz, viewers, len(found), *three, len(taken) - len(found))
+        return cls(link, worker, rate_hz, viewers, len(taken) - lost, *three, lost)
 
 
 @dataclass(frozen=True)
@@ -86,129 +100,63 @@ class ProcessRow:
     memory_mb: float
 
 
-class _Port:
-    """A serial port without a loop around it."""
-
-    def __init__(self, fd: int, icd: InterfaceDefinition) -> None:
-        self._icd = icd
-        self._stack = build_serial_stack(icd)
-        self._fd = fd
-        self._poll = select.poll()
-        self._poll.register(fd, select.POLLIN)
-
-    def close(self) -> None:
-        """Close the port."""
-        os.close(self._fd)
+async def exchange(client: AsyncObcClient, request: Request, name: str) -> tuple[float, Reply | None]:
+    """Send a request; return the latency in seconds, infinite without an answer, and the reply unless it is a refusal."""
+    try:
+        reply, latency = await client.transact(request, name)
+    except NackError:
+        return client.transactions[-1].latency_s, None
+    except (NoReplyError, LinkLostError):
+        return inf, None
+    return latency, reply
 
 
-class SerialRequester(_Port):
-    """A minimal OBC on a serial line."""
-
-    def __init__(self, path: str, icd: InterfaceDefinition) -> None:
-        super().__init__(os.open(path, os.O_RDWR | os.O_NOCTTY), icd)
-        self._host = self._stack.host()
-        tty.setraw(self._fd)
-        os.set_blocking(self._fd, False)
-
-    def ask(self, name: str) -> float | None:
-        """Request a row; return the time until the last byte of the reply in s, or None without a reply."""
-        row = self._icd.telemetry[name]
-        request = self._icd.request(row)
-        self._host.expect(request)
-        data = self._stack.encode_request(request)
-        begin = time.perf_counter()
-        os.write(self._fd, data)
-        while self._poll.poll(REPLY_WITHIN_S * 1000.0):
-            data = os.read(self._fd, 4096)
-            arrived = time.perf_counter()
-            if any(isinstance(event, Reply) for event in self._host.feed(data, arrived)):
-                return arrived - begin
-        self._host = self._stack.host()
-        return None
+async def ask_in_turn(asks: Mapping[str, Ask], rows: Iterable[Row], seconds: float) -> dict[str, list[float]]:
+    """Request rows from several peers in turn, after random pauses, for some time; return the latencies by peer."""
+    rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
+    latencies: dict[str, list[float]] = {peer: [] for peer in asks}
+    end = time.monotonic() + seconds
+    for row in cycle(rows):
+        for peer, ask in asks.items():
+            latencies[peer].append(await ask(row))
+            await asyncio.sleep(rng.expovariate(1.0 / PAUSE_S))
+        if time.monotonic() >= end:
+            break
+    return latencies
 
 
-class HubRequester:
-    """A minimal OBC on the TCP hub for CAN."""
-
-    def __init__(self, spec: str, icd: InterfaceDefinition) -> None:
-        self._icd = icd
-        host, port, bus = spec.removeprefix("socketcand:").replace("/", ":").split(":")
-        self._socket = socket.create_connection((host, int(port)), REPLY_WITHIN_S)
-        self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self._buffer = b""
-        self._receive_until(b"< hi >")
-        self._socket.sendall(f"< open {bus} >".encode())
-        self._receive_until(b"< ok >")
-        self._socket.sendall(b"< rawmode >")
-        self._receive_until(b"< ok >")
-
-    def ask(self, name: str) -> float | None:
-        """Request a row; return the time until the last frame of the reply in s, or None without a reply."""
-        row = self._icd.telemetry[name]
-        frames = 1 if row.size <= 8 else -(-row.size // 7)  # a CAN frame carries 8 bytes, a segment 7
-        begin = time.perf_counter()
-        for frame in encode_request_frames(self._icd.request(row), HOST, DEVICE):
-            self._socket.sendall(format_send(frame))
-        try:
-            while frames:
-                frames -= self._is_reply(self._receive_until(b" >"), row.id)
-        except TimeoutError:
-            return None
-        return time.perf_counter() - begin
-
-    @staticmethod
-    def _is_reply(text: bytes, row_id: int) -> bool:
-        """Return whether a line from the hub is a frame of the reply to this OBC."""
-        words = text.split()
-        if words[:2] != [b"<", b"frame"]:
-            return False
-        can_id = CanId.unpack(int(words[2], 16))
-        return (can_id.id, can_id.source, can_id.destination) == (row_id, DEVICE, HOST)
-
-    def _receive_until(self, end: bytes) -> bytes:
-        """Receive up to an end mark; return the bytes before it."""
-        while end not in self._buffer:
-            data = self._socket.recv(4096)
-            if not data:
-                raise BenchError("CAN hub: closed the connection; is the emulator still running?")
-            self._buffer += data
-        text, _, self._buffer = self._buffer.partition(end)
-        return text
-
-    def close(self) -> None:
-        """Leave the bus."""
-        self._socket.close()
-
-
-class EchoRequester(_Port):
+class Echo:
     """A process that echoes requests over a pty, for the latency of the machine."""
 
     def __init__(self, icd: InterfaceDefinition) -> None:
-        fd, other = os.openpty()
-        super().__init__(fd, icd)
-        tty.setraw(other)
-        self._process = subprocess.Popen([sys.executable, "-c", ECHO, str(other)], pass_fds=[other])  # noqa: S603
-        os.close(other)
+        self._icd = icd
+        self._stack = build_serial_stack(icd)
+        self._line = open_serial("pty", paced=False)
+        self._arrived: asyncio.Queue[float] = asyncio.Queue()
 
-    def ask(self, name: str) -> float | None:
-        """Send the bytes of a request; return the time until their echo in s, or None without an echo."""
-        request = self._stack.encode_request(self._icd.request(self._icd.telemetry[name]))
+    async def start(self) -> None:
+        """Start the process."""
+        await self._line.start(lambda _data: self._arrived.put_nowait(time.perf_counter()))
+        self._process = subprocess.Popen([sys.executable, "-c", ECHO, self._line.description])  # noqa: S603
+        await self._arrived.get()
+
+    async def ask(self, row: Row) -> float:
+        """Send the bytes of a request; return the time until their echo in s, infinite without an echo."""
+        request = self._stack.encode_request(self._icd.request(row))
+        self._arrived = asyncio.Queue()  # a late echo of the last request is discarded
         begin = time.perf_counter()
-        os.write(self._fd, request)
-        if not self._poll.poll(REPLY_WITHIN_S * 1000.0):
-            return None
-        os.read(self._fd, 4096)
-        return time.perf_counter() - begin
+        self._line.send(request)
+        try:
+            async with asyncio.timeout(REPLY_WITHIN_S):
+                return await self._arrived.get() - begin
+        except TimeoutError:
+            return inf
 
-    def close(self) -> None:
+    async def close(self) -> None:
         """End the process."""
-        super().close()
         self._process.kill()
         self._process.wait()
-
-
-PAIRS: Final = 4
-"""Number of alternations between measurements without and with viewers."""
+        await self._line.close()
 
 
 class Viewers:
@@ -223,10 +171,6 @@ class Viewers:
         for process in self._processes:
             process.kill()
             process.wait()
-
-
-Ask = Callable[[str], float | None]
-"""Requests a row by name; returns the latency in seconds, or None without a reply."""
 
 
 def measure(
@@ -244,71 +188,71 @@ def measure(
     """
     icd = load_unit(unit)
     rows: list[LatencyRow] = []
-    rng = random.Random(1)  # noqa: S311 (pauses, not secrets)
     ready_s = memory_mb = 0.0
-    turns = [0, viewers] * PAIRS if viewers else [0]
-    """Number of viewers in each turn."""
     for rate in rates_hz:
         report(f"{worker}: {rate:g} Hz")
-        with ExitStack() as stack:
-            hub_process = stack.enter_context(EmulatorProcess(hub_command()))
-            moving = [f"parameters.update_rate={rate}", "parameters.start_mode=lost_in_space"]
-            begin = time.perf_counter()
-            emulator = stack.enter_context(
-                EmulatorProcess(
-                    emulator_command(
-                        profile="demo",
-                        unit=unit,
-                        can=hub_process.ready["can"],
-                        settings=[
-                            f"run.worker={worker}",
-                            f"links.serial.baud={BAUD}",
-                            *(moving if rate > 0.0 else ["parameters.start_mode=standby"]),
-                        ],
-                        extra=["--view", "auto"] if viewers else (),
-                    )
-                )
+        moving = [f"parameters.update_rate={rate}", "parameters.start_mode=lost_in_space"]
+        with EmulatorProcess(hub_command()) as hub:
+            command = emulator_command(
+                profile="demo",
+                unit=unit,
+                can=hub.ready["can"],
+                settings=[
+                    f"run.worker={worker}",
+                    f"links.serial.baud={BAUD}",
+                    *(moving if rate > 0.0 else ["parameters.start_mode=standby"]),
+                ],
+                extra=["--view", "auto"] if viewers else (),
             )
-            ready_s = ready_s or time.perf_counter() - begin
-            links = _open_links(icd, emulator.ready, stack)
-            taken: dict[tuple[int, str], list[float | None]] = {
-                (count, link): [] for count in dict.fromkeys(turns) for link in links
-            }
-            for count in turns:
-                with closing(Viewers(emulator.ready.get("view", ""), count)):
-                    time.sleep(SETTLE_S if count else 0.0)
-                    for link, latency in _latencies(icd, links, seconds / turns.count(0), rng):
-                        taken[count, link].append(latency)
-            rows += [
-                LatencyRow.of(link, worker, rate, count, values) for (count, link), values in taken.items()
-            ]
-            memory_mb = max(memory_mb, emulator.memory_bytes() / 2**20)
+            begin = time.perf_counter()
+            with EmulatorProcess(command) as emulator:
+                ready_s = ready_s or time.perf_counter() - begin
+                taken = asyncio.run(_measure_links(icd, emulator.ready, seconds, viewers))
+                memory_mb = max(memory_mb, emulator.memory_bytes() / 2**20)
+        rows += [LatencyRow.of(link, worker, rate, count, values) for (count, link), values in taken.items()]
     return rows, ProcessRow(worker, ready_s, memory_mb)
 
 
-def _open_links(icd: InterfaceDefinition, ready: Mapping[str, str], stack: ExitStack) -> dict[str, Ask]:
+async def _measure_links(
+    icd: InterfaceDefinition, ready: Mapping[str, str], seconds: float, viewers: int
+) -> dict[tuple[int, str], list[float]]:
+    """Return the latencies by number of viewers and link."""
+    rows = [icd.telemetry[name] for name in REQUESTED_ROWS if name in icd.telemetry]
+    turns = [0, viewers] * PAIRS if viewers else [0]
+    taken: dict[tuple[int, str], list[float]] = {}
+    async with AsyncExitStack() as stack:
+        asks = await _open_links(icd, ready, stack)
+        for count in turns:
+            with closing(Viewers(ready.get("view", ""), count)):
+                await asyncio.sleep(SETTLE_S if count else 0.0)
+                latencies = await ask_in_turn(asks, rows or icd.telemetry.values(), seconds / turns.count(0))
+            for link, values in latencies.items():
+                taken.setdefault((count, link), []).extend(values)
+    return taken
+
+
+async def _open_links(
+    icd: InterfaceDefinition, ready: Mapping[str, str], stack: AsyncExitStack
+) -> dict[str, Ask]:
     """Open the links that the emulator has, and the echo process for comparison."""
     if "serial" not in ready:
         raise BenchError(f"bench latency: unit {icd.name} has no serial link to measure")
-    opened: dict[str, SerialRequester | HubRequester | EchoRequester] = {
-        "serial": SerialRequester(ready["serial"], icd)
-    }
+    asks: dict[str, Ask] = {}
+
+    async def open_link(link: HostLink[Any]) -> None:
+        client = AsyncObcClient(link, icd, timeout_s=REPLY_WITHIN_S)
+        await client.start()
+        stack.push_async_callback(client.close)
+
+        async def ask(row: Row) -> float:
+            return (await exchange(client, icd.request(row), row.name))[0]
+
+        asks[link.name] = ask
+
+    await open_link(SerialHostLink(icd, ready["serial"], baud=BAUD))
     if "can" in ready and icd.link.can is not None:
-        opened["can"] = HubRequester(ready["can"], icd)
-    opened["echo"] = EchoRequester(icd)
-    for requester in opened.values():
-        stack.callback(requester.close)
-    return {link: requester.ask for link, requester in opened.items()}
-
-
-def _latencies(
-    icd: InterfaceDefinition, links: Mapping[str, Ask], seconds: float, rng: random.Random
-) -> Iterator[tuple[str, float | None]]:
-    """Send requests on each link in turn for some time; yield link and latency."""
-    names = cycle([name for name in ROWS if name in icd.telemetry] or list(icd.telemetry))
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        name = next(names)
-        for link, ask in links.items():
-            yield link, ask(name)
-            time.sleep(rng.expovariate(1.0 / PAUSE_S))
+        await open_link(CanHostLink(ready["can"]))
+    echo = Echo(icd)
+    await echo.start()
+    stack.push_async_callback(echo.close)
+    return {**asks, "echo": echo.ask}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Final, Generic, TypeVar
 
 from starhil.hil_tests.errors import LinkLostError
@@ -37,14 +38,21 @@ class HostLink(ABC, Generic[Item]):
     name: str
     """`serial` or `can`."""
     _receiver: Receiver[Item, Reply]
-    """Decoder of the replies."""
 
-    def __init__(self, transport: Transport[Item], description: str, log: WireLog | None) -> None:
+    def __init__(
+        self,
+        transport: Transport[Item],
+        description: str,
+        log: WireLog | None,
+        make_receiver: Callable[[], Receiver[Item, Reply]],
+    ) -> None:
         self.on_reply: Callable[[Reply], None] = lambda _reply: None
         self.on_fault: Callable[[LinkFault], None] = lambda _fault: None
         self.on_raw: Callable[[bytes | CanFrame], None] | None = None
         self.description = description
         self._log = log
+        self._make_receiver: Callable[[], Receiver[Item, Reply]] = make_receiver
+        self._receiver = make_receiver()
         self._transport: Transport[Item] = transport
         self._lost: ProtocolError | None = None
         self._flusher: asyncio.Task[None] | None = None
@@ -53,9 +61,9 @@ class HostLink(ABC, Generic[Item]):
     def request(self, request: Request) -> None:
         """Send a request."""
 
-    @abstractmethod
     def reset_receiver(self) -> None:
         """Discard an incomplete reply that is no longer awaited."""
+        self._receiver = self._make_receiver()
 
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on this link; none if no reply may be awaited."""
@@ -130,10 +138,9 @@ class SerialHostLink(HostLink[bytes]):
         baud: int = DEFAULT_BAUD,
         log: WireLog | None = None,
     ) -> None:
-        super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log)
         self._stack = build_serial_stack(icd)
-        self._dialect = chosen_dialect(icd, dialect)
-        self._receiver = self._stack.host(self._dialect)
+        host = partial(self._stack.host, chosen_dialect(icd, dialect))
+        super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log, host)
 
     def request(self, request: Request) -> None:
         """Frame and send a request."""
@@ -143,10 +150,6 @@ class SerialHostLink(HostLink[bytes]):
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on the serial line."""
         return self._stack.answers(row)
-
-    def reset_receiver(self) -> None:
-        """Discard an incomplete reply."""
-        self._receiver = self._stack.host(self._dialect)
 
 
 class CanHostLink(HostLink[CanFrame]):
@@ -165,16 +168,12 @@ class CanHostLink(HostLink[CanFrame]):
         device_address: int = DEFAULT_DEVICE_ADDRESS,
         log: WireLog | None = None,
     ) -> None:
-        super().__init__(open_can(spec), f"CAN {spec}", log)
+        host = partial(CanHostReceiver, host_address, device_address)
+        super().__init__(open_can(spec), f"CAN {spec}", log, host)
         self.host_address = host_address
         self.device_address = device_address
-        self._receiver = CanHostReceiver(host_address, device_address)
 
     def request(self, request: Request) -> None:
         """Send a request as frames."""
         for frame in encode_request_frames(request, self.host_address, self.device_address):
             self.send(frame)
-
-    def reset_receiver(self) -> None:
-        """Discard the segments of an incomplete reply."""
-        self._receiver = CanHostReceiver(self.host_address, self.device_address)

@@ -25,8 +25,9 @@ class Spread:
 
     @classmethod
     def of(cls, seconds: Sequence[float]) -> Spread:
-        """Summarise durations in seconds; NaN if there are none."""
-        return cls(*(round(1e3 * percentile(seconds, part), 3) for part in (0.5, 0.99, 1.0)))
+        """Summarise the finite durations in seconds; NaN if there are none."""
+        found = list(filter(math.isfinite, seconds))
+        return cls(*(round(1e3 * percentile(found, part), 3) for part in (0.5, 0.99, 1.0)))
 
 
 @dataclass(frozen=True)

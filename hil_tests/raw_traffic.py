@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import re
 import time
-from typing import Final
+from collections.abc import Callable, Sequence
+from typing import Any, Final
 
-from starhil.hil_tests.client import ObcClient
+from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.links import CanHostLink, SerialHostLink
 from starhil.protocol.can_framing import CanFrame
@@ -58,42 +59,29 @@ def matches(expected: str, seen: str) -> bool:
     return re.fullmatch(expected.replace("..", "[0-9A-F]{2}"), seen) is not None
 
 
-def send_and_listen(
-    client: ObcClient,
-    data: tuple[str, ...],
+async def send_and_listen(
+    client: AsyncObcClient,
+    items: Sequence[bytes | CanFrame],
     listen_s: float,
     wanted: tuple[str, ...] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.
 
-    The data are in hexadecimal or in the format of `cansend`. Listens for `listen_s`, and for up to `timeout_s` (default: that of
-    the client) until as much has arrived as the patterns in `wanted` have.
+    Listens for `listen_s`, and for up to `timeout_s` (default: that of the client) until as much has arrived as the
+    patterns in `wanted` have.
     """
-    return client.run(_send_and_listen(client, data, listen_s, wanted, timeout_s))
-
-
-async def _send_and_listen(
-    client: ObcClient,
-    data: tuple[str, ...],
-    listen_s: float,
-    wanted: tuple[str, ...],
-    timeout_s: float | None,
-) -> tuple[str, ...]:
-    link = client.core.link
+    link = client.link
     if not isinstance(link, (SerialHostLink, CanHostLink)):
         raise BenchError(f"{link.description}: cannot send raw data")
+    send: Callable[[Any], None] = link.send
     size = len("".join(wanted))
-    end = time.monotonic() + (client.core.timeout_s if timeout_s is None else timeout_s)
+    end = time.monotonic() + (client.timeout_s if timeout_s is None else timeout_s)
     seen: list[bytes | CanFrame] = []
     before, link.on_raw = link.on_raw, seen.append
     try:
-        if isinstance(link, SerialHostLink):
-            for text in data:
-                link.send(bytes.fromhex(text))
-        else:
-            for text in data:
-                link.send(parse_frame(text))
+        for item in items:
+            send(item)
         await asyncio.sleep(listen_s)
         while len("".join(_format_received(link, seen))) < size and time.monotonic() < end:
             await asyncio.sleep(_POLL_S)

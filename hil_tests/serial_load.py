@@ -6,6 +6,7 @@ It talks to a device over the line only, so it can measure a real unit as well a
 from __future__ import annotations
 
 import asyncio
+import re
 import time
 from collections import deque
 from typing import Final
@@ -42,7 +43,6 @@ class _SerialPipeline:
         self._reply_arrived = asyncio.Event()
         self.exchanges = 0
         self.wrong = 0
-        self.received = 0
         self.last = b""
         """Data of the last reply."""
 
@@ -66,14 +66,9 @@ class _SerialPipeline:
 
     def take(self, data: bytes) -> None:
         """Decode message by message, because in dialect b each reply needs its request."""
-        self.received += len(data)
-        start = 0
-        while start < len(data):
-            end = data.find(b"\xff", start)
-            end = len(data) if end < 0 else end + 1
-            for event in self._receiver.feed(data[start:end], time.monotonic()):
+        for piece in re.findall(rb"[^\xff]*\xff|[^\xff]+", data):
+            for event in self._receiver.feed(piece, time.monotonic()):
                 self._check_reply(event)
-            start = end
         self._reply_arrived.set()
 
     async def drain(self, left: int) -> bool:
@@ -117,7 +112,7 @@ async def load_serial(
         answers = await pipeline.drain(PIPELINE - 1)
     answers = answers and await pipeline.drain(0)
     duration = time.monotonic() - begin
-    sent, received = transport.statistics.sent, pipeline.received
+    sent, received = transport.statistics.sent, transport.statistics.received
     flags = await _error_flags(icd, transport, pipeline) if answers else 0
     await transport.close()
     capacity = duration * baud / 10.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -12,7 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 from starhil.hil_tests.bench import Bench, LinkOptions
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointing
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointed
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError, ScriptError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.private_can_bus import private_can_bus
@@ -27,8 +28,9 @@ from starhil.hil_tests.results import (
     write_junit,
 )
 from starhil.hil_tests.run_feed import RunFeed, console_address
-from starhil.hil_tests.script import Control, Restart, Script, load_script
+from starhil.hil_tests.script import Script, load_script
 from starhil.hil_tests.session import SessionRunner
+from starhil.hil_tests.steps import Control, Listen
 from starhil.hil_tests.temporary_folder import temporary_folder
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
@@ -79,9 +81,8 @@ def run_session(request: SessionRequest) -> SessionResult:
     script = load_script(path, icd)
     if request.keep_going:
         script.defaults.keep_going = True
-    if not request.start:
-        _reject_emulator_steps(path, script)
     options = _options(request, script)
+    _check_steps(path, script, icd, options.links, start=request.start)
     folder = request.folder or DEFAULT_FOLDER / path.stem
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -89,9 +90,9 @@ def run_session(request: SessionRequest) -> SessionResult:
         raise BenchError(f"{folder}: the log folder cannot be created: {error.strerror}") from None
     if request.junit is not None:
         prepare_report(request.junit)
-    show = _printer(quiet=request.quiet)
-    if not request.quiet:
-        Console(highlight=False).print(Text(escape_controls(script.title), style="bold"))
+    console = Console(highlight=False, quiet=request.quiet)
+    console.print(Text(escape_controls(script.title), style="bold"))
+    show: Callable[[StepResult], None] = partial(_print_result, console)
     result: SessionResult | None = None
     try:
         with ExitStack() as stack:
@@ -112,18 +113,24 @@ def run_session(request: SessionRequest) -> SessionResult:
         result = replace(result, interruption=interruption)
     if request.junit is not None:
         write_junit(request.junit, script.title, junit_cases(result, path.stem), result.seconds)
-    if not request.quiet:
-        _print_summary(result, folder)
+    counts = ", ".join(f"{result.count(status)} {status}" for status in STYLES)
+    style = "green" if result.passed else "bold red"
+    console.print(Text(f"{counts} in {result.seconds:.1f} s; logs in {folder}", style=style), soft_wrap=True)
     return result
 
 
-def _reject_emulator_steps(path: Path, script: Script) -> None:
-    """Raise ScriptError if a step needs an emulator that the bench started."""
-    for step in script.steps:
-        if isinstance(step, Control | Restart):
-            action = "control" if isinstance(step, Control) else "restart"
+def _check_steps(
+    path: Path, script: Script, icd: InterfaceDefinition, links: tuple[str, ...], *, start: bool
+) -> None:
+    """Raise ScriptError if a step can never pass on these links, or needs an emulator that the bench starts."""
+    for step, link in script.planned(links):
+        why = ""
+        if step.needs_emulator and not start:
             why = "only an emulator that the bench started can do this: use --start"
-            raise ScriptError(f"{path.name}: step {step.number}: {action}: {why}")
+        elif isinstance(step, Listen) and link == "can" and icd.link.can is None:
+            why = f"unit {icd.name} has only CANopen on CAN, where no row is sent without a request; read it"
+        if why:
+            raise ScriptError(f"{path.name}: step {step.number}: {type(step).__name__.lower()}: {why}")
 
 
 def _failed(
@@ -166,7 +173,7 @@ def _shown_on_console(
         return show
     address = console_address(view, bench.emulator)
     unit = ", ".join(f"{link} {getattr(bench.options, link)}" for link in bench.links)
-    planned = len(script.steps) * (len(bench.links) if script.defaults.link == "both" else 1)
+    planned = len(script.planned(bench.links))
     feed = stack.enter_context(
         RunFeed(address, kind="session", title=script.title, unit=unit, planned=planned)
     )
@@ -221,7 +228,7 @@ def _emulator(
             can=options.can or "off",
             dialect=options.dialect,
             seed=wanted.seed,
-            settings=[*_pointed(script), *wanted.settings],
+            settings=pointed(script.truth.attitude, wanted.settings),
             state_dir=state,
             truth_log=truth_log,
             extra=extra,
@@ -237,35 +244,15 @@ def _beside(profile: str | None, script: Path) -> str | None:
     return str(path) if path.is_file() else profile
 
 
-def _pointed(script: Script) -> list[str]:
-    """Return the settings that point the emulator at the script's true attitude, unless it has settings for this."""
-    truth = script.truth.attitude
-    return [] if truth is None else pointing(truth, script.emulator.settings)
-
-
-def _printer(*, quiet: bool) -> Callable[[StepResult], None]:
-    console = Console(highlight=False)
-
-    def show(result: StepResult) -> None:
-        mark, style = STYLES[result.status]
-        line = Text(f"{mark} ", style=style)
-        line.append(f"{result.number:3d}  ", style="dim")
-        line.append(escape_controls(result.name))
-        if result.link:
-            line.append(f"  [{result.link}]", style="dim")
-        if result.latency_s is not None:
-            line.append(f"  {result.latency_s:.4f} s", style="cyan")
-        if result.detail:
-            line.append(
-                f"  {escape_controls(result.detail)}", style="red" if result.status == FAILED else "dim"
-            )
-        console.print(line, soft_wrap=True)
-
-    return (lambda _result: None) if quiet else show
-
-
-def _print_summary(result: SessionResult, folder: Path) -> None:
-    console = Console(highlight=False)
-    counts = ", ".join(f"{result.count(status)} {status}" for status in (PASSED, FAILED, SKIPPED))
-    style = "green" if result.passed else "bold red"
-    console.print(Text(f"{counts} in {result.seconds:.1f} s; logs in {folder}", style=style), soft_wrap=True)
+def _print_result(console: Console, result: StepResult) -> None:
+    mark, style = STYLES[result.status]
+    line = Text(f"{mark} ", style=style)
+    line.append(f"{result.number:3d}  ", style="dim")
+    line.append(escape_controls(result.name))
+    if result.link:
+        line.append(f"  [{result.link}]", style="dim")
+    if result.latency_s is not None:
+        line.append(f"  {result.latency_s:.4f} s", style="cyan")
+    if result.detail:
+        line.append(f"  {escape_controls(result.detail)}", style="red" if result.status == FAILED else "dim")
+    console.print(line, soft_wrap=True)

@@ -13,27 +13,28 @@ shifts take 3 µs to build and 7 µs to parse an ID, a `construct.BitStruct` 78 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Final, Generic, TypeVar
+from typing import Final, TypeVar
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import (
     BURST_ID,
     DEFAULT_MAX_SIZE,
     DEFAULT_TIMEOUT_S,
-    FIRST_TELEMETRY_ID,
     FaultKind,
     LinkFault,
+    Receiver,
     Reply,
     ReplyKind,
     Request,
     RequestKind,
-    check_receiver_limits,
     error_code,
 )
+
+Message = TypeVar("Message")
 
 MAX_STANDARD_ID: Final = 0x7FF
 MAX_EXTENDED_ID: Final = 0x1FFFFFFF
@@ -48,14 +49,14 @@ MAX_OPEN_MESSAGES: Final = 32
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """One classic CAN data or remote frame."""
+    """One classic CAN data or remote frame; frames with the same content are equal, whenever they came."""
 
     id: int
     """CAN ID, 11 or 29 bits."""
     data: bytes = b""
     extended: bool = True
     remote: bool = False
-    timestamp: float | None = None
+    timestamp: float | None = field(default=None, compare=False)
     """Time of reception, seconds since 1970, or None."""
 
     def __post_init__(self) -> None:
@@ -98,6 +99,11 @@ REQUEST_TYPES: Final = {
 }
 """Kind of request → its type in one frame and in segments."""
 
+REQUEST_KINDS: Final[Mapping[int, RequestKind]] = {
+    number: kind for kind, numbers in REQUEST_TYPES.items() for number in numbers
+}
+"""Type → kind of request."""
+
 REPLY_TYPES: Final = {
     ReplyKind.ACK: (MessageType.TELECOMMAND_ACK,),
     ReplyKind.EVENT: (MessageType.EVENT,),
@@ -114,9 +120,17 @@ Public sources confirm the types, but not the layout of unsolicited messages and
 """
 
 
+_REPLY_KINDS: Final[Mapping[int, ReplyKind]] = {
+    **{number: kind for kind in REPLY_TYPES if kind is not ReplyKind.BURST for number in REPLY_TYPES[kind]},
+    MessageType.TELECOMMAND_NACK: ReplyKind.NACK,
+    MessageType.TELEMETRY_NACK: ReplyKind.NACK,
+}
+"""Type → kind of reply; a burst has the type of telemetry."""
+
+
 def nack_type(row_id: int) -> MessageType:
     """Return the type of the refusal of a row."""
-    telemetry = row_id >= FIRST_TELEMETRY_ID
+    telemetry = RequestKind.of(row_id) is RequestKind.TELEMETRY
     return MessageType.TELEMETRY_NACK if telemetry else MessageType.TELECOMMAND_NACK
 
 
@@ -205,11 +219,22 @@ class _Assembly:
     """Whether a segment was lost: the remaining ones are skipped, without another fault."""
 
 
-class _Assembler:
-    """Joins segments by CAN ID, within limits of size, number and time."""
+class _CanReceiver(Receiver[CanFrame, Message]):
+    """Base of both ends: joins segments by CAN ID, within limits of size, number and time.
 
-    def __init__(self, max_size: int, timeout_s: float) -> None:
-        check_receiver_limits(max_size, timeout_s)
+    Only frames to `address` are interpreted and, if `sender` is set, only those from it.
+    """
+
+    def __init__(
+        self,
+        address: int,
+        sender: int | None = None,
+        *,
+        max_size: int = DEFAULT_MAX_SIZE,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        self._address = address
+        self._sender = sender
         self._max_size = max_size
         self._timeout_s = timeout_s
         self._open: dict[int, _Assembly] = {}
@@ -220,223 +245,123 @@ class _Assembler:
 
     def flush(self, now: float) -> list[LinkFault]:
         late = [key for key, message in self._open.items() if now - message.time >= self._timeout_s]
-        faults = []
-        for key in late:
-            message = self._open.pop(key)
-            faults.append(
-                LinkFault(
-                    FaultKind.CAN_INCOMPLETE,
-                    f"{key:08X}: {message.left} segments missing after {self._timeout_s:g} s of silence",
-                )
-            )
-        return faults
+        return [self._incomplete(key, self._open.pop(key)) for key in late]
 
-    def has(self, key: int) -> bool:
-        """Return whether a message with this key is incomplete."""
-        return key in self._open
+    def _incomplete(self, key: int, message: _Assembly) -> LinkFault:
+        text = f"{message.left} segments missing after {self._timeout_s:g} s of silence"
+        return LinkFault(FaultKind.CAN_INCOMPLETE, f"{key:08X}: {text}")
 
-    def drop(self, key: int) -> bool:
-        """Drop the message with this key; return whether there was one."""
-        return self._open.pop(key, None) is not None
+    def feed(self, frame: CanFrame, now: float) -> list[Message | LinkFault]:
+        events: list[Message | LinkFault] = list(self.flush(now))
+        if frame.extended and not frame.remote:
+            can_id = CanId.unpack(frame.id)
+            if can_id.destination == self._address and self._sender in (None, can_id.source):
+                events.extend(self._interpret(can_id, frame, now))
+        return events
 
-    def add(self, key: int, payload: bytes, now: float) -> Iterator[bytes | LinkFault]:
+    @abstractmethod
+    def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Message | LinkFault]:
+        """Yield the messages and faults of a frame that is addressed to this end."""
+
+    def _join(self, key: int, payload: bytes, now: float) -> Iterator[bytes | LinkFault]:
         """Add a segment; yield the fault if there is one, and the message if it is complete.
 
         A segment out of order breaks its message. Further segments are skipped up to one whose counter is 0,
         which ends the message, or at least the first segment's counter, which starts a new one.
         """
         if not payload:
-            self.drop(key)
+            self._open.pop(key, None)
             yield LinkFault(FaultKind.CAN_LENGTH, f"{key:08X}: segment without its counter")
             return
         chunk, left = payload[:-1], payload[-1]
+        whole = len(chunk) == SEGMENT_DATA
         message = self._open.get(key)
         if message is None:
-            yield from self._open_message(key, chunk, left, now)
+            if not left or not whole:
+                yield _wrong_segment(key, chunk, left, " is not the first of a message")
+                return
+            if len(self._open) >= MAX_OPEN_MESSAGES:
+                oldest = min(self._open, key=lambda other: self._open[other].time)
+                del self._open[oldest]
+                yield LinkFault(FaultKind.CAN_OVERLONG, f"{oldest:08X}: too many incomplete messages")
+            self._open[key] = _Assembly(left, left, now, bytearray(chunk))
             return
-        if message.broken or left != message.left - 1 or (left and len(chunk) != SEGMENT_DATA):
-            yield from self._out_of_order(key, message, chunk, left, now)
+        message.time = now
+        if not message.broken and (left != message.left - 1 or (left and not whole)):
+            message.broken = True
+            yield _wrong_segment(key, chunk, left, f", expected {message.left - 1}")
+        if message.broken:
+            if whole and left >= message.first:
+                self._open[key] = _Assembly(left, left, now, bytearray(chunk))
+            elif not left:
+                del self._open[key]
             return
         message.data += chunk
-        message.left, message.time = left, now
-        overlong = len(message.data) + left > self._max_size
-        message.broken = overlong
-        if overlong:
+        message.left = left
+        if len(message.data) + left > self._max_size:
+            message.broken = True
             yield LinkFault(FaultKind.CAN_OVERLONG, f"{key:08X}: message longer than {self._max_size} bytes")
         if not left:
             del self._open[key]
-            if not overlong:
+            if not message.broken:
                 yield bytes(message.data)
 
-    def _open_message(self, key: int, chunk: bytes, left: int, now: float) -> Iterator[LinkFault]:
-        if left == 0 or len(chunk) != SEGMENT_DATA:
-            yield LinkFault(
-                FaultKind.CAN_SEQUENCE,
-                f"{key:08X}: segment counter {left} with {len(chunk)} bytes is not the first of a message",
-            )
-            return
-        if len(self._open) >= MAX_OPEN_MESSAGES:
-            oldest = min(self._open, key=lambda other: self._open[other].time)
-            del self._open[oldest]
-            yield LinkFault(FaultKind.CAN_OVERLONG, f"{oldest:08X}: too many incomplete messages")
-        self._open[key] = _Assembly(left, left, now, bytearray(chunk))
 
-    def _out_of_order(
-        self, key: int, message: _Assembly, chunk: bytes, left: int, now: float
-    ) -> Iterator[LinkFault]:
-        if not message.broken:
-            text = f"{key:08X}: segment counter {left} with {len(chunk)} bytes, expected {message.left - 1}"
-            yield LinkFault(FaultKind.CAN_SEQUENCE, text)
-        message.broken = True
-        message.time = now
-        if left >= message.first and len(chunk) == SEGMENT_DATA:
-            self._open[key] = _Assembly(left, left, now, bytearray(chunk))
-        elif left == 0:
-            del self._open[key]
+def _wrong_segment(key: int, chunk: bytes, left: int, text: str) -> LinkFault:
+    return LinkFault(
+        FaultKind.CAN_SEQUENCE, f"{key:08X}: segment counter {left} with {len(chunk)} bytes{text}"
+    )
 
 
-_Event = TypeVar("_Event")
+def _with_type(number: MessageType, frame: CanFrame) -> int:
+    """Return the CAN ID of a frame with another type of message."""
+    return number << 24 | frame.id & 0xFFFFFF
 
 
-class _Receiver(ABC, Generic[_Event]):
-    """Base of both ends: CAN frames in, messages and faults out."""
-
-    def __init__(
-        self, address: int, *, max_size: int = DEFAULT_MAX_SIZE, timeout_s: float = DEFAULT_TIMEOUT_S
-    ) -> None:
-        self.address = address
-        """Address of this end; may change at any time."""
-        self._assembler = _Assembler(max_size, timeout_s)
-
-    @property
-    def busy(self) -> bool:
-        """Whether a segmented message is incomplete, so that `flush` may become due."""
-        return self._assembler.busy
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Abandon segmented messages without a new segment for the timeout."""
-        return self._assembler.flush(now)
-
-    def feed(self, frame: CanFrame, now: float) -> list[_Event | LinkFault]:
-        """Return the messages and faults that a frame completes.
-
-        `now` is its time of arrival (s, any origin).
-        """
-        events: list[_Event | LinkFault] = list(self.flush(now))
-        if frame.extended and not frame.remote:
-            can_id = CanId.unpack(frame.id)
-            if self._concerns(can_id):
-                events.extend(self._interpret(can_id, frame, now))
-        return events
-
-    def _concerns(self, can_id: CanId) -> bool:
-        return can_id.destination == self.address
-
-    @abstractmethod
-    def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[_Event | LinkFault]:
-        """Yield the messages and faults of a frame that is addressed to this end."""
-
-
-class CanDeviceReceiver(_Receiver[Request]):
-    """The device's end: CAN frames in, requests and faults out.
-
-    Frames to other addresses are ignored.
-    """
+class CanDeviceReceiver(_CanReceiver[Request]):
+    """The device's end: CAN frames in, requests and faults out."""
 
     def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Request | LinkFault]:
-        is_telemetry = can_id.id >= FIRST_TELEMETRY_ID
-        match can_id.type:
-            case MessageType.TELECOMMAND if not is_telemetry:
-                segmented = CanId(
-                    MessageType.TELECOMMAND_EXTENDED, can_id.id, can_id.source, can_id.destination
-                )
-                if self._assembler.drop(segmented.pack()):
-                    yield LinkFault(
-                        FaultKind.CAN_SEQUENCE, f"{frame.id:08X}: interrupts a segmented telecommand"
-                    )
-                yield Request(RequestKind.TELECOMMAND, can_id.id, frame.data, can_id.source)
-            case MessageType.TELEMETRY_REQUEST if is_telemetry:
-                yield Request(RequestKind.TELEMETRY, can_id.id, frame.data, can_id.source)
-            case MessageType.TELECOMMAND_EXTENDED if not is_telemetry:
-                for item in self._assembler.add(frame.id, frame.data, now):
-                    yield (
-                        item
-                        if isinstance(item, LinkFault)
-                        else Request(RequestKind.TELECOMMAND, can_id.id, item, can_id.source)
-                    )
-            case _:
-                yield LinkFault(
-                    FaultKind.CAN_TYPE,
-                    f"{frame.id:08X}: type {can_id.type} with ID {can_id.id} is not a request",
-                )
+        kind = RequestKind.of(can_id.id)
+        messages: Iterable[bytes | LinkFault] = [frame.data]
+        if REQUEST_KINDS.get(can_id.type) is not kind:
+            text = f"{frame.id:08X}: type {can_id.type} with ID {can_id.id} is not a request"
+            messages = [LinkFault(FaultKind.CAN_TYPE, text)]
+        elif can_id.type == MessageType.TELECOMMAND_EXTENDED:
+            messages = self._join(frame.id, frame.data, now)
+        elif self._open and (key := _with_type(MessageType.TELECOMMAND_EXTENDED, frame)) in self._open:
+            del self._open[key]
+            text = f"{frame.id:08X}: interrupts a segmented telecommand"
+            yield LinkFault(FaultKind.CAN_SEQUENCE, text)
+        for item in messages:
+            yield item if isinstance(item, LinkFault) else Request(kind, can_id.id, item, can_id.source)
 
 
-_SINGLE_FRAMES: Final[dict[int, ReplyKind]] = {
-    MessageType.TELECOMMAND_ACK: ReplyKind.ACK,
-    MessageType.TELECOMMAND_NACK: ReplyKind.NACK,
-    MessageType.TELEMETRY_NACK: ReplyKind.NACK,
-    MessageType.TELEMETRY: ReplyKind.TELEMETRY,
-    MessageType.EVENT: ReplyKind.EVENT,
-}
-"""Type → kind of the replies of which one frame is all."""
-
-
-class CanHostReceiver(_Receiver[Reply]):
-    """The OBC's end: CAN frames in, replies and faults out.
-
-    Frames to other addresses, requests from other masters and, if `device` is set, frames from other devices
-    are ignored.
-    """
-
-    def __init__(
-        self,
-        address: int,
-        device: int | None = None,
-        *,
-        max_size: int = DEFAULT_MAX_SIZE,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-    ) -> None:
-        super().__init__(address, max_size=max_size, timeout_s=timeout_s)
-        self._device = device
-
-    def _concerns(self, can_id: CanId) -> bool:
-        return super()._concerns(can_id) and self._device in (None, can_id.source)
+class CanHostReceiver(_CanReceiver[Reply]):
+    """The OBC's end: CAN frames in, replies and faults out; requests from other masters are ignored."""
 
     def _interpret(self, can_id: CanId, frame: CanFrame, now: float) -> Iterator[Reply | LinkFault]:
-        match can_id.type:
-            case number if number in _SINGLE_FRAMES:
-                yield self._single(can_id, frame)
-            case MessageType.TELEMETRY_EXTENDED:
-                kind = ReplyKind.BURST if can_id.id == BURST_ID else ReplyKind.TELEMETRY
-                yield from self._add_segment(kind, frame.id, can_id, frame.data, now)
-            case MessageType.UNSOLICITED_FIRST | MessageType.UNSOLICITED_BODY | MessageType.UNSOLICITED_LAST:
-                yield from self._unsolicited(can_id, frame.data, now)
-            case MessageType.TELECOMMAND | MessageType.TELEMETRY_REQUEST | MessageType.TELECOMMAND_EXTENDED:
-                return
-            case _:
-                yield LinkFault(FaultKind.CAN_TYPE, f"{frame.id:08X}: type {can_id.type} is not a reply")
-
-    @staticmethod
-    def _single(can_id: CanId, frame: CanFrame) -> Reply | LinkFault:
-        kind = _SINGLE_FRAMES[can_id.type]
-        if kind is not ReplyKind.NACK:
-            return Reply(kind, can_id.id, frame.data, source=can_id.source)
-        if not frame.data:
-            return LinkFault(FaultKind.CAN_LENGTH, f"{frame.id:08X}: NACK without a code")
-        return Reply(kind, can_id.id, code=error_code(frame.data[0]), source=can_id.source)
-
-    def _unsolicited(self, can_id: CanId, data: bytes, now: float) -> Iterator[Reply | LinkFault]:
-        key = CanId(MessageType.UNSOLICITED_FIRST, can_id.id, can_id.source, can_id.destination).pack()
-        first = can_id.type == MessageType.UNSOLICITED_FIRST
-        if first and self._assembler.drop(key):
-            yield LinkFault(FaultKind.CAN_INCOMPLETE, f"{key:08X}: interrupted by the start of another")
-        if can_id.type == MessageType.UNSOLICITED_LAST and not self._assembler.has(key):
-            yield Reply(ReplyKind.UNSOLICITED, can_id.id, data, source=can_id.source)
-            return
-        yield from self._add_segment(ReplyKind.UNSOLICITED, key, can_id, data, now)
-
-    def _add_segment(
-        self, kind: ReplyKind, key: int, can_id: CanId, data: bytes, now: float
-    ) -> Iterator[Reply | LinkFault]:
-        for item in self._assembler.add(key, data, now):
-            yield item if isinstance(item, LinkFault) else Reply(kind, can_id.id, item, source=can_id.source)
+        number, kind = can_id.type, _REPLY_KINDS.get(can_id.type)
+        messages: Iterable[bytes | LinkFault] = [frame.data]
+        if kind is None:
+            text = f"{frame.id:08X}: type {number} is not a reply"
+            messages = [] if number in REQUEST_KINDS else [LinkFault(FaultKind.CAN_TYPE, text)]
+        elif kind is ReplyKind.NACK and not frame.data:
+            messages = [LinkFault(FaultKind.CAN_LENGTH, f"{frame.id:08X}: NACK without a code")]
+        elif number == MessageType.TELEMETRY_EXTENDED:
+            messages = self._join(frame.id, frame.data, now)
+            kind = ReplyKind.BURST if can_id.id == BURST_ID else kind
+        elif kind is ReplyKind.UNSOLICITED:
+            key = _with_type(MessageType.UNSOLICITED_FIRST, frame)
+            if number == MessageType.UNSOLICITED_FIRST and key in self._open:
+                del self._open[key]
+                yield LinkFault(FaultKind.CAN_INCOMPLETE, f"{key:08X}: interrupted by the start of another")
+            if number != MessageType.UNSOLICITED_LAST or key in self._open:
+                messages = self._join(key, frame.data, now)
+        for item in messages:
+            if isinstance(item, LinkFault):
+                yield item
+            elif kind is ReplyKind.NACK:
+                yield Reply(kind, can_id.id, code=error_code(item[0]), source=can_id.source)
+            elif kind is not None:
+                yield Reply(kind, can_id.id, item, source=can_id.source)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
 from typing import Final, TypeVar
@@ -33,7 +33,7 @@ class UnknownNameError(ProtocolError, KeyError):
 class Names(dict[str, _Item]):
     """Items by name; a missing name raises UnknownNameError with suggestions, or with all names if they are few."""
 
-    def __init__(self, what: str, items: Iterable[tuple[str, _Item]], *, few: bool = False) -> None:
+    def __init__(self, what: str, items: Iterable[tuple[str, _Item]] = (), *, few: bool = False) -> None:
         super().__init__(items)
         self._what = what
         self._few = few
@@ -52,12 +52,12 @@ class InterfaceDefinition:
     name: str
     version: str
     doc: str
-    telecommands: Names[Row]
-    telemetry: Names[Row]
-    enums: Names[EnumDefinition]
-    parameters: Names[Parameter]
+    telecommands: Names[Row] = field(default_factory=partial(Names, "telecommand"))
+    telemetry: Names[Row] = field(default_factory=partial(Names, "telemetry row"))
+    enums: Names[EnumDefinition] = field(default_factory=partial(Names, "enumeration"))
+    parameters: Names[Parameter] = field(default_factory=partial(Names, "parameter"))
     """The parameters that the unit exposes."""
-    device_parameters: Names[Parameter]
+    device_parameters: Names[Parameter] = field(default_factory=partial(Names, "parameter"))
     """All parameters of the device; those that the unit exposes have the unit's limits and defaults."""
     sections: tuple[Section, ...] = ()
     """Documentation that accompanies the rows, such as conventions."""
@@ -72,7 +72,7 @@ class InterfaceDefinition:
     first_telemetry_id: int | None = None
     """IDs from this one on are telemetry, even if there is no such row."""
     plugin: Plugin = field(default_factory=Plugin)
-    files: Mapping[str, Path] = field(default_factory=dict)
+    files: dict[str, Path] = field(default_factory=dict)
     """Name of a row → the file that defines it."""
 
     @property

@@ -111,11 +111,7 @@ def device_model() -> DeviceModel:
     enums = {item.name: item for item in file.enum}
     return DeviceModel(
         parameters={
-            item.name: Parameter.limited(
-                dict(item),
-                enums[item.enumeration] if item.enumeration else None,
-                f"{MODEL_FILE}: {item.name}",
-            )
+            item.name: Parameter.limited(dict(item), enums[item.enumeration] if item.enumeration else None)
             for item in file.parameter
         },
         quantities={item.name: item for item in file.quantity},

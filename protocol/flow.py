@@ -76,12 +76,11 @@ class ConnectionLimit:
 class TurnProtocol(asyncio.BufferedProtocol):
     """A connection that reads at most `TURN` bytes before the loop serves other connections."""
 
-    def __init__(self) -> None:
-        self._buffer = bytearray(TURN)
+    _buffer: bytearray
 
-    def get_buffer(self, sizehint: int) -> bytearray:
+    def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 (asyncio's signature)
         """Return the buffer for the next bytes."""
-        _ = sizehint
+        self._buffer = bytearray(TURN)
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:

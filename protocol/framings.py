@@ -8,6 +8,7 @@ deframer is sans-I/O: it is fed bytes with their time of arrival and returns fau
 from __future__ import annotations
 
 import binascii
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +26,7 @@ from starhil.protocol.link_schema import (
     LengthFraming,
     SlipFraming,
 )
-from starhil.protocol.messages import FaultKind, LinkFault, check_receiver_limits
+from starhil.protocol.messages import FaultKind, LinkFault, Receiver
 from starhil.protocol.plugin import guarded
 from starhil.protocol.values import IcdError
 
@@ -56,60 +57,73 @@ class Receiving(Generic[_Message]):
     """Silence within a message after which it is abandoned."""
 
 
-class Deframer(ABC, Generic[_Message]):
+class Deframer(Receiver[bytes, _Message]):
     """Finds bodies in a stream of bytes; each run of junk yields one fault."""
-
-    @property
-    @abstractmethod
-    def busy(self) -> bool:
-        """Whether a message is incomplete."""
-
-    @abstractmethod
-    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
-
-    @abstractmethod
-    def flush(self, now: float) -> list[LinkFault]:
-        """Abandon an incomplete message after a silence of the timeout."""
 
 
 class _Collector(Deframer[_Message]):
-    """Base of the deframers that collect bytes until a message is complete."""
+    """Base of the deframers: collects bytes in a buffer, and removes junk and messages from its front.
+
+    A run of junk is reported once, with its first byte. It lasts up to a message or a silence of the timeout.
+    """
 
     def __init__(self, receiving: Receiving[_Message]) -> None:
-        check_receiver_limits(receiving.max_size, receiving.timeout_s)
-        self._interpret = receiving.interpret
-        self._measure = receiving.measure
-        self._max_size = receiving.max_size
-        self._timeout_s = receiving.timeout_s
+        self._receiving = receiving
         self._last_time = float("-inf")
         self._events: list[_Message | LinkFault] = []
+        self._buffer = bytearray()
+        self._reported = 0
+        """Number of bytes at the front of the buffer that a fault has already reported."""
+        self._in_junk = False
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._buffer)
 
     def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
         self._events = list(self.flush(now))
         if data:
             self._last_time = now
-            self._consume(data)
+            self._buffer += data
+            while self._buffer and self._take():
+                pass
         return self._events
 
     def flush(self, now: float) -> list[LinkFault]:
-        if now - self._last_time < self._timeout_s:
+        if now - self._last_time < self._receiving.timeout_s:
             return []
-        fault = self._abandon()
+        fault = self._incomplete() if self._buffer else None
+        self._buffer.clear()
+        self._reported = 0
+        self._in_junk = False
         return [] if fault is None else [fault]
 
-    def _incomplete(self, size: int) -> LinkFault:
-        """Return the fault of an incomplete message with this number of bytes."""
-        text = f"message of {size} bytes without end after {self._timeout_s:g} s of silence"
+    @abstractmethod
+    def _take(self) -> bool:
+        """Remove junk or a message from the front of the buffer; return whether to continue."""
+
+    @abstractmethod
+    def _incomplete(self) -> LinkFault | None:
+        """Return the fault of the bytes in the buffer after a silence, unless it has been reported."""
+
+    def _without_end(self, size: int) -> LinkFault:
+        text = f"message of {size} bytes without end after {self._receiving.timeout_s:g} s of silence"
         return LinkFault(FaultKind.UART_INCOMPLETE, text)
 
-    @abstractmethod
-    def _consume(self, data: bytes) -> None:
-        """Process bytes and add the messages and faults that they complete."""
+    def _find_start(self, start: re.Pattern[bytes]) -> bool:
+        """Drop junk before the next start; return whether that is complete: see `_start_pattern`."""
+        found = start.search(self._buffer)
+        size = len(self._buffer) if found is None else found.start()
+        if size:
+            if size > self._reported and not self._in_junk:
+                self._fault(FaultKind.UART_PROTOCOL, f"byte {self._buffer[0]:02X} outside a message")
+            self._in_junk = True
+            self._drop(size)
+        return found is not None and found.lastindex == 1
 
-    @abstractmethod
-    def _abandon(self) -> LinkFault | None:
-        """Drop the buffer; return the fault of an incomplete message that has not been reported."""
+    def _drop(self, size: int) -> None:
+        del self._buffer[:size]
+        self._reported -= size
 
     def _add(self, result: _Message | LinkFault | None) -> None:
         if result is not None:
@@ -119,7 +133,18 @@ class _Collector(Deframer[_Message]):
         self._events.append(LinkFault(kind, text))
 
     def _overlong(self) -> LinkFault:
-        return LinkFault(FaultKind.UART_OVERLONG, f"message longer than {self._max_size} bytes")
+        return LinkFault(FaultKind.UART_OVERLONG, f"message longer than {self._receiving.max_size} bytes")
+
+
+def _start_pattern(mark: bytes, last: bytes) -> re.Pattern[bytes]:
+    """Return the pattern of a start, or of its beginning at the end of the data.
+
+    A start is `mark` and what the pattern `last` matches. Only a complete start has group 1.
+    """
+    pattern = b"(%b)" % last
+    for byte in reversed(mark):
+        pattern = b"%b(?:%b|\\Z)" % (re.escape(bytes((byte,))), pattern)
+    return re.compile(pattern)
 
 
 class Framing(ABC):
@@ -188,46 +213,43 @@ class Slip(Framing):
 
 
 class _DelimitedDeframer(_Collector[_Message]):
-    """Divides the stream at each end; text longer than `limit` is reported once and skipped up to the next end."""
+    """Divides the stream at each end; text longer than `limit` is junk up to the next end."""
 
     def __init__(self, receiving: Receiving[_Message], framing: Slip | Delimited, limit: int) -> None:
         super().__init__(receiving)
         self._framing = framing
         self._limit = limit
-        self._text = b""
-        self._skipping = False
 
     @property
     def busy(self) -> bool:
-        return bool(self._text) or self._skipping
+        return bool(self._buffer) or self._in_junk
 
-    def _consume(self, data: bytes) -> None:
+    def _take(self) -> bool:
         end = self._framing.end
-        *whole, self._text = (self._text + data).split(end)
-        for text in whole:
-            if len(text) > self._limit and not self._skipping:
-                self._add(self._overlong())
-            elif not self._skipping:
-                self._deliver(text)
-            self._skipping = False
-        if len(self._text) > self._limit:
-            if not self._skipping:
-                self._add(self._overlong())
-            self._skipping = True
-            self._text = self._text[len(self._text) - len(end) + 1 :]
-
-    def _deliver(self, text: bytes) -> None:
-        for body in self._framing.bodies(text):
+        found = self._buffer.find(end)
+        size = len(self._buffer) if found < 0 else found
+        if size > self._limit and not self._in_junk:
+            self._add(self._overlong())
+            self._in_junk = True
+        if found < 0:
+            self._drop(size - len(end) + 1 if size > self._limit else 0)
+            return False
+        text = bytes(self._buffer[:size])
+        self._drop(size + len(end))
+        for body in () if self._in_junk else self._framing.bodies(text):
             if isinstance(body, LinkFault):
                 self._add(body)
             else:
-                self._add(self._overlong() if len(body) > self._max_size else self._interpret(body))
+                self._add(
+                    self._overlong()
+                    if len(body) > self._receiving.max_size
+                    else self._receiving.interpret(body)
+                )
+        self._in_junk = False
+        return True
 
-    def _abandon(self) -> LinkFault | None:
-        size = 0 if self._skipping else len(self._text)
-        self._text = b""
-        self._skipping = False
-        return self._incomplete(size) if size else None
+    def _incomplete(self) -> LinkFault | None:
+        return None if self._in_junk else self._without_end(len(self._buffer))
 
 
 class Escaped(Framing):
@@ -255,120 +277,81 @@ class Escaped(Framing):
         self.escape = bytes((model.escape,))
         self.start = self.escape if starts else bytes((model.escape, model.start))
         self.end = bytes((model.escape, model.end))
-        self.starts = starts
+        self.doubled = self.escape * 2
+        self.starts = bytes(starts) or self.start[1:]
         self.first_is_id = first_is_id
 
     def encode(self, body: bytes) -> bytes:
         """Return start, the body with its escape bytes doubled, and end."""
-        return self.start + body.replace(self.escape, self.escape * 2) + self.end
+        return self.start + body.replace(self.escape, self.doubled) + self.end
 
     def deframer(self, receiving: Receiving[_Message]) -> Deframer[_Message]:
         """Return a deframer that ignores bytes between messages."""
-        return EscapedDeframer(receiving, self)
+        return _EscapedDeframer(receiving, self)
 
 
-class EscapedDeframer(_Collector[_Message]):
-    """Finds bodies between starts and ends; each run of junk yields one fault.
+class _EscapedDeframer(_Collector[_Message]):
+    """Finds bodies between starts and ends.
 
-    A run of junk ends at the next start of a message or after a silence of the timeout.
+    An escape byte alone is kept until the next byte, and no message: `busy` is False.
     """
 
     def __init__(self, receiving: Receiving[_Message], framing: Escaped) -> None:
         super().__init__(receiving)
-        self._several = bool(framing.starts)
-        self._starts = framing.starts or frozenset(framing.start[1:])
-        self._escape = framing.escape
-        self._end = framing.end[1]
-        self._first_is_id = framing.first_is_id
-        self._in_message = False
-        self._escaped = False
-        """Whether the last byte was an escape byte."""
-        self._start = 0
-        self._body = bytearray()
-        self._in_junk = False
+        self._framing = framing
+        escape, doubled = re.escape(framing.escape), re.escape(framing.doubled)
+        self._start = _start_pattern(framing.escape, b"[%b]" % re.escape(framing.starts))
+        single = b"(?:%b[^%b])?" % (escape, re.escape(framing.starts + framing.end))
+        text = b"[^%b]*(?:%b[^%b]*)*" % (escape, doubled, escape)
+        self._text = re.compile(single + text if framing.first_is_id else text)
+        """Bytes of a message up to an escape byte that is not doubled."""
 
     @property
     def busy(self) -> bool:
-        """Whether a message is incomplete."""
-        return self._in_message
+        return len(self._buffer) > 1
 
-    def _consume(self, data: bytes) -> None:
-        position, size = 0, len(data)
-        while position < size:
-            if self._escaped:
-                self._escaped = False
-                self._after_escape(data[position])
-                position += 1
-                continue
-            found = data.find(self._escape, position)
-            end = size if found < 0 else found
-            if end > position:
-                self._add_plain_bytes(data[position:end])
-            self._escaped = found >= 0
-            position = end + 1
+    def _read_text(self) -> tuple[bytes, int]:
+        """Return the body as far as it has arrived, and its size on the line."""
+        found = self._text.match(self._buffer, 2)
+        text = b"" if found is None else found[0]
+        return text.replace(self._framing.doubled, self._framing.escape), len(text)
 
-    def _abandon(self) -> LinkFault | None:
-        in_message, size = self._in_message, len(self._body)
-        lone_escape = self._escaped and not in_message and not self._in_junk
-        self._reset(in_junk=False)
-        if lone_escape:
-            return LinkFault(
-                FaultKind.UART_PROTOCOL, f"escape byte {self._escape.hex().upper()} outside a message"
-            )
-        return self._incomplete(size) if in_message else None
-
-    def _add_plain_bytes(self, run: bytes) -> None:
-        """Add bytes that are neither escape bytes nor escaped."""
-        if self._in_message:
-            self._body += run
-            if len(self._body) > self._max_size:
-                self._drop_message(self._overlong())
-        else:
-            self._report_junk(run[0])
-
-    def _after_escape(self, byte: int) -> None:
-        if byte in self._starts:
-            if self._in_message:
-                text = f"message of {len(self._body)} bytes interrupted by the start of another"
-                self._fault(FaultKind.UART_INCOMPLETE, text)
-            self._reset(in_junk=False)
-            self._in_message = True
-            self._start = byte
-        elif not self._in_message:
-            self._report_junk(self._escape[0])
-            self._escaped = byte == self._escape[0]
-        elif byte == self._end:
-            body = bytes(self._body)
-            self._reset(in_junk=False)
-            self._deliver(body)
-        elif byte == self._escape[0]:
-            self._add_plain_bytes(self._escape)
-        elif self._first_is_id and not self._body:
-            self._add_plain_bytes(self._escape + bytes((byte,)))
-        else:
-            text = f"byte {byte:02X} after an escape byte within a message"
-            self._drop_message(LinkFault(FaultKind.UART_PROTOCOL, text))
-
-    def _deliver(self, body: bytes) -> None:
-        if not body:
+    def _take(self) -> bool:
+        if not self._find_start(self._start):
+            return False
+        self._in_junk = False
+        framing = self._framing
+        body, size = self._read_text()
+        start, after = self._buffer[1:2], self._buffer[size + 3 : size + 4]
+        if len(body) > self._receiving.max_size:
+            beginning = body[: self._receiving.max_size + 1].replace(framing.escape, framing.doubled)
+            self._drop(2 + min(size, len(beginning)))
+            self._add(self._overlong())
+            self._in_junk = True
+        elif not after:
+            return False
+        elif after in framing.starts:
+            self._drop(size + 2)
+            text = f"message of {len(body)} bytes interrupted by the start of another"
+            self._fault(FaultKind.UART_INCOMPLETE, text)
+        elif after != framing.end[1:]:
+            self._drop(size + 4)
+            text = f"byte {after.hex().upper()} after an escape byte within a message"
+            self._fault(FaultKind.UART_PROTOCOL, text)
+            self._in_junk = True
+        elif not body:
+            self._drop(size + 4)
             self._fault(FaultKind.UART_PROTOCOL, "message without an ID")
         else:
-            self._add(self._interpret(bytes((self._start,)) + body if self._several else body))
+            self._drop(size + 4)
+            self._add(self._receiving.interpret(bytes(start) + body if len(framing.start) == 1 else body))
+        return True
 
-    def _reset(self, *, in_junk: bool) -> None:
-        self._in_message = self._escaped = False
-        self._in_junk = in_junk
-        self._body.clear()
-
-    def _drop_message(self, fault: LinkFault) -> None:
-        """Drop the message; its remaining bytes belong to the same run of junk."""
-        self._add(fault)
-        self._reset(in_junk=True)
-
-    def _report_junk(self, byte: int) -> None:
-        if not self._in_junk:
-            self._fault(FaultKind.UART_PROTOCOL, f"byte {byte:02X} outside a message")
-        self._in_junk = True
+    def _incomplete(self) -> LinkFault | None:
+        if self.busy:
+            return self._without_end(len(self._read_text()[0]))
+        text = f"escape byte {self._framing.escape.hex().upper()} outside a message"
+        return None if self._in_junk else LinkFault(FaultKind.UART_PROTOCOL, text)
 
 
 class Stuffing:
@@ -442,62 +425,37 @@ class Counted(Framing):
 class _CountedDeframer(_Collector[_Message]):
     def __init__(self, receiving: Receiving[_Message], framing: Counted) -> None:
         super().__init__(receiving)
-        self._start, self._end, self._stuffing = framing.start, framing.end, framing.stuffing
-        self._buffer = bytearray()
-        self._reported = 0
-        """Number of bytes at the beginning of the buffer that a fault has already reported."""
-        self._in_junk = False
+        self._framing = framing
+        self._start = _start_pattern(framing.start[:-1], re.escape(framing.start[-1:]))
 
     @property
     def busy(self) -> bool:
-        return bool(self._buffer) or (self._in_junk and not self._start)
+        return bool(self._buffer) or (self._in_junk and not self._framing.start)
 
-    def _consume(self, data: bytes) -> None:
-        if self._in_junk and not self._start:
-            return
-        self._buffer += data
-        while self._buffer and self._at_start() and self._read_message():
-            pass
-
-    def _at_start(self) -> bool:
-        """Drop junk before the next start; return whether a complete start was found."""
-        head = len(self._start)
-        if not head:
-            return True
-        found = self._buffer.find(self._start)
-        self._drop_junk(self._partial_start() if found < 0 else found)
-        return found >= 0
-
-    def _partial_start(self) -> int:
-        """Return the position of a start that may be incomplete."""
-        for size in range(min(len(self._start) - 1, len(self._buffer)), 0, -1):
-            if self._buffer.endswith(self._start[:size]):
-                return len(self._buffer) - size
-        return len(self._buffer)
-
-    def _read_message(self) -> bool:
-        """Take the message at the start of the buffer; return whether to continue."""
-        head = len(self._start)
-        body, ends = self._stuffing.decode(bytes(self._buffer[head:]))
+    def _take(self) -> bool:
+        head, end = len(self._framing.start), self._framing.end
+        if self._in_junk and not head:
+            self._buffer.clear()
+        if not self._buffer or not self._find_start(self._start):
+            return False
+        body, ends = self._framing.stuffing.decode(bytes(self._buffer[head:]))
         try:
-            size = self._measure(body)
+            size = self._receiving.measure(body)
         except BodySizeError as error:
             return self._reject(LinkFault(FaultKind.UART_PROTOCOL, str(error)), head)
-        if size is None:
-            return len(body) > self._max_size and self._reject(self._overlong(), head)
-        if size > self._max_size:
+        if (len(body) if size is None else size) > self._receiving.max_size:
             return self._reject(self._overlong(), head)
-        if len(body) < size:
+        if size is None or len(body) < size:
             return False
-        end = head + (ends[size - 1] if size else 0)
-        whole = end + len(self._end)
+        last = head + (ends[size - 1] if size else 0)
+        whole = last + len(end)
         if len(self._buffer) < whole:
             return False
-        if self._buffer[end:whole] != self._end:
-            found = bytes(self._buffer[end:whole]).hex(" ").upper()
-            text = f"{found} instead of the end of a message"
+        found = bytes(self._buffer[last:whole])
+        if found != end:
+            text = f"{found.hex(' ').upper()} instead of the end of a message"
             return self._reject(LinkFault(FaultKind.UART_PROTOCOL, text), whole)
-        result = self._interpret(body[:size])
+        result = self._receiving.interpret(body[:size])
         if isinstance(result, LinkFault):
             return self._reject(result, whole)
         self._drop(whole)
@@ -511,25 +469,11 @@ class _CountedDeframer(_Collector[_Message]):
             self._add(fault)
             self._reported = extent
         self._in_junk = True
-        self._drop(1 if self._start else len(self._buffer))
+        self._drop(1 if self._framing.start else len(self._buffer))
         return True
 
-    def _drop_junk(self, size: int) -> None:
-        if size > max(self._reported, 0) and not self._in_junk:
-            self._fault(FaultKind.UART_PROTOCOL, f"byte {self._buffer[0]:02X} outside a message")
-        self._in_junk = self._in_junk or size > 0
-        self._drop(size)
-
-    def _drop(self, size: int) -> None:
-        del self._buffer[:size]
-        self._reported -= size
-
-    def _abandon(self) -> LinkFault | None:
-        size, reported = len(self._buffer), self._reported
-        self._buffer.clear()
-        self._reported = 0
-        self._in_junk = False
-        return self._incomplete(size) if size and reported <= 0 else None
+    def _incomplete(self) -> LinkFault | None:
+        return None if self._reported > 0 else self._without_end(len(self._buffer))
 
 
 class Delimited(Framing):
@@ -574,33 +518,6 @@ class Delimited(Framing):
         """Return a deframer for the text before each end."""
         longest = 2 * receiving.max_size if self._hex else receiving.max_size
         return _DelimitedDeframer(receiving, self, longest + len(self.start))
-
-
-class FirstByteDeframer(Deframer[_Message]):
-    """Gives each message to the deframer of the start byte with which it begins; None: of all other bytes."""
-
-    def __init__(self, deframers: Mapping[int | None, Deframer[_Message]]) -> None:
-        self._deframers = deframers
-        self._other = deframers.get(None) or next(iter(deframers.values()))
-        self._current = self._other
-
-    @property
-    def busy(self) -> bool:
-        """Whether a message is incomplete."""
-        return self._current.busy
-
-    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
-        """Return the messages and faults that these bytes complete."""
-        events: list[_Message | LinkFault] = list(self.flush(now))
-        for byte in data:
-            if not self._current.busy:
-                self._current = self._deframers.get(byte, self._other)
-            events += self._current.feed(bytes((byte,)), now)
-        return events
-
-    def flush(self, now: float) -> list[LinkFault]:
-        """Abandon an incomplete message after a silence of the timeout."""
-        return self._current.flush(now)
 
 
 class _PluginFraming(Framing):

@@ -30,7 +30,7 @@ from starhil.protocol.flow import (
     detect_lost_peer,
     limit_buffers,
 )
-from starhil.protocol.socketcand import CommandError, CommandSplitter, format_frame, parse_send
+from starhil.protocol.socketcand import CommandSplitter, format_frame, parse_send
 
 _LOGGER: Final = logging.getLogger("starhil.hub")
 
@@ -52,16 +52,11 @@ python-can's client rejects the answer to `< rawmode >` if a frame follows it in
 the client sends shows that it has read the answer, and ends the wait.
 """
 
-FLUSH_LOG_S: Final = 0.5
-"""Longest time that a logged frame stays in the buffer."""
-
 
 @dataclass(slots=True)
 class HubStatistics:
     """Counters since the start."""
 
-    clients: int = 0
-    """Clients connected now."""
     frames: int = 0
     """Frames received from clients."""
     delivered: int = 0
@@ -75,11 +70,11 @@ class HubStatistics:
 class _Client(TurnProtocol):
     """One connection."""
 
+    _transport: asyncio.Transport
+
     def __init__(self, hub: CanHub) -> None:
-        super().__init__()
         self._hub = hub
         self._splitter = CommandSplitter()
-        self._transport: asyncio.Transport | None = None
         self._waiting = FairQueue(BACKLOG_LIMIT)
         self._full = False
         self._settle: asyncio.TimerHandle | None = None
@@ -88,22 +83,20 @@ class _Client(TurnProtocol):
         self.remote = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if not self._hub.limit.admits(transport, self._hub.statistics.clients):
+        if not self._hub.limit.admits(transport, len(self._hub.clients)):
             return
         self._transport = cast("asyncio.Transport", transport)
         detect_lost_peer(transport)
         limit_buffers(transport)
         self._transport.set_write_buffer_limits(high=WINDOW)
         self._transport.write(b"< hi >")
-        self._hub.join(self)
+        self._hub.clients.append(self)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 (asyncio's signature)
-        if self._transport is None:  # rejected
-            return
-        self._transport = None
         if self._settle is not None:
             self._settle.cancel()
-        self._hub.leave(self)
+        if self in self._hub.clients:  # not rejected
+            self._hub.clients.remove(self)
 
     def pause_writing(self) -> None:
         self._full = True
@@ -114,13 +107,11 @@ class _Client(TurnProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Execute the received commands."""
-        if self._settle is not None:
-            self._end_settling()
+        self._end_settling()
         frames: list[CanFrame] = []
         for command in self._splitter.feed(data):
-            if command is not None and command.startswith(b"send "):
+            if self.bus is not None and command is not None and command.startswith(b"send "):
                 try:
-                    self._require_bus()
                     frames.append(parse_send(command))
                 except ProtocolError as error:
                     self._answer_error(str(error))
@@ -134,13 +125,10 @@ class _Client(TurnProtocol):
 
     def close(self) -> None:
         """Drop the connection and its queue."""
-        if self._transport is not None:
-            self._transport.abort()
+        self._transport.abort()
 
     def deliver(self, sender: _Client, lines: list[bytes]) -> int:
         """Send frames of another client as soon as there is room; return how many were dropped."""
-        if self._transport is None:
-            return len(lines)
         if self._waiting.size or self._full or self._settle is not None:
             return self._waiting.put(sender, lines)
         self._transport.write(b"".join(lines))
@@ -149,25 +137,19 @@ class _Client(TurnProtocol):
     @property
     def backlog(self) -> int:
         """Number of bytes that wait for this client."""
-        return self._waiting.size + (
-            self._transport.get_write_buffer_size() if self._transport is not None else 0
-        )
+        return self._waiting.size + self._transport.get_write_buffer_size()
 
     def _write_waiting(self) -> None:
-        while self._waiting.size and not self._full and self._transport is not None:
+        while self._waiting.size and not self._full:
             self._transport.write(b"".join(self._waiting.take(WINDOW)))
 
     def _answer(self, text: str) -> None:
-        if self._transport is not None and self.backlog <= BACKLOG_LIMIT:
+        if self.backlog <= BACKLOG_LIMIT:
             self._transport.write(f"< {text} >".encode())
 
     def _answer_error(self, text: str) -> None:
         self._hub.statistics.errors += 1
         self._answer(f"error {text}")
-
-    def _require_bus(self) -> None:
-        if self.bus is None:
-            raise CommandError("no bus is open; send open NAME first")
 
     def _execute(self, command: bytes | None) -> None:
         match command.split() if command is not None else []:
@@ -176,9 +158,9 @@ class _Client(TurnProtocol):
                 self._answer("ok")
             case [b"rawmode"] if self.bus is not None:
                 self._answer("ok")
-                if not self.raw:
-                    self.raw = True
-                    self._withhold_frames()
+                if not (self.raw or self.remote):
+                    self._settle = asyncio.get_running_loop().call_later(SETTLE_S, self._end_settling)
+                self.raw = True
             case [b"remote"] if self.bus is not None:
                 self.remote = True
                 self._answer("ok")
@@ -186,22 +168,18 @@ class _Client(TurnProtocol):
                 self._answer("echo")
             case [b"open", _]:
                 self._answer_error("a bus is open already")
-            case [b"rawmode"] | [b"remote"]:
+            case [b"rawmode"] | [b"remote"] | [b"send", *_]:
                 self._answer_error("no bus is open; send open NAME first")
             case []:
                 self._answer_error("malformed command")
             case _:
                 self._answer_error("unknown command")
 
-    def _withhold_frames(self) -> None:
-        if not self.remote:
-            self._settle = asyncio.get_running_loop().call_later(SETTLE_S, self._end_settling)
-
     def _end_settling(self) -> None:
         if self._settle is not None:
             self._settle.cancel()
             self._settle = None
-        self._write_waiting()
+            self._write_waiting()
 
 
 class CanHub:
@@ -227,8 +205,8 @@ class CanHub:
         self._log: TextIO | None = None
         self._now = now
         self._server: asyncio.Server | None = None
-        self._clients: list[_Client] = []
-        self._flusher: asyncio.TimerHandle | None = None
+        self.clients: Final[list[_Client]] = []
+        """Clients connected now."""
 
     async def start(self) -> None:
         """Listen. Raises ProtocolError if the address or the log is not available."""
@@ -245,39 +223,25 @@ class CanHub:
         self.port = self._server.sockets[0].getsockname()[1]
         if self._log_path is not None:
             try:
-                self._log = self._log_path.open("w", encoding="ascii")
+                self._log = self._log_path.open(
+                    "w", encoding="ascii", buffering=1
+                )  # a batch is written at once
             except OSError as error:
                 await self.close()
                 raise ProtocolError(f"CAN hub: cannot write {self._log_path}: {error.strerror}") from None
-            self._flush_log()
 
     async def close(self) -> None:
         """Stop listening and drop all clients."""
-        if self._flusher is not None:
-            self._flusher.cancel()
         if self._server is not None:
             self._server.close()
             self._server = None
-        for client in tuple(self._clients):
+        for client in tuple(self.clients):
             client.close()
-        while self._clients:
+        while self.clients:
             await asyncio.sleep(0)
         if self._log is not None:
-            try:
-                self._log.close()
-            except OSError as error:
-                self._abandon_log(error)
+            self._log.close()
             self._log = None
-
-    def join(self, client: _Client) -> None:
-        """Add a client."""
-        self._clients.append(client)
-        self.statistics.clients += 1
-
-    def leave(self, client: _Client) -> None:
-        """Remove a client."""
-        self._clients.remove(client)
-        self.statistics.clients -= 1
 
     def distribute(self, sender: _Client, frames: list[CanFrame]) -> None:
         """Deliver frames to every other client of the sender's bus."""
@@ -287,7 +251,7 @@ class CanHub:
         self.statistics.frames += len(lines)
         all_lines = [line for line, _ in lines]
         data_lines = [line for line, remote in lines if not remote]
-        for client in self._clients:
+        for client in self.clients:
             if client is sender or not client.raw or client.bus != sender.bus:
                 continue
             wanted = all_lines if client.remote else data_lines
@@ -296,26 +260,13 @@ class CanHub:
             self.statistics.dropped += dropped
         if self._log is not None:
             bus = sender.bus or DEFAULT_BUS
+            text = "".join(format_candump(replace(frame, timestamp=seconds), bus) + "\n" for frame in frames)
             try:
-                for frame in frames:
-                    self._log.write(format_candump(replace(frame, timestamp=seconds), bus) + "\n")
+                self._log.write(text)
             except OSError as error:
-                self._abandon_log(error)
-
-    def _flush_log(self) -> None:
-        if self._log is None:
-            return
-        try:
-            self._log.flush()
-        except OSError as error:
-            self._abandon_log(error)
-        else:
-            self._flusher = asyncio.get_running_loop().call_later(FLUSH_LOG_S, self._flush_log)
-
-    def _abandon_log(self, error: OSError) -> None:
-        """Report once that the CAN log ends here; the bus continues without it."""
-        log, self._log = self._log, None
-        _LOGGER.warning("CAN hub: log %s ends here: %s; the bus continues", self._log_path, reason(error))
-        if log is not None:
-            with contextlib.suppress(OSError):  # its buffer cannot be written either
-                log.close()
+                _LOGGER.warning(
+                    "CAN hub: log %s ends here: %s; the bus continues", self._log_path, reason(error)
+                )
+                with contextlib.suppress(OSError):  # its buffer cannot be written either
+                    self._log.close()
+                self._log = None

@@ -9,7 +9,9 @@ error names file, table and key, and what to write instead.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -19,15 +21,10 @@ from pydantic import ValidationError
 from starhil.protocol import icd_schema as schema
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Conventions
-from starhil.protocol.definition import (
-    OTHER_ERROR,
-    InterfaceDefinition,
-    Names,
-)
-from starhil.protocol.device_model import DeviceModel, device_model
+from starhil.protocol.definition import OTHER_ERROR, InterfaceDefinition, Names
 from starhil.protocol.errors import escape_controls
 from starhil.protocol.icd_bindings import check_row
-from starhil.protocol.icd_layout import NUMBER, Layout
+from starhil.protocol.icd_layout import NUMBER, Layout, enum_of
 from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageClass
 from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
@@ -36,16 +33,9 @@ from starhil.protocol.serial_stack import build_serial_stack
 from starhil.protocol.text_messages import words
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
-from starhil.protocol.values import (
-    EnumDefinition,
-    FieldError,
-    IcdError,
-    MissingNameError,
-    Parameter,
-    Section,
-)
+from starhil.protocol.values import FieldError, IcdError, Located, MissingNameError, Parameter, Section
 
-_Table = TypeVar("_Table")
+_Item = TypeVar("_Item")
 
 SETS: Final = "set_"
 """Prefix of the names of telecommands that can be read back."""
@@ -54,8 +44,10 @@ HIGHEST_ID: Final = 0xFF
 
 CLASS: Final = "class"
 """Table of the classes; among the broken names if a class is missing."""
-UNKNOWN_UNIT: Final = {"name": "", "version": "", "doc": "", "provenance": "ours"}
-"""Stands for a table [unit] with errors."""
+UNIT: Final = "unit"
+"""Table of the unit; among the broken names if it has errors."""
+UNKNOWN_UNIT: Final = schema.UnitModel(name="", version="", doc="", provenance="ours")
+"""Stands for a missing table [unit], or one with errors."""
 
 
 def load_unit(name_or_folder: str | Path = DEFAULT_UNIT) -> InterfaceDefinition:
@@ -80,11 +72,13 @@ def _load(path: Path) -> InterfaceDefinition:
 
 
 def read_definition(path: Path, *, run_plugin: bool = True) -> tuple[InterfaceDefinition, list[str]]:
-    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each."""
-    files = sorted(path.glob("*.toml")) if path.is_dir() else [path]
-    reader = _Reader(path, run_plugin=run_plugin)
-    for file in files:
-        reader.read(file)
+    """Read a folder of TOML files, or one file; return what is valid of the definition, and all errors, one line each.
+
+    Files `*_cases.toml` in a folder are conformance cases, and no part of the definition.
+    """
+    found = sorted(path.glob("*.toml")) if path.is_dir() else [path]
+    files = [file for file in found if file is path or not file.stem.endswith("_cases")]
+    reader = _Reader(path, files, run_plugin=run_plugin)
     definition = reader.definition()
     errors = reader.errors if files else [f"{path}: no .toml file in this folder"]
     # an error may quote any text of the definition
@@ -117,36 +111,43 @@ def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
 class _Reader:
     """Validates the files of a definition, and puts their tables together."""
 
-    def __init__(self, path: Path, *, run_plugin: bool) -> None:
+    def __init__(self, path: Path, files: list[Path], *, run_plugin: bool) -> None:
         self.errors: list[str] = []
         self._path = path
-        self._run_plugin = run_plugin
-        self._files: list[tuple[Path, schema.FileModel]] = []
+        self._tables: dict[str, list[tuple[Path, Any]]] = {name: [] for name in schema.FileModel.model_fields}
+        """The valid tables of all files, each with its file."""
         self._unread = False
         """Whether a file could not be read, so that names may be missing because of that."""
         self._broken: set[str] = set()
         """Names of tables with errors, which are missing, or lack a field."""
-        self._model: DeviceModel = device_model()
-        self._used_enums: dict[str, EnumDefinition] = {}
-        """Enumerations of the device model that the unit uses."""
-        self._unit = schema.UnitModel.model_validate(UNKNOWN_UNIT)
-        self._enums: dict[str, EnumDefinition] = {}
-        self._classes: dict[str, MessageClass] = {}
-        self._parameters: dict[str, Parameter] = {}
-        self._device_parameters: dict[str, Parameter] = {}
-        self._link = LinkModel()
-        self._plugin = Plugin()
-        self._rows: dict[str, Row] = {}
-        self._row_files: dict[str, Path] = {}
-        self._ids: dict[tuple[int | None, int], str] = {}
-        """Code of the class and ID → name of the row."""
         self._removed: list[tuple[Path, RequestKind, Any]] = []
         """Rows that are not valid, with their files."""
-        self.byte_order = Conventions().byte_order
+        self._rows: dict[str, Row] = {}
+        self._ids: dict[tuple[int | None, int], str] = {}
+        """Code of the class and ID → name of the row."""
+        for file in files:
+            self._read(file)
+        self._unit = self._read_unit()
+        self._classes: dict[str, MessageClass] = {}
+        for file, item in self._tables["classes"]:
+            with self._recording(f"{file}: class {item.name}", CLASS, item.name):
+                self._add_class(item)
+        self._icd = InterfaceDefinition(
+            name=self._unit.name,
+            version=self._unit.version,
+            doc=self._unit.doc,
+            first_telemetry_id=self._unit.first_telemetry_id,
+            conventions=self._single("conventions", Conventions()),
+            errors=self._single("errors", {}),
+            link=self._single("link", LinkModel()),
+            canopen=self._single("canopen", None),
+            classes=tuple(self._classes.values()),
+            plugin=self._read_plugin(run_plugin=run_plugin),
+        )
 
     # --- files ---
 
-    def read(self, file: Path) -> None:
+    def _read(self, file: Path) -> None:
         """Read and validate one file."""
         try:
             document = tomllib.loads(read_user_text(file))
@@ -161,7 +162,8 @@ class _Reader:
         said = False
         while True:
             try:
-                self._files.append((file, schema.FileModel.model_validate(document)))
+                tables = schema.FileModel.model_validate(document)
+                break
             except ValidationError as error:
                 found = list(problems(error, schema.FileModel, document))
                 if not said:  # later ones may be caused by what was removed
@@ -169,365 +171,177 @@ class _Reader:
                 said = True
                 for place in sorted({_place(problem) for problem in found}, key=_order, reverse=True):
                     self._remove(file, document, place)
-            else:
-                return
+        for name, given in tables:
+            listed = given if isinstance(given, list) else [] if given is None else [given]
+            self._tables[name] += [(file, table) for table in listed]
 
     def _remove(self, file: Path, document: Any, place: tuple[int | str, ...]) -> None:
         """Remove what is invalid from a document, and record the names that are missing because of that."""
         *path, last = place
         named = [name for name in (_name_at(document, place[:2]),) if name is not None]
         self._broken |= {*named, *(name.removeprefix(SETS) for name in named)}
-        if place[0] == CLASS:
-            self._broken.add(CLASS)
-        if place == ("unit",):
-            document["unit"] = UNKNOWN_UNIT
-            self._plugin = Plugin(skipped="")
-            return
+        if place[0] == CLASS or place == (UNIT,):
+            self._broken.add(str(place[0]))
         if len(place) == 2 and place[0] in tuple(RequestKind):
             self._removed.append((file, RequestKind(place[0]), document[place[0]][last]))
         for step in path:
             document = document[step]
         del document[last]
 
-    def _single(self, name: str, default: _Table) -> tuple[Path, _Table]:
-        """Return a table that occurs once, and its file."""
-        found = [(file, table) for file, model in self._files if (table := getattr(model, name)) is not None]
-        self.errors += [f"{file}: a second [{name}]; keep one of them" for file, _ in found[1:]]
-        return found[0] if found else (self._path, default)
+    def _single(self, name: str, default: _Item) -> _Item:
+        """Return a table that occurs once."""
+        tables = self._tables[name]
+        self.errors += [f"{file}: a second [{name}]; keep one of them" for file, _ in tables[1:]]
+        return tables[0][1] if tables else default
 
-    def _every(self, name: str) -> Iterator[tuple[Path, Any]]:
-        """Yield the tables of a kind that occurs many times, and their files."""
-        for file, model in self._files:
-            for table in getattr(model, name):
-                yield file, table
+    def _file_of(self, name: str) -> Path:
+        """Return the file of a table that occurs once."""
+        return self._tables[name][0][0] if self._tables[name] else self._path
 
-    def _attempt(self, step: Callable[..., None], *arguments: object) -> bool:
-        """Run one step and record its error; return whether there was none."""
+    @contextmanager
+    def _recording(self, where: str, *names: str) -> Iterator[None]:
+        """Record the error of a step, except for a name that is missing because of another error.
+
+        `names` are missing, or lack a field, if the step fails.
+        """
         try:
-            step(*arguments)
+            with Located(where):
+                yield
         except IcdError as error:
-            self._record(error)
-            return False
-        return True
-
-    def _record(self, error: IcdError) -> None:
-        """Record an error, except for a name that is missing because of another error."""
-        caused = isinstance(error, MissingNameError) and (self._unread or error.name in self._broken)
-        if not caused:
-            self.errors += error.args
+            caused = isinstance(error, MissingNameError) and (self._unread or error.name in self._broken)
+            self.errors += () if caused else error.args
+            self._broken |= {*names}
 
     # --- the definition ---
 
+    def _read_unit(self) -> schema.UnitModel:
+        unit = self._single(UNIT, UNKNOWN_UNIT)
+        if unit is UNKNOWN_UNIT and not self._unread and UNIT not in self._broken:
+            self.errors.append(f"{self._path}: no [unit] with name, version and doc")
+        return unit
+
+    def _read_plugin(self, *, run_plugin: bool) -> Plugin:
+        if self._unit is UNKNOWN_UNIT:
+            return Plugin(skipped="")
+        name, file = self._unit.plugin, self._file_of(UNIT)
+        if name is not None and run_plugin:
+            with self._recording(str(file)):
+                return load_plugin(file.parent, name)
+        return Plugin(skipped=name)  # also if it fails: its names are unknown, not wrong
+
     def definition(self) -> InterfaceDefinition:
         """Return what is valid of the definition."""
-        conventions = self._single("conventions", Conventions())[1]
-        errors_file, errors = self._single("errors", dict[str, int]())
-        link_file, self._link = self._single("link", LinkModel())
-        for file, item in self._every("classes"):
-            if not self._attempt(self._add_class, file, item):
-                self._broken |= {CLASS, item.name}
-        for file, item in self._every("enum"):
-            self._attempt(self._add, self._enums, item.name, item, f"{file}: enum {item.name}")
+        icd = self._icd
+        for file, item in self._tables["enum"]:
+            with self._recording(f"{file}: enum {item.name}"):
+                _add(icd.enums, item.name, item)
         sections: dict[str, Section] = {}
-        for file, item in self._every("section"):
-            self._attempt(self._add, sections, item.heading, item, f"{file}: section {item.heading}")
-        self._attempt(self._set_unit)
-        self.byte_order = conventions.byte_order
-        self._add_parameters()
-        telecommands = self._build_rows(RequestKind.TELECOMMAND)
-        telemetry = self._build_rows(RequestKind.TELEMETRY)
+        for file, item in self._tables["section"]:
+            with self._recording(f"{file}: section {item.heading}"):
+                _add(sections, item.heading, item)
+        for name, item in icd.model.parameters.items():
+            own = None if item.enum is None else icd.enums.get(item.enum.name)
+            icd.device_parameters[name] = item if own is None else Parameter.limited(dict(item), own)
+        for file, item in self._tables["parameter"]:
+            with self._recording(f"{file}: parameter {item.name}"):
+                self._add_parameter(item)
+        for kind in RequestKind:
+            self._add_rows(kind)
         self._check_removed()
         for row in self._rows.values():
-            self._attempt(self._check_answers, row)
-        self._attempt(self._check_errors, errors_file, errors, conventions)
-        definition = InterfaceDefinition(
-            name=self._unit.name,
-            version=self._unit.version,
-            doc=self._unit.doc,
-            telecommands=Names("telecommand", ((row.name, row) for row in telecommands)),
-            telemetry=Names("telemetry row", ((row.name, row) for row in telemetry)),
-            enums=Names(
-                "enumeration",
-                {
-                    **{name: enum for name, enum in self._model.enums.items() if name in self._used_enums},
-                    **self._enums,
-                }.items(),
-            ),
-            parameters=Names("parameter", self._parameters.items()),
-            device_parameters=Names("parameter", {**self._device_parameters, **self._parameters}.items()),
-            sections=tuple(sections.values()),
-            canopen=self._single("canopen", None)[1],
-            link=self._link,
-            conventions=conventions,
-            classes=tuple(self._classes.values()),
-            errors=errors,
-            first_telemetry_id=self._unit.first_telemetry_id,
-            plugin=self._plugin,
-            files=self._row_files,
-        )
-        self._attempt(self._check_link, link_file, definition)
-        return definition
+            with self._recording(f"{icd.files[row.name]}: {row.kind} {row.name}"):
+                self._check_answers(row)
+        with self._recording(str(self._file_of("errors"))):
+            _check_errors(icd.errors, icd.conventions)
+        used = {id(field.enum) for row in self._rows.values() for field in row.fields}
+        used |= {id(parameter.enum) for parameter in icd.parameters.values()}
+        enums = {name: enum for name, enum in icd.model.enums.items() if id(enum) in used} | icd.enums
+        icd = replace(icd, enums=Names("enumeration", enums.items()), sections=tuple(sections.values()))
+        with self._recording(str(self._file_of("link"))):
+            _check_link(icd)
+        return icd
 
-    def _set_unit(self) -> None:
-        file, unit = self._single("unit", None)
-        if unit is None:
-            if not self._unread:
-                self.errors.append(f"{self._path}: no [unit] with name, version and doc")
-            self._plugin = Plugin(skipped="")
-            return
-        self._unit = unit
-        if self._unit.plugin is None:
-            return
-        self._plugin = Plugin(skipped=self._unit.plugin)  # also if it fails: its names are unknown, not wrong
-        if self._run_plugin:
-            try:
-                self._plugin = load_plugin(file.parent, self._unit.plugin)
-            except IcdError as error:
-                raise IcdError(f"{file}: {error}") from error
-
-    @staticmethod
-    def _add(table: dict[str, _Table], name: str, item: _Table, where: str) -> None:
-        if name in table:
-            raise IcdError(f"{where}: defined twice")
-        table[name] = item
-
-    def _add_class(self, file: Path, item: MessageClass) -> None:
-        where = f"{file}: class {item.name}"
+    def _add_class(self, item: MessageClass) -> None:
         same = next((other.name for other in self._classes.values() if other.code == item.code), None)
         if item.name not in self._classes and item.code is not None and same is not None:
-            raise IcdError(f"{where}: code {item.code} is already used by {same}")
-        self._add(self._classes, item.name, item, where)
+            raise IcdError(f"code {item.code} is already used by {same}")
+        _add(self._classes, item.name, item)
 
-    @staticmethod
-    def _check_errors(file: Path, errors: Mapping[str, int], conventions: Conventions) -> None:
-        known = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
-        for name in errors:
-            if name not in known:
-                raise IcdError(
-                    f"{file}: errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
-                )
-        if "crc" in errors and not conventions.telecommand_crc:
-            raise IcdError(
-                f"{file}: errors.crc: never sent, because a message with a wrong checksum is not answered; remove it"
-            )
-
-    def _check_link(self, file: Path, definition: InterfaceDefinition) -> None:
-        """Check that the parts of the links are compatible with each other and with the rows."""
-        serial, can = self._link.serial, self._link.can
-        for row in definition.rows:
-            if "echo" in row.answers:
-                where = f"{self._path}: {row.kind} {row.name}: answer 'echo'"
-                if serial is not None and isinstance(serial.framing, CubeSpaceFraming):
-                    raise IcdError(f"{where}: link.serial with framing cubespace has no echoes")
-                if can is not None:
-                    raise IcdError(f"{where}: link.can has no echoes")
-                if serial is not None and (serial.format or serial.acknowledge or serial.refusal):
-                    raise IcdError(
-                        f"{where}: link.serial with `format`, `acknowledge` or `refusal` has no echoes"
-                    )
-            if row.request and serial is None:
-                raise IcdError(
-                    f"{self._path}: {row.kind} {row.name}: `request` is a text on link.serial, which the unit does not have"
-                )
-        if serial is None or definition.link_is_unknown:
-            return
-        if isinstance(serial.framing, CubeSpaceFraming):
-            for name in serial.framing.unanswered:
-                if name not in definition.telecommands:
-                    raise MissingNameError(
-                        f"{file}: link.serial.framing.unanswered: no telecommand named {name!r}"
-                        f"{did_you_mean(name, definition.telecommands)}",
-                        name,
-                    )
-        try:
-            stack = build_serial_stack(definition)
-        except IcdError as error:
-            raise IcdError(f"{file}: {error}") from None
-        for row in definition.rows:
-            text_form = stack.request_formats.of(row.klass) in stack.text_formats
-            check_text_requests(row, definition, f"{file}: {row.kind} {row.name}", needed=text_form)
-
-    def enum_of(self, name: str | None, where: str) -> EnumDefinition:
-        """Return an enumeration of the unit or, if it has none of this name, of the device model."""
-        if name is None:
-            raise IcdError(f"{where}: type enum needs `enum`, the name of an enumeration")
-        if name in self._enums:
-            return self._enums[name]
-        if name in self._model.enums:
-            return self._used_enums.setdefault(name, self._model.enums[name])
-        known = sorted({*self._enums, *self._model.enums})
-        raise MissingNameError(
-            f"{where}: no enumeration named {name!r}{did_you_mean(name, known)} (known: {', '.join(known)})",
-            name,
-        )
-
-    # --- parameters ---
-
-    def _add_parameters(self) -> None:
-        for name, item in self._model.parameters.items():
-            own = None if item.enum is None else self._enums.get(item.enum.name)
-            where = f"device model: parameter {name}"
-            self._device_parameters[name] = item if own is None else Parameter.limited(dict(item), own, where)
-        for file, model in self._every("parameter"):
-            self._attempt(self._add_parameter, model, f"{file}: parameter {model.name}")
-
-    def _add_parameter(self, model: schema.ParameterModel, where: str) -> None:
-        if model.name in self._parameters:
-            raise IcdError(f"{where}: defined twice")
-        same_id = next((other.name for other in self._parameters.values() if other.id == model.id), None)
-        if same_id is not None:
-            raise IcdError(f"{where}: ID {model.id} is already used by {same_id}")
-        base = self._model.parameters.get(model.name)
-        if base is None:
-            hint = did_you_mean(model.name, self._model.parameters)
-            raise IcdError(f"{where}: the device has no parameter with this name{hint}")
+    def _add_parameter(self, model: schema.ParameterModel) -> None:
+        known, device = self._icd.parameters, self._icd.model.parameters
+        same_id = next((other.name for other in known.values() if other.id == model.id), None)
+        if same_id is not None and model.name not in known:
+            raise IcdError(f"ID {model.id} is already used by {same_id}")
+        if model.name not in device:
+            raise IcdError(f"the device has no parameter with this name{did_you_mean(model.name, device)}")
+        base = device[model.name]
         if model.unit not in (None, base.unit):
-            raise IcdError(f"{where}: unit {model.unit!r}, but in the device it is {base.unit!r}")
+            raise IcdError(f"unit {model.unit!r}, but in the device it is {base.unit!r}")
         keys = {**dict(base), **{key: value for key, value in model if value is not None}}
         named = model.enumeration or (None if base.enum is None else base.enum.name)
-        enum = self.enum_of(named, where) if keys["type"] == "enum8" else None
-        parameter = Parameter.limited(keys, enum, where, model.id)
+        enum = enum_of(named, self._icd) if keys["type"] == "enum8" else None
+        parameter = Parameter.limited(keys, enum, model.id)
         try:
             default = parameter.check(parameter.default)
         except FieldError as error:
-            raise IcdError(f"{where}: default: {error}") from None
-        self._parameters[model.name] = parameter.model_copy(update={"default": default})
-
-    def check_parameter(self, name: str | None, unit: str, where: str) -> str | None:
-        """Check that the parameter of a field exists and has the unit of the field."""
-        if name is None:
-            return None
-        if name not in self._device_parameters:
-            raise IcdError(
-                f"{where}: no parameter named {name!r}{did_you_mean(name, self._device_parameters)}"
-            )
-        if self._device_parameters[name].unit != unit:
-            raise IcdError(
-                f"{where}: unit {unit!r}, but parameter {name} is in {self._device_parameters[name].unit!r}; they must agree"
-            )
-        return name
+            raise IcdError(f"default: {error}") from None
+        parameter = parameter.model_copy(update={"default": default})
+        _add(known, model.name, parameter)
+        self._icd.device_parameters[model.name] = parameter
 
     # --- rows ---
 
-    def _build_rows(self, kind: RequestKind) -> list[Row]:
-        """Return the rows of a kind, those that include others last."""
-        models: list[tuple[Path, schema.RowModel]] = []
-        for file, tables in self._files:
-            models += [(file, item) for item in getattr(tables, kind)]
-            if kind == "telemetry":
-                commands = [item for item in tables.telecommand if item.readback is not None]
-                models += [(file, _readback(item)) for item in commands]
-        done: list[Row] = []
-        for file, model in sorted(models, key=lambda item: bool(item[1].include)):
-            self._attempt(self._add_rows, kind, file, model, done)
-        return done
+    def _add_rows(self, kind: RequestKind) -> None:
+        """Add the rows of a kind, those that include others last."""
+        models: list[tuple[Path, schema.RowModel]] = list(self._tables[kind])
+        if kind == "telemetry":
+            commands = [
+                (file, item) for file, item in self._tables["telecommand"] if item.readback is not None
+            ]
+            models += [(file, _readback(item)) for file, item in commands]
+        for file, model in sorted(models, key=lambda item: (bool(item[1].include), item[0])):
+            with self._recording(f"{file}: {kind} {model.name}", model.name):
+                self._expand_row(kind, file, model)
 
-    def _add_rows(self, kind: RequestKind, file: Path, model: schema.RowModel, done: list[Row]) -> None:
-        try:
-            built = list(self._expand_row(kind, f"{file}: {kind} {model.name}", model))
-        except IcdError:
-            self._broken.add(model.name)
-            raise
-        for row in built:
-            where = f"{file}: {kind} {row.name}"
-            whole = model.name not in self._broken
-            self.errors += check_row(row, self._model, self._plugin, where, complete=whole)
-            if self._attempt(self._check_unique, row, where):
-                self._rows[row.name] = row
-                self._row_files[row.name] = file
-                done.append(row)
-
-    def _class_of(self, kind: RequestKind, model: schema.RowModel, where: str) -> str:
-        """Return the class of a row; record an error and return none if it is wrong."""
-        of_kind = [item.name for item in self._classes.values() if item.kind is kind]
-        if model.klass is None:
-            if (len(of_kind) > 1 or (self._classes and not of_kind)) and CLASS not in self._broken:
-                self._record(
-                    IcdError(f"{where}: needs `class`, one of {', '.join(of_kind or self._classes)}")
-                )
-            return of_kind[0] if of_kind else ""
-        found = self._classes.get(model.klass)
-        if found is None:
-            text = f"{where}: no class named {model.klass!r}{did_you_mean(model.klass, self._classes)}"
-            self._record(MissingNameError(text, model.klass))
-            return ""
-        if found.kind is not kind:
-            self._record(IcdError(f"{where}: class {model.klass} is for {found.kind}, not for {kind}"))
-        return model.klass
-
-    def _check_unique(self, row: Row, where: str) -> None:
-        first = self._unit.first_telemetry_id
-        if first is not None and (row.id >= first) != (row.kind == "telemetry"):
-            side = f"{first} and up" if row.kind == "telemetry" else f"below {first}"
-            raise IcdError(f"{where}: ID {row.id} is not a {row.kind} ID ({side})")
-        highest = self._highest_id
-        if row.id > highest:
-            raise IcdError(f"{where}: ID {row.id} is above {highest}")
-        if row.name in self._rows:
-            raise IcdError(f"{where}: name used twice")
-        code = self._classes[row.klass].code if row.klass else None
-        if self._ids.setdefault((code, row.id), row.name) != row.name:
-            raise IcdError(f"{where}: ID {row.id} is already used by {self._ids[code, row.id]}")
-
-    def _check_removed(self) -> None:
-        """Report the IDs of rows that are not valid, if other rows have them."""
-        for file, kind, table in self._removed:
-            if not isinstance(table, dict) or not isinstance(table.get("id"), int):
-                continue
-            name, row_id = table.get("name"), table["id"]
-            of_kind = [item.name for item in self._classes.values() if item.kind is kind]
-            klass = self._classes.get(str(table.get("class", of_kind[0] if len(of_kind) == 1 else "")))
-            if self._classes and klass is None:
-                continue
-            used = self._ids.get((None if klass is None else klass.code, row_id), name)
-            if used != name:
-                self.errors.append(f"{file}: {kind} {name}: ID {row_id} is already used by {used}")
-
-    @property
-    def _highest_id(self) -> int:
-        """Highest ID that the link can carry."""
-        header = [] if self._link.serial is None else self._link.serial.request_header
-        widths = [bit.width for item in header for bit in item.bits if bit.role == "id"]
-        widths += [int(item.type[1:]) for item in header if item.role == "id"]
-        return (1 << widths[0]) - 1 if widths else HIGHEST_ID
-
-    def _expand_row(self, kind: RequestKind, where: str, model: schema.RowModel) -> Iterator[Row]:
+    def _expand_row(self, kind: RequestKind, file: Path, model: schema.RowModel) -> None:
+        where = f"{file}: {kind} {model.name}"
         provenance = model.provenance or self._unit.provenance
         if provenance is None:
-            raise IcdError(f"{where}: needs `provenance`, here or in [unit]")
+            raise IcdError("needs `provenance`, here or in [unit]")
         last = model.id if model.last_id is None else model.last_id
         if last < model.id:
-            raise IcdError(f"{where}: last_id {last} is below ID {model.id}")
+            raise IcdError(f"last_id {last} is below ID {model.id}")
         if kind == "telecommand" and model.unsolicited is not None:
-            raise IcdError(f"{where}: only telemetry is sent unsolicited")
+            raise IcdError("only telemetry is sent unsolicited")
         if kind == "telemetry" and model.readback is not None:
-            raise IcdError(f"{where}: only telecommands have a readback")
+            raise IcdError("only telecommands have a readback")
         if model.readback is not None and not model.name.startswith(SETS):
-            raise IcdError(f"{where}: the name of a telecommand with a readback must begin with {SETS}")
-        klass = self._class_of(kind, model, where)
+            raise IcdError(f"the name of a telecommand with a readback must begin with {SETS}")
+        of_kind = [item.name for item in self._classes.values() if item.kind is kind]
+        klass = model.klass or next(iter(of_kind), "")
+        with self._recording(where):
+            self._check_class(kind, model, of_kind)
         answers = model.answer
-        if answers is None and klass:
+        if klass not in self._classes:
+            klass = ""
+        elif answers is None:
             answers = self._classes[klass].answer
         for number, row_id in enumerate(range(model.id, last + 1), 1):
             single = model.last_id is None
-            layout = Layout(self, where, kind, provenance, None if single else number)
+            layout = Layout(self._icd, kind, provenance, None if single else number)
             for name in model.include or ():
-                if name not in self._rows:
-                    self._broken.add(model.name)
-                    hint = did_you_mean(name, self._rows)
-                    raise MissingNameError(f"{where}: include: no row named {name!r}{hint}", name)
-                layout.include(self._rows[name])
+                with Located("include"):
+                    included = _find("row", name, self._rows)
+                layout.include(included)
                 if name in self._broken:
                     self._broken.add(model.name)
             for item in model.fields:
-                if not self._attempt(layout.add, item):
-                    self._broken.add(model.name)
-            if model.size is not None and layout.size != model.size and model.name not in self._broken:
-                self._broken.add(model.name)  # its ID and bindings can still be checked
-                self._record(
-                    IcdError(f"{where}: size is {model.size} but the fields add up to {layout.size} bytes")
-                )
-            yield Row.model_construct(
+                with self._recording(where, model.name):
+                    layout.add(item)
+            if model.size not in (None, layout.size) and model.name not in self._broken:
+                with self._recording(where, model.name):  # its ID and bindings can still be checked
+                    raise IcdError(f"size is {model.size} but the fields add up to {layout.size} bytes")
+            row = Row.model_construct(
                 kind=kind,
                 id=row_id,
                 name=model.name if single else f"{model.name}_{number}",
@@ -547,31 +361,140 @@ class _Reader:
                 zeros=model.unbound is not None,
                 request=model.request or "",
             )
+            self._add_row(row, file, complete=model.name not in self._broken)
+
+    def _add_row(self, row: Row, file: Path, *, complete: bool) -> None:
+        where = f"{file}: {row.kind} {row.name}"
+        self.errors += [f"{where}: {text}" for text in check_row(row, self._icd, complete=complete)]
+        with self._recording(where):
+            self._check_id(row)
+            self._rows[row.name] = row
+            self._icd.files[row.name] = file
+            rows = self._icd.telecommands if row.kind == "telecommand" else self._icd.telemetry
+            rows[row.name] = row
+
+    def _check_class(self, kind: RequestKind, model: schema.RowModel, of_kind: list[str]) -> None:
+        """Raise IcdError if a row lacks its class, or names a wrong one."""
+        if model.klass is not None:
+            found = _find("class", model.klass, self._classes)
+            if found.kind is not kind:
+                raise IcdError(f"class {model.klass} is for {found.kind}, not for {kind}")
+        elif (len(of_kind) > 1 or (self._classes and not of_kind)) and CLASS not in self._broken:
+            raise IcdError(f"needs `class`, one of {', '.join(of_kind or self._classes)}")
+
+    def _check_id(self, row: Row) -> None:
+        first = self._unit.first_telemetry_id
+        if first is not None and (row.id >= first) != (row.kind == "telemetry"):
+            side = f"{first} and up" if row.kind == "telemetry" else f"below {first}"
+            raise IcdError(f"ID {row.id} is not a {row.kind} ID ({side})")
+        highest = self._highest_id
+        if row.id > highest:
+            raise IcdError(f"ID {row.id} is above {highest}")
+        if row.name in self._rows:
+            raise IcdError("name used twice")
+        code = self._classes[row.klass].code if row.klass else None
+        if self._ids.setdefault((code, row.id), row.name) != row.name:
+            raise IcdError(f"ID {row.id} is already used by {self._ids[code, row.id]}")
+
+    def _check_removed(self) -> None:
+        """Report the IDs of rows that are not valid, if other rows have them."""
+        for file, kind, table in self._removed:
+            if not isinstance(table, dict) or not isinstance(table.get("id"), int):
+                continue
+            name, row_id = table.get("name"), table["id"]
+            of_kind = [item.name for item in self._classes.values() if item.kind is kind]
+            klass = self._classes.get(str(table.get("class", of_kind[0] if len(of_kind) == 1 else "")))
+            if self._classes and klass is None:
+                continue
+            used = self._ids.get((None if klass is None else klass.code, row_id), name)
+            if used != name:
+                self.errors.append(f"{file}: {kind} {name}: ID {row_id} is already used by {used}")
+
+    @property
+    def _highest_id(self) -> int:
+        """Highest ID that the link can carry."""
+        serial = self._icd.link.serial
+        header = [] if serial is None else serial.request_header
+        widths = [bit.width for item in header for bit in item.bits if bit.role == "id"]
+        widths += [int(item.type[1:]) for item in header if item.role == "id"]
+        return (1 << widths[0]) - 1 if widths else HIGHEST_ID
 
     def _check_answers(self, row: Row) -> None:
         for answer in row.answers:
             kind, _, name = answer.partition(":")
-            where = f"{self._path}: {row.kind} {row.name}: answer {answer!r}"
-            if kind not in ("echo", "reply", "row") or (kind == "row") != bool(name):
-                raise IcdError(f"{where}: must be echo, reply or row:NAME")
-            if kind == "row" and (name not in self._rows or self._rows[name].kind != "telemetry"):
-                text = f"{where}: no telemetry row with this name{did_you_mean(name, self._rows)}"
-                raise MissingNameError(text, name)
+            with Located(f"answer {answer!r}"):
+                if kind not in ("echo", "reply", "row") or (kind == "row") != bool(name):
+                    raise IcdError("must be echo, reply or row:NAME")
+                if kind == "row":
+                    _find("telemetry row", name, self._icd.telemetry)
 
 
-def check_text_requests(row: Row, definition: InterfaceDefinition, where: str, *, needed: bool) -> None:
+def _add(table: dict[str, _Item], name: str, item: _Item) -> None:
+    if name in table:
+        raise IcdError("defined twice")
+    table[name] = item
+
+
+def _find(what: str, name: str, items: Mapping[str, _Item]) -> _Item:
+    """Return the item of a name. Raises MissingNameError, with similar names."""
+    if name not in items:
+        raise MissingNameError(f"no {what} named {name!r}{did_you_mean(name, items)}", name)
+    return items[name]
+
+
+def _check_errors(errors: Mapping[str, int], conventions: Conventions) -> None:
+    known = [*(code.name.lower() for code in ErrorCode), OTHER_ERROR]
+    for name in errors:
+        if name not in known:
+            raise IcdError(
+                f"errors.{name}: no such error{did_you_mean(name, known)} (known: {', '.join(known)})"
+            )
+    if "crc" in errors and not conventions.telecommand_crc:
+        raise IcdError(
+            "errors.crc: never sent, because a message with a wrong checksum is not answered; remove it"
+        )
+
+
+def _check_link(icd: InterfaceDefinition) -> None:
+    """Check that the parts of the links are compatible with each other and with the rows."""
+    serial, can = icd.link.serial, icd.link.can
+    for row in icd.rows:
+        with Located(f"{row.kind} {row.name}"):
+            if "echo" in row.answers:
+                if serial is not None and isinstance(serial.framing, CubeSpaceFraming):
+                    raise IcdError("answer 'echo': link.serial with framing cubespace has no echoes")
+                if can is not None:
+                    raise IcdError("answer 'echo': link.can has no echoes")
+                if serial is not None and (serial.format or serial.acknowledge or serial.refusal):
+                    raise IcdError(
+                        "answer 'echo': link.serial with `format`, `acknowledge` or `refusal` has no echoes"
+                    )
+            if row.request and serial is None:
+                raise IcdError("`request` is a text on link.serial, which the unit does not have")
+    if serial is None or icd.link_is_unknown:
+        return
+    if isinstance(serial.framing, CubeSpaceFraming):
+        for name in serial.framing.unanswered:
+            with Located("link.serial.framing.unanswered"):
+                _find("telecommand", name, icd.telecommands)
+    stack = build_serial_stack(icd)
+    for row in icd.rows:
+        with Located(f"{row.kind} {row.name}"):
+            text_form = stack.request_formats.of(row.klass) in stack.text_formats
+            check_text_request(row, icd, needed=text_form)
+
+
+def check_text_request(row: Row, definition: InterfaceDefinition, *, needed: bool) -> None:
     """Check the text that requests a row; `needed` if requests of other rows of its format are texts."""
     if not row.request:
         if needed:
-            raise IcdError(
-                f"{where}: needs `request`, a text, as the other rows of its format on link.serial"
-            )
+            raise IcdError("needs `request`, a text, as the other rows of its format on link.serial")
         return
     if row.kind == "telecommand" and row.size:
-        raise IcdError(f"{where}: `request` is a text without data; it has no fields")
+        raise IcdError("`request` is a text without data; it has no fields")
     same = next(item for item in definition.rows if words(item.request) == words(row.request))
     if same is not row:
-        raise IcdError(f"{where}: request {row.request!r} is already that of {same.name}")
+        raise IcdError(f"request {row.request!r} is already that of {same.name}")
 
 
 def _readback(model: schema.RowModel) -> schema.RowModel:

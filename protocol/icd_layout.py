@@ -11,23 +11,35 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from pydantic import ValidationError
 
 from starhil.protocol.codec import Field, FieldKind, Row, Slot
 from starhil.protocol.conventions import Order
-from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance, RepeatModel
+from starhil.protocol.definition import InterfaceDefinition
+from starhil.protocol.icd_schema import BitModel, FieldKeys, FieldModel, Provenance
 from starhil.protocol.messages import RequestKind
+from starhil.protocol.names import did_you_mean
 from starhil.protocol.validation_messages import wording
-from starhil.protocol.values import INTEGER_RANGES, SCALAR_SIZES, EnumDefinition, IcdError, Scalar
+from starhil.protocol.values import (
+    INTEGER_RANGES,
+    SCALAR_SIZES,
+    EnumDefinition,
+    IcdError,
+    Located,
+    MissingNameError,
+    Scalar,
+)
 
 NUMBER: Final = "[n]"
 _KINDS: Final[dict[str, FieldKind]] = {"f32": "float", "f64": "float", "bytes": "bytes", "text": "text"}
 _UNPLACED: Final = Field.model_construct(name="", kind="unused", slot=Slot(0, "u8", 0, 0))
 """The defaults of a field."""
+_KEPT: Final = tuple(FieldKeys.model_fields)
+"""Keys that a field keeps as they are."""
 SMALLEST_SCALE: Final = 1e-100
 """Smallest magnitude of a scale."""
 MAX_NAMES: Final = 256
@@ -36,39 +48,21 @@ MAX_NAMES: Final = 256
 _BRACES: Final = re.compile(r"\{([^{}]*)\}")
 
 
-class Definitions(Protocol):
-    """The parts of a definition to which fields refer."""
-
-    byte_order: Order
-
-    def enum_of(self, name: str | None, where: str) -> EnumDefinition:
-        """Return an enumeration by name."""
-        ...
-
-    def check_parameter(self, name: str | None, unit: str, where: str) -> str | None:
-        """Check that the parameter of a field exists and has the unit of the field."""
-        ...
-
-
 class Layout:
     """The fields of one row, and the bytes that they occupy.
 
     Parameters
     ----------
+    icd
+        Definition with the enumerations and parameters to which the fields refer.
     number
         Number of the row if the entry expands to several, otherwise None.
     """
 
     def __init__(
-        self,
-        definitions: Definitions,
-        where: str,
-        kind: RequestKind,
-        provenance: Provenance,
-        number: int | None,
+        self, icd: InterfaceDefinition, kind: RequestKind, provenance: Provenance, number: int | None
     ) -> None:
-        self._definitions = definitions
-        self._where = where
+        self._icd = icd
         self._kind = kind
         self._provenance = provenance
         self._number = number
@@ -81,141 +75,124 @@ class Layout:
         """Append the fields of another row; fields of a telecommand report the last accepted values."""
         moved = {slot.index: self._slot(slot.type, slot.size, slot.order) for slot in row.slots}
         for item in row.fields:
-            field = item.changed(slot=moved[item.slot.index])
+            changes: dict[str, Any] = {"slot": moved[item.slot.index]}
             if row.kind != self._kind:
-                source = row.name if field.parameter is None and field.const is None else None
-                field = field.changed(value=None, argument=None, telecommand=source)
-            self._append(field)
+                source = row.name if item.parameter is None and item.const is None else None
+                changes |= {"value": None, "argument": None, "telecommand": source}
+            self._append(item.changed(**changes))
 
     def add(self, model: FieldModel) -> None:
         """Append a field, a series of numbered fields, a repeated group, or the bits of a bit field.
 
-        Raises IcdError, after which the layout is as before.
+        Raises IcdError, which names the field.
         """
-        fields, slots, size = len(self.fields), len(self.slots), self.size
-        try:
-            self._add(model)
-        except IcdError:
-            del self.fields[fields:], self.slots[slots:]
-            self.size = size
-            self._names = {item.name for item in self.fields} - {""}
-            raise
+        for single, suffix, number in _expanded(model, self._number):
+            with Located(f"field {single.name or 'unused'}"):
+                slot = self._slot_of(single)
+            parts: Sequence[FieldModel | BitModel] = single.bits or [single]
+            shift = 0
+            for part in parts:
+                name = part.name + suffix if part.name else ""
+                provenance = part.provenance or single.provenance or self._provenance
+                with Located(f"field {name or 'unused'}"):
+                    keys = self._keys(part, slot, number)
+                keys |= {"name": name, "provenance": provenance, "shift": shift}
+                self._append(_UNPLACED.model_copy(update=keys))
+                shift += keys["width"]
 
-    def _add(self, model: FieldModel) -> None:
-        where = f"{self._where}: field {model.name or 'unused'}"
-        if model.text is not None:
-            for item in self._of_text(model):
-                self._add_single(item, f"{self._where}: field {item.name or 'unused'}", "", self._number)
-            return
-        if model.repeat is not None:
-            self._add_repeat(model, model.repeat, where)
-            return
-        if model.count is None:
-            self._add_single(model, where, "", self._number)
-        for number in range(1, (model.count or 0) + 1):
-            self._add_single(model, where, f"_{number}", number)
-
-    def _add_repeat(self, model: FieldModel, repeat: RepeatModel, where: str) -> None:
-        if model.model_fields_set - {"repeat", "doc"}:
-            raise IcdError(f"{where}: `repeat` allows no other keys but `doc`")
-        group = [single for item in repeat.fields for single in self._of_text(item)]
-        if any(item.repeat is not None or item.count is not None for item in group):
-            raise IcdError(f"{where}: a repeated group cannot contain `repeat` or `count`")
-        for number in range(repeat.first, repeat.first + repeat.count):
-            for item in group:
-                self._add_single(item, where, f"_{number}", number)
-
-    def _of_text(self, model: FieldModel) -> list[FieldModel]:
-        """Expand the text of a field to fields; return any other field itself."""
-        if model.text is None:
-            return [model]
-        where = f"{self._where}: field {model.text!r}"
-        if model.model_fields_set != {"text"}:
-            raise IcdError(f"{where}: `text` allows no other keys")
-        try:
-            return fields_of(model.text)
-        except IcdError as error:
-            raise IcdError(f"{where}: {error}") from None
-
-    def _add_single(self, model: FieldModel, where: str, suffix: str, number: int | None) -> None:
+    def _slot_of(self, model: FieldModel) -> Slot:
+        """Append the bytes of a single field."""
         if model.type is None:
-            raise IcdError(f"{where}: needs `type`, or `repeat`")
-        if model.type.startswith("bits"):
-            self._add_bits(model, suffix, number)
-            return
-        if model.bits:
-            raise IcdError(f"{where}: only types bits8, bits16 and bits32 have bits")
+            raise IcdError("needs `type`, or `repeat`")
+        if model.type.startswith("bits") and (not model.bits or model.count is not None):
+            raise IcdError(f"type {model.type} needs `bits` and takes no count")
+        if model.bits and not model.type.startswith("bits"):
+            raise IcdError("only types bits8, bits16 and bits32 have bits")
         string = model.type in ("bytes", "text")
         if string and model.size is None:
-            raise IcdError(f"{where}: type {model.type} needs a size")
+            raise IcdError(f"type {model.type} needs a size")
         if not string and model.size is not None:
-            raise IcdError(f"{where}: type {model.type} has a fixed size; remove `size`")
-        slot = self._slot("bytes", model.size or 0) if string else self._scalar_slot(model.type, model.order)
-        self._append(self._field(model, slot, where, suffix, number))
+            raise IcdError(f"type {model.type} has a fixed size; remove `size`")
+        if string:
+            return self._slot("bytes", model.size or 0)
+        scalar = model.type.replace("enum", "u").replace("bits", "u")
+        size = SCALAR_SIZES[scalar]
+        width = sum(bit.width for bit in model.bits)
+        if model.bits and width != 8 * size:
+            raise IcdError(f"the bits add up to {width}, must be {8 * size}")
+        return self._slot(scalar, size, model.order)
 
-    def _add_bits(self, model: FieldModel, suffix: str, number: int | None) -> None:
-        where = f"{self._where}: field {model.name or 'unused'}"
-        if not model.bits or (model.count is not None):
-            raise IcdError(f"{where}: type {model.type} needs `bits` and takes no count")
-        slot = self._scalar_slot(str(model.type), model.order)
-        shift = 0
-        for bit in model.bits:
-            here = f"{self._where}: field {bit.name or 'unused'}"
-            field = self._field(bit, slot, here, suffix, number)
-            provenance = bit.provenance or model.provenance or self._provenance
-            self._append(field.changed(shift=shift, width=bit.width, provenance=provenance))
-            shift += bit.width
-        if shift != 8 * slot.size:
-            raise IcdError(f"{where}: the bits add up to {shift}, must be {8 * slot.size}")
-
-    def _field(
-        self, model: FieldModel | BitModel, slot: Slot, where: str, suffix: str, number: int | None
-    ) -> Field:
-        """Return a field that is a whole slot; the place of bits is still to be set."""
+    def _keys(self, model: FieldModel | BitModel, slot: Slot, number: int | None) -> dict[str, Any]:
+        """Return the attributes of a field, except for its place in the slot."""
         kind: FieldKind
         limits: tuple[int, int] | None
+        width = 0
         if isinstance(model, BitModel):
-            kind = "flag" if model.width == 1 else "bits"
-            limits, described = (0, 2**model.width - 1), f"{model.width} bits"
+            width = model.width
+            kind = "flag" if width == 1 else "bits"
+            limits, described = (0, 2**width - 1), f"{width} bits"
         else:
             kind = _KINDS.get(str(model.type), "integer")
             limits, described = INTEGER_RANGES.get(slot.type), f"type {model.type}"
-        faults = list(_wrong_numbers(model, limits, described, where))
-        try:
-            parameter = self._definitions.check_parameter(model.parameter, model.unit, where)
-        except IcdError as error:
-            faults.insert(0, str(error))
+        faults = tuple(self._faults(model, limits, described))
         if faults:
             raise IcdError(*faults)
-        enum, aliases = self._enumeration(model, where)
+        enum, aliases = self._enumeration(model)
         if enum is not None:
             kind = "enum"
             low, high = limits or (0, -1)
             if not all(low <= value <= high for value in enum.values.values()):
-                raise IcdError(f"{where}: enumeration {enum.name} does not fit {described}")
+                raise IcdError(f"enumeration {enum.name} does not fit {described}")
         if kind not in ("integer", "float", "bits") and (model.scale, model.bias) != (1.0, 0.0):
-            raise IcdError(f"{where}: scale and offset need a number of at least 2 bits")
+            raise IcdError("scale and offset need a number of at least 2 bits")
+        if model.name is None and (model.value or model.argument or model.const is not None):
+            raise IcdError("a field with a value, argument or const needs a name")
         given = vars(model)
-        keys = {key: given[key] for key in FieldKeys.model_fields if key in given}
-        if model.const is not None:
-            keys |= {"minimum": model.const, "maximum": model.const}
-        keys |= {
-            "name": model.name + suffix if model.name else "",
-            "kind": "unused" if model.name is None else kind,
-            "slot": slot,
-            "enum": enum,
-            "aliases": aliases,
-            "default": _default(model.default, enum, where),
-            "parameter": parameter,
-            "value": _numbered(model.value, number, where),
-            "argument": _numbered(model.argument, number, where),
-            "provenance": model.provenance or self._provenance,
-        }
-        return _UNPLACED.model_copy(update=keys)
+        limits_of_const = {} if model.const is None else {"minimum": model.const, "maximum": model.const}
+        return (
+            {key: given[key] for key in _KEPT}
+            | limits_of_const
+            | {
+                "kind": "unused" if model.name is None else kind,
+                "slot": slot,
+                "width": width,
+                "enum": enum,
+                "aliases": aliases,
+                "default": _default(model.default, enum),
+                "value": _numbered(model.value, number),
+                "argument": _numbered(model.argument, number),
+            }
+        )
 
-    def _enumeration(
-        self, model: FieldModel | BitModel, where: str
-    ) -> tuple[EnumDefinition | None, Mapping[str, str]]:
+    def _faults(
+        self, model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str
+    ) -> Iterator[str]:
+        """Yield what is wrong with the parameter and the numbers of a field."""
+        name, known = model.parameter, self._icd.device_parameters
+        if name is not None and name not in known:
+            yield f"no parameter named {name!r}{did_you_mean(name, known)}"
+        elif name is not None and known[name].unit != model.unit:
+            yield f"unit {model.unit!r}, but parameter {name} is in {known[name].unit!r}; they must agree"
+        if abs(model.scale) < SMALLEST_SCALE:
+            yield f"scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}"
+            return
+        if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
+            yield f"min {model.minimum:g} is above max {model.maximum:g}"
+        if model.wrap and isinstance(model, FieldModel) and not str(model.type).startswith("u"):
+            yield "wrap: only unsigned integers wrap"
+        if model.wrap and (model.minimum, model.maximum) != (None, None):
+            yield "wrap: a field that wraps has no min and max"
+        if limits is None:
+            return
+        numbers = {"min": model.minimum, "max": model.maximum, "const": model.const, "default": model.default}
+        for name, value in numbers.items():
+            if (
+                isinstance(value, int | float)
+                and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]
+            ):
+                yield f"{name} {value:g} does not fit {described} with its scale"
+
+    def _enumeration(self, model: FieldModel | BitModel) -> tuple[EnumDefinition | None, Mapping[str, str]]:
         """Return the enumeration of a field, by name or in its `map`, and its aliases."""
         if model.name is None:
             return None, {}
@@ -223,64 +200,69 @@ class Layout:
         if isinstance(model, FieldModel) and is_number and model.enumeration is not None:
             bits = str(model.type).removeprefix("u")
             types = f"enum{bits}" if bits in ("8", "16", "32") else "enum8, enum16 or enum32"
-            raise IcdError(f"{where}: `enum` needs type {types}, not {model.type}")
+            raise IcdError(f"`enum` needs type {types}, not {model.type}")
         if model.map is not None:
             if model.enumeration is not None:
-                raise IcdError(f"{where}: has both `map` and `enum`")
-            return mapped(model.map, where)
+                raise IcdError("has both `map` and `enum`")
+            return mapped(model.map)
         if is_number or (isinstance(model, BitModel) and model.enumeration is None):
             return None, {}
-        return self._definitions.enum_of(model.enumeration, where), {}
-
-    def _scalar_slot(self, type_: str, order: Order | None) -> Slot:
-        """Return the slot of a number, an enumeration or a bit field."""
-        scalar = type_.replace("enum", "u").replace("bits", "u")
-        return self._slot(scalar, SCALAR_SIZES[scalar], order)
+        return enum_of(model.enumeration, self._icd), {}
 
     def _slot(self, scalar: str, size: int, order: Order | None = None) -> Slot:
-        slot = Slot(len(self.slots), scalar, self.size, size, order or self._definitions.byte_order)
+        slot = Slot(len(self.slots), scalar, self.size, size, order or self._icd.conventions.byte_order)
         self.slots.append(slot)
         self.size += size
         return slot
 
     def _append(self, item: Field) -> None:
         if item.name in self._names:
-            raise IcdError(f"{self._where}: field {item.name}: name used twice in the row")
-        if not item.name and (item.value or item.argument or item.const is not None):
-            raise IcdError(
-                f"{self._where}: field unused: a field with a value, argument or const needs a name"
-            )
+            raise IcdError(f"field {item.name}: name used twice in the row")
         self.fields.append(item)
         self._names |= {item.name} - {""}
 
 
-def _wrong_numbers(
-    model: FieldModel | BitModel, limits: tuple[int, int] | None, described: str, where: str
-) -> Iterator[str]:
-    """Yield what is wrong with the numbers of a field."""
-    if abs(model.scale) < SMALLEST_SCALE:
-        yield f"{where}: scale {model.scale:g} is smaller than {SMALLEST_SCALE:g}"
-        return
-    if model.minimum is not None and model.maximum is not None and model.minimum > model.maximum:
-        yield f"{where}: min {model.minimum:g} is above max {model.maximum:g}"
-    if model.wrap and isinstance(model, FieldModel) and not str(model.type).startswith("u"):
-        yield f"{where}: wrap: only unsigned integers wrap"
-    if model.wrap and (model.minimum, model.maximum) != (None, None):
-        yield f"{where}: wrap: a field that wraps has no min and max"
-    if limits is None:
-        return
-    numbers = {"min": model.minimum, "max": model.maximum, "const": model.const, "default": model.default}
-    for name, value in numbers.items():
-        if (
-            isinstance(value, int | float)
-            and not limits[0] <= round((value - model.bias) / model.scale) <= limits[1]
-        ):
-            yield f"{where}: {name} {value:g} does not fit {described} with its scale"
+def enum_of(name: str | None, icd: InterfaceDefinition) -> EnumDefinition:
+    """Return an enumeration of the unit or, if it has none of this name, of the device model."""
+    if name is None:
+        raise IcdError("type enum needs `enum`, the name of an enumeration")
+    found = icd.enums.get(name) or icd.model.enums.get(name)
+    if found is None:
+        known = sorted({*icd.enums, *icd.model.enums})
+        near = did_you_mean(name, known)
+        raise MissingNameError(f"no enumeration named {name!r}{near} (known: {', '.join(known)})", name)
+    return found
 
 
-def mapped(
-    table: Mapping[str, Scalar | list[Scalar]], where: str
-) -> tuple[EnumDefinition, Mapping[str, str]]:
+def _expanded(model: FieldModel, number: int | None) -> Iterator[tuple[FieldModel, str, int | None]]:
+    """Yield the single fields of an entry, each with the suffix of its name and the number for `[n]`."""
+    if model.repeat is None and model.count is None:
+        yield from ((single, "", number) for single in _of_text(model))
+        return
+    group, numbers = [model], range(1, (model.count or 0) + 1)
+    with Located(f"field {model.text or model.name or 'unused'}"):
+        if model.repeat is not None:
+            numbers = range(model.repeat.first, model.repeat.first + model.repeat.count)
+            group = model.repeat.fields
+            if model.model_fields_set - {"repeat", "doc"}:
+                raise IcdError("`repeat` allows no other keys but `doc`")
+            if any(item.repeat is not None or item.count is not None for item in group):
+                raise IcdError("a repeated group cannot contain `repeat` or `count`")
+    group = [single for item in group for single in _of_text(item)]
+    yield from ((single, f"_{each}", each) for each in numbers for single in group)
+
+
+def _of_text(model: FieldModel) -> list[FieldModel]:
+    """Expand the text of a field to fields; return any other field itself."""
+    if model.text is None:
+        return [model]
+    with Located(f"field {model.text!r}"):
+        if model.model_fields_set != {"text"}:
+            raise IcdError("`text` allows no other keys")
+        return fields_of(model.text)
+
+
+def mapped(table: Mapping[str, Scalar | list[Scalar]]) -> tuple[EnumDefinition, Mapping[str, str]]:
     """Return the enumeration of a `map`, and the values that are sent as another member."""
     values: dict[str, int] = {}
     aliases: dict[str, str] = {}
@@ -288,12 +270,10 @@ def mapped(
         try:
             number = int(wire, 0)
         except ValueError:
-            raise IcdError(
-                f'{where}: map: {wire!r} is not a number on the wire; write "1" = "tracking"'
-            ) from None
+            raise IcdError(f'map: {wire!r} is not a number on the wire; write "1" = "tracking"') from None
         names = [text_of(value) for value in (given if isinstance(given, list) else [given])]
         if not names or any(name in values or name in aliases for name in names):
-            raise IcdError(f"{where}: map: {wire}: no value, or a duplicate one")
+            raise IcdError(f"map: {wire}: no value, or a duplicate one")
         values[names[0]] = number
         aliases |= dict.fromkeys(names[1:], names[0])
     return EnumDefinition.model_construct(name="map", doc="", values=values), aliases
@@ -304,21 +284,21 @@ def text_of(value: object) -> str:
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
-def _numbered(name: str | None, number: int | None, where: str) -> str | None:
+def _numbered(name: str | None, number: int | None) -> str | None:
     """Replace `[n]` in the name of a quantity or argument by the number of a repetition."""
     if name is None or NUMBER not in name:
         return name
     if number is None:
-        raise IcdError(f"{where}: {name}: [n] is only allowed with count, repeat or last_id")
+        raise IcdError(f"{name}: [n] is only allowed with count, repeat or last_id")
     return name.replace(NUMBER, f"[{number}]")
 
 
-def _default(value: Scalar | None, enum: EnumDefinition | None, where: str) -> Scalar | None:
+def _default(value: Scalar | None, enum: EnumDefinition | None) -> Scalar | None:
     if enum is None or value is None:
         return value
     name = text_of(value)
     if name not in enum.values:
-        raise IcdError(f"{where}: default {value!r} is not in enumeration {enum.name}")
+        raise IcdError(f"default {value!r} is not in enumeration {enum.name}")
     return name
 
 

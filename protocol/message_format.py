@@ -6,14 +6,14 @@ check. Messages of several formats are distinguished by their first byte.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Final, TypeVar
 
 from starhil.protocol.checks import Check
 from starhil.protocol.envelope import Envelope, Header, HeaderError
-from starhil.protocol.framings import BodySizeError, Deframer, FirstByteDeframer, Framing, Receiving
+from starhil.protocol.framings import BodySizeError, Deframer, Framing, Receiving
 from starhil.protocol.link_schema import FixedFraming, FramingModel
 from starhil.protocol.messages import FaultKind, LinkFault
 from starhil.protocol.values import IcdError
@@ -154,7 +154,31 @@ class Formats:
             )
             for form in self.all
         }
-        return made[_first_byte(self.other)] if len(made) == 1 else FirstByteDeframer(made)
+        return made[_first_byte(self.other)] if len(made) == 1 else _FirstByteDeframer(made)
+
+
+class _FirstByteDeframer(Deframer[_Message]):
+    """Gives each message to the deframer of the start byte with which it begins; None: of all other bytes."""
+
+    def __init__(self, deframers: Mapping[int | None, Deframer[_Message]]) -> None:
+        self._deframers = deframers
+        self._other = deframers.get(None) or next(iter(deframers.values()))
+        self._current = self._other
+
+    @property
+    def busy(self) -> bool:
+        return self._current.busy
+
+    def feed(self, data: bytes, now: float) -> list[_Message | LinkFault]:
+        events: list[_Message | LinkFault] = list(self.flush(now))
+        for byte in data:
+            if not self._current.busy:
+                self._current = self._deframers.get(byte, self._other)
+            events += self._current.feed(bytes((byte,)), now)
+        return events
+
+    def flush(self, now: float) -> list[LinkFault]:
+        return self._current.flush(now)
 
 
 def _first_byte(form: MessageFormat) -> int | None:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum, StrEnum
 from typing import Final, Protocol, TypeVar
-
-from starhil.protocol.errors import ProtocolError
 
 Arriving_contra = TypeVar("Arriving_contra", contravariant=True)
 Message_co = TypeVar("Message_co", covariant=True)
@@ -46,6 +45,11 @@ class RequestKind(StrEnum):
 
     TELECOMMAND = "telecommand"
     TELEMETRY = "telemetry"
+
+    @classmethod
+    def of(cls, row_id: int) -> RequestKind:
+        """Return the kind of a CubeSpace row."""
+        return cls.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else cls.TELECOMMAND
 
 
 class ReplyKind(Enum):
@@ -106,8 +110,7 @@ class Request:
     @classmethod
     def of(cls, row_id: int, data: bytes = b"", source: int = 0) -> Request:
         """Return a request whose kind follows from its ID."""
-        kind = RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
-        return cls(kind, row_id, data, source)
+        return cls(RequestKind.of(row_id), row_id, data, source)
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,26 +162,20 @@ class LinkFault:
 
 
 class Receiver(Protocol[Arriving_contra, Message_co]):
-    """The receiving side of a link."""
+    """The receiving side of a link: bytes or CAN frames in, messages and faults out."""
 
     @property
+    @abstractmethod
     def busy(self) -> bool:
         """Whether a message is incomplete, so that `flush` may become due."""
-        ...
 
+    @abstractmethod
     def feed(self, item: Arriving_contra, now: float, /) -> Sequence[Message_co | LinkFault]:
         """Return the messages and faults that an item completes; `now` is the time of arrival, s."""
-        ...
 
-    def flush(self, now: float) -> list[LinkFault]:
-        """Drop an incomplete message that has timed out; return the faults."""
-        ...
-
-
-def check_receiver_limits(max_size: int, timeout_s: float) -> None:
-    """Raise ProtocolError unless both limits of a receiver are positive."""
-    if max_size < 1 or timeout_s <= 0:
-        raise ProtocolError(f"receiver limits {max_size} bytes, {timeout_s} s must be positive")
+    @abstractmethod
+    def flush(self, now: float, /) -> list[LinkFault]:
+        """Drop an incomplete message after a silence of the time-out; return the faults."""
 
 
 def error_code(raw: int) -> ErrorCode | int:

@@ -17,14 +17,14 @@ from functools import partial
 from typing import Final
 
 from starhil.protocol import cubespace
-from starhil.protocol.checks import Check, build_check
+from starhil.protocol.checks import build_check
 from starhil.protocol.codec import Row
 from starhil.protocol.conventions import Order
 from starhil.protocol.cubespace import Dialect, DialectReplies
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.envelope import Envelope, Header, HeaderError
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.framings import Deframer, Framing, Receiving, build_framing
+from starhil.protocol.framings import Deframer, Receiving, build_framing
 from starhil.protocol.link_schema import (
     CubeSpaceFraming,
     FormatModel,
@@ -35,7 +35,6 @@ from starhil.protocol.link_schema import (
 from starhil.protocol.message_format import Formats, MessageFormat
 from starhil.protocol.messages import (
     DEFAULT_MAX_SIZE,
-    FIRST_TELEMETRY_ID,
     ErrorCode,
     FaultKind,
     LinkFault,
@@ -125,20 +124,19 @@ class SerialStack:
         """Format of requests without a class."""
         self.replies: Final = self.reply_formats.other
         """Format of replies without a class, and of texts."""
-        self._in_dialect: Final = {dialect: DialectReplies(dialect) for dialect in self.dialects}
-        default = default_dialect(self.dialects)
-        self._in_default_dialect = None if default is None else self._in_dialect[default]
+        self._in_dialect: Final[dict[Dialect | None, DialectReplies]] = {
+            dialect: DialectReplies(dialect) for dialect in self.dialects
+        }
+        self._in_default_dialect = self._in_dialect.get(default_dialect(self.dialects))
         self._check_headers()
-        headers = [self.request_header, self.reply_header]
+        headers = [self.requests.header, self.replies.header]
         headers += [head for replies in self._in_dialect.values() for head in replies.headers.values()]
-        longest = max((row.size for row in rows), default=0)
-        overhead = max(
-            head.size(name) + form.check.size
-            for head in headers
-            for name in ("", *self.classes.by_name)
-            for form in (*self.request_formats.all, *self.reply_formats.all)
+        longest = (
+            max((row.size for row in rows), default=0)
+            + max(head.size(name) for head in headers for name in ("", *self.classes.by_name))
+            + max(form.check.size for form in (*self.request_formats.all, *self.reply_formats.all))
         )
-        self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest + overhead)
+        self.max_size: Final = link.max_size or max(DEFAULT_MAX_SIZE, longest)
 
     def _formats_of(self, direction: str, models: Sequence[HeaderFieldModel]) -> Formats:
         found = []
@@ -176,46 +174,22 @@ class SerialStack:
         header = Header(models, self.byte_order, codes, overhead, f"link.serial.{name}")
         return MessageFormat(frames, framing, checks, header, item.classes or ())
 
-    @property
-    def framing(self) -> Framing:
-        """The framing of requests."""
-        return self.requests.framing
-
-    @property
-    def check(self) -> Check:
-        """The check of requests."""
-        return self.requests.check
-
-    @property
-    def request_header(self) -> Header:
-        """The header of requests."""
-        return self.requests.header
-
-    @property
-    def reply_header(self) -> Header:
-        """The header of replies, except in the dialects."""
-        return self.replies.header
-
     def in_dialect(self, dialect: Dialect | None) -> DialectReplies | None:
-        """Return the replies in a dialect; None if the unit has no dialects."""
-        return (
-            self._in_default_dialect
-            if dialect is None
-            else self._in_dialect.get(dialect, self._in_default_dialect)
-        )
+        """Return the replies in a dialect, None for the default; None if the unit has no dialects."""
+        return self._in_dialect.get(dialect, self._in_default_dialect)
 
     def answers(self, row: Row) -> tuple[str, ...]:
         """Return the answers of a row on the line, of which there may be fewer than on other links."""
         return () if row.name in self._unanswered else row.answers
 
     def _check_headers(self) -> None:
-        for where, header in (("request", self.request_header), ("reply", self.reply_header)):
+        for where, header in (("request", self.requests.header), ("reply", self.replies.header)):
             for item in header.fields:
                 self._check_classes(item.classes, f"link.serial.{where}_header")
             formats = self.request_formats if where == "request" else self.reply_formats
             if any(form.model.kind == "length" for form in formats.all) and "length" not in header.roles:
                 raise IcdError(f"link.serial.{where}_header: framing length needs a field with role length")
-        if self.request_header.counts:
+        if self.requests.header.counts:
             raise IcdError("link.serial.request_header: `counts` belongs to the reply header")
         text_replies = [self.replies] if self.link.acknowledge or self.link.refusal else []
         for form in (*self.text_formats, *text_replies):
@@ -223,16 +197,19 @@ class SerialStack:
                 raise IcdError(
                     f"link.serial: texts need a framing with an end, such as delimited, not {form.model.kind}"
                 )
-        if "id" not in self.request_header.roles and len(self.text_formats) < len(self.request_formats.all):
+        if "id" not in self.requests.header.roles and len(self.text_formats) < len(self.request_formats.all):
             raise IcdError("link.serial.request_header: needs a field with role id")
-        directions = ("source", "reply", self.reply_header), ("destination", "request", self.request_header)
+        directions = (
+            ("source", "reply", self.replies.header),
+            ("destination", "request", self.requests.header),
+        )
         for role, where, header in directions:
             if role in header.roles:
                 raise IcdError(f"link.serial.{where}_header: role {role} belongs to the other direction")
 
     def row(self, klass: str, row_id: int) -> Row | None:
         """Return the row of a message; the class matters only if the link carries one."""
-        if "class" in self.request_header.roles:
+        if "class" in self.requests.header.roles:
             return self._rows.get((klass, row_id))
         return self._rows.get((klass, row_id)) or self._rows_by_id.get(row_id)
 
@@ -246,7 +223,7 @@ class SerialStack:
         unsolicited = kind in (ReplyKind.UNSOLICITED, ReplyKind.EVENT)
         return (
             kind is not ReplyKind.ECHO
-            and ("unsolicited" if unsolicited else "reply") in self.reply_header.counts
+            and ("unsolicited" if unsolicited else "reply") in self.replies.header.counts
         )
 
     def device(self) -> Deframer[Request]:
@@ -280,7 +257,7 @@ class SerialStack:
             values["source"] = request.source
         if request.flags:
             values["flags"] = request.flags
-        if "class" in self.request_header.roles:
+        if "class" in self.requests.header.roles:
             values["class"] = self.classes.coded(request.klass).code or 0
         return form.close(form.header.pack(values, request.klass, len(request.data)), request.data)
 
@@ -303,7 +280,7 @@ class SerialStack:
         text = self.texts.encode(reply)
         if text is not None:
             return self.replies.framing.encode(self.replies.close(b"", text))
-        header = self.reply_header
+        header = self.replies.header
         if refused and not header.roles_in(reply.klass) & {"status", "ack"}:
             return b""
         values = {
@@ -359,7 +336,7 @@ class SerialStack:
     def kind_of(self, row_id: int, klass: str = "") -> RequestKind | None:
         """Return the kind of a row, which need not exist; None if it is unknown."""
         if self.dialects:
-            return RequestKind.TELEMETRY if row_id >= FIRST_TELEMETRY_ID else RequestKind.TELECOMMAND
+            return RequestKind.of(row_id)
         item = self.classes.by_name.get(klass)
         row = self.row(klass, row_id)
         return item.kind if item is not None else row.kind if row is not None else None
@@ -406,7 +383,7 @@ class HostReceiver:
         """Whether a message is incomplete, so that `flush` may become due."""
         return self._deframer.busy
 
-    def feed(self, data: bytes, now: float) -> list[Reply | LinkFault]:
+    def feed(self, data: bytes, now: float) -> Sequence[Reply | LinkFault]:
         """Return the messages and faults that these bytes complete; `now` is the time of arrival, s."""
         return self._deframer.feed(data, now)
 
@@ -483,8 +460,8 @@ class HostReceiver:
             sequence=values.get("sequence", 0),
             flags=values.get("flags", 0),
             final=bool(values.get("final", 1)),
-            uptime_ns=values["ticks"] * stack.reply_header.count_ns("ticks") if "ticks" in values else 0,
-            time_ns=values["time"] * stack.reply_header.count_ns("time") if "time" in values else 0,
+            uptime_ns=values["ticks"] * stack.replies.header.count_ns("ticks") if "ticks" in values else 0,
+            time_ns=values["time"] * stack.replies.header.count_ns("time") if "time" in values else 0,
         )
 
     def _text_reply(self, kind: ReplyKind, code: int) -> Reply | LinkFault:
@@ -545,11 +522,13 @@ def chosen_dialect(icd: InterfaceDefinition, wanted: str | None) -> Dialect | No
     Raises IcdError: the unit does not have this dialect.
     """
     dialects = dialects_of(icd.link.serial)
-    if not dialects and wanted is not None:
+    if wanted is None:
+        return default_dialect(dialects)
+    if not dialects:
         raise IcdError(f"unit {icd.name} has no reply dialects; do not select one")
-    if len(dialects) == 1 and wanted not in (None, dialects[0]):
-        raise IcdError(f"unit {icd.name} has only dialect {dialects[0]}; do not select another")
-    return default_dialect(dialects) if wanted is None else Dialect(wanted)
+    if wanted not in dialects:
+        raise IcdError(f"unit {icd.name} has only dialect {', '.join(dialects)}; do not select another")
+    return Dialect(wanted)
 
 
 def build_serial_stack(icd: InterfaceDefinition) -> SerialStack:

@@ -129,8 +129,12 @@ def wording(item: ErrorDetails) -> str:
     else:
         message = item["msg"].removeprefix("Value error, ")
         text = f"{message[:1].lower()}{message[1:]}"
-    whole = isinstance(given, (dict, list)) or kind == "json_invalid"
-    return text if whole else f"{text} (given: {given!r})"
+    quoted = isinstance(given, str) and repr(given) in text
+    return (
+        text
+        if quoted or isinstance(given, (dict, list)) or kind == "json_invalid"
+        else f"{text} (given: {given!r})"
+    )
 
 
 def _choice(item: ErrorDetails, models: Sequence[type[BaseModel]]) -> str:
@@ -150,7 +154,12 @@ def _along(
     """Follow a pydantic location; return the keys without tags of unions, and the models at the end."""
     models: list[type[BaseModel]] = [model]
     keys: list[int | str] = []
+    within_mapping = False
     for step in loc:
+        if within_mapping:  # the step is a key that the document chooses
+            keys.append(step)
+            within_mapping = False
+            continue
         tagged = [each for each in models if step in _tags_of(each) or step == each.__name__]
         if tagged and len(models) > 1:
             models = tagged
@@ -158,6 +167,7 @@ def _along(
         keys.append(step)
         if isinstance(step, str):
             fields = [_keys_of(each)[step] for each in models if step in _keys_of(each)]
+            within_mapping = any(get_origin(annotation) is dict for annotation in fields)
             models = [below for annotation in fields for below in _models_in(annotation)]
     return tuple(keys), models
 
@@ -184,8 +194,8 @@ def _dotted(document: Any, location: Sequence[int | str]) -> str:
             here = here[step]
         except (KeyError, IndexError, TypeError):
             here = None
-        named = here.get("name", here.get("heading")) if isinstance(here, dict) else None
-        steps.append(str(named if named is not None and isinstance(step, int) else step))
+        named = here.get("name", here.get("heading", here.get("id"))) if isinstance(here, dict) else None
+        steps.append(named if isinstance(named, str) and isinstance(step, int) else str(step))
     return ".".join(steps)
 
 

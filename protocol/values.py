@@ -59,6 +59,20 @@ class IcdError(ProtocolError):
     """An invalid interface definition; the text names file, row and field."""
 
 
+class Located:
+    """Context of a part of a definition: its name is put in front of the errors that are raised in it."""
+
+    def __init__(self, where: str) -> None:
+        self._where = where
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        if isinstance(error, IcdError):
+            error.args = tuple(f"{self._where}: {text}" for text in error.args)
+
+
 class MissingNameError(IcdError):
     """A name that the definition uses but does not define."""
 
@@ -225,9 +239,7 @@ class Parameter(ParameterKeys):
     enum: EnumDefinition | None
 
     @classmethod
-    def limited(
-        cls, keys: Mapping[str, Any], enum: EnumDefinition | None, where: str, number: int = 0
-    ) -> Parameter:
+    def limited(cls, keys: Mapping[str, Any], enum: EnumDefinition | None, number: int = 0) -> Parameter:
         """Return a parameter with the limits of its enumeration or type; raise IcdError if it has no valid ones."""
         given = {name: keys[name] for name in ParameterKeys.model_fields}
         parameter = cls.model_construct(**{**given, "id": number, "enum": enum})
@@ -238,11 +250,11 @@ class Parameter(ParameterKeys):
         elif parameter.type == "bool":
             low, high = 0.0, 1.0
         elif low is None or high is None or not low <= high:
-            raise IcdError(f"{where}: needs min and max, with min not above max")
+            raise IcdError("needs min and max, with min not above max")
         else:
             lowest, highest = INTEGER_RANGES.get(parameter.type, (-math.inf, math.inf))
             if low < lowest or high > highest:
-                raise IcdError(f"{where}: limits {low:g} to {high:g} do not fit type {parameter.type}")
+                raise IcdError(f"limits {low:g} to {high:g} do not fit type {parameter.type}")
         return parameter.model_copy(update={"minimum": low, "maximum": high})
 
     def check(self, value: Value) -> bool | int | float | str:

@@ -410,6 +410,33 @@ def _free_to_all(estimate: Sequence[str], values: Array) -> Array:
     return np.column_stack(columns)
 
 
+def attitude_covariance(camera: Camera, covariance: Array, xy_px: Array, sigma_px: Array) -> Array:
+    """Covariance (3, 3) of an attitude that errors of the camera's calibration cause, rad², sensor frame.
+
+    An error p of the camera displaces the stars by Kᵢ p, which turns the attitude that fits them best by
+    ``G p = (Σ wᵢ RᵢᵀRᵢ)⁻¹ Σ wᵢ RᵢᵀKᵢ p`` to first order; R and K are the derivatives of a star's position with
+    respect to rotation and camera, and wᵢ = 1/σᵢ². The covariance is ``G C Gᵀ``. It has no part of the stars' noise.
+
+    Parameters
+    ----------
+    camera : Camera
+        The calibrated camera.
+    covariance : ndarray (9, 9)
+        Covariance C of its parameters, as in `Calibration`.
+    xy_px : ndarray (n, 2)
+        Positions of the stars from which the attitude was computed; n ≥ 2.
+    sigma_px : ndarray (n,)
+        Standard deviation of each position per axis, pixels.
+    """
+    vectors = camera.back_project(xy_px)
+    rotation = _rotation_jacobian(camera.params, vectors)
+    weighted = rotation.transpose(0, 2, 1) / np.square(sigma_px)[:, None, None]
+    by_camera = np.sum(weighted @ _camera_jacobian(camera.params, vectors), axis=0)
+    turn = np.linalg.solve(np.sum(weighted @ rotation, axis=0), by_camera)
+    result: Array = turn @ covariance @ turn.T
+    return result
+
+
 def _rotation_jacobian(params: Array, vectors: Array) -> Array:
     """Derivative (n, 2, 3) of the positions with respect to a sensor rotation e, px/rad: J (v × e)."""
     x, y, z = vectors.T

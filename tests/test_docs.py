@@ -31,7 +31,7 @@ from starhil.emulator.truth.csv_file import BOUNDS
 from starhil.emulator.truth.source import TruthStatus
 from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.private_can_bus import HubThread, private_can_bus
+from starhil.hil_tests.private_can_bus import hub_thread, private_can_bus
 from starhil.hil_tests.raw_traffic import format_frame, parse_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen.device_dictionary import build_dictionary
@@ -499,7 +499,7 @@ def test_frames_that_a_page_types_are_answered_as_shown(name, tmp_path):
     page = PAGES[name]
     node = [0x705] if "--canopen" in page.run else []
     with contextlib.ExitStack() as stack:
-        hub = stack.enter_context(HubThread()).channel
+        hub = stack.enter_context(hub_thread())
         typed = shlex.split(page.run.replace("vcan0", hub))
         assert typed[:2] == ["starhil", "run"]
         stack.enter_context(EmulatorProcess(emulator_command(state_dir=tmp_path, extra=typed[2:])))

@@ -24,6 +24,7 @@ import itertools, logging, sys, time
 from starhil.emulator.cli.endurance import run_once
 from starhil.emulator.endurance.unit_under_test import links_of
 from starhil.hil_tests.endurance.life import make_life
+from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled_units
 logging.getLogger("starhil").addHandler(logging.NullHandler())
@@ -32,7 +33,7 @@ end = float(sys.argv[1])
 for number, unit in enumerate(itertools.cycle(sorted(bundled_units()))):
     seed = 1 + number // len(bundled_units())
     icd = load_unit(unit)
-    outcome = run_once(make_life(icd, unit, links_of(icd), seed, 400))
+    outcome = run_once(make_life(unit_of(icd), unit, links_of(icd), seed, 400))
     if outcome.violation:
         print(f"{time.process_time():.0f} s, {unit} seed {seed}: {outcome.violation}")
     if outcome.violation or time.process_time() > end:

@@ -39,7 +39,7 @@ INSTRUMENTED = (
     "starhil.hil_tests.images", "starhil.hil_tests.raw_traffic", "starhil.hil_tests.truth_log",
     "starhil.hil_tests.emulator_process", "starhil.emulator.control", "starhil.emulator.console",
     "starhil.emulator.device", "starhil.emulator.truth", "starhil.emulator.profile",
-    "starhil.emulator.replay", "starhil.emulator.cli.endurance", "starhil.emulator.tape",
+    "starhil.emulator.replay", "starhil.emulator.replay_differences", "starhil.emulator.cli.endurance", "starhil.emulator.tape",
     "starhil.emulator.json_lines", "starhil.emulator.toml_file", "starid.files",
     "starid.imaging.image_io", "starid.camera_file", "starid.hipparcos", "starid.thesis.database_file",
 )  # fmt: skip

@@ -270,10 +270,11 @@ _SHOTS: Final[dict[str, Callable[[EcssDevice, Condition, int, np.random.Generato
 
 
 def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
-    """Solve the frames of a part; return outcomes, errors (arcseconds), and numbers of field and condition."""
+    """Solve the frames of a part; return outcomes, errors and stated uncertainties (arcseconds), and numbers of field and condition."""
     device = of_thread(EcssDevice, plan)
     numbers = range(chunk * plan.chunk, min((chunk + 1) * plan.chunk, condition.frames))
     errors = np.full((len(numbers), 3), np.nan)
+    stated = np.full((len(numbers), 2), np.nan)
     outcome = np.zeros(len(numbers), dtype="U24")
     labels = np.zeros((len(numbers), 3), dtype=np.int64)
     for row, number in enumerate(numbers):
@@ -284,13 +285,14 @@ def run_part(plan: EcssPlan, condition: Condition, chunk: int) -> Results:
             continue
         error = Attitude(np.array(result.quaternion_xyzw)).error_to(shot.attitude)
         errors[row] = error.rotation_vector_rad * ARCSEC_PER_RAD
+        stated[row] = result.sigma_cross_arcsec, result.sigma_roll_arcsec
         too_far = max(error.cross_boresight_arcsec, error.roll_arcsec) > 3600.0 * WRONG_DEG
         rate_deg_s = round(float(np.degrees(np.linalg.norm(shot.rate_rad_s))), _RATE_DIGITS)
         if rate_deg_s > device.max_rate_deg_s:
             outcome[row] = "rate_too_high"
         else:
             outcome[row] = "wrong" if too_far else "correct"
-    return {"outcome": outcome, "error_arcsec": errors, "labels": labels}
+    return {"outcome": outcome, "error_arcsec": errors, "stated_arcsec": stated, "labels": labels}
 
 
 def run_ecss(

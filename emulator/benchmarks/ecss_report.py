@@ -29,6 +29,9 @@ from starid.result_store import Results
 INTERVAL: Final = 0.95
 """Confidence level of the intervals for probabilities."""
 
+SIGMAS: Final = (1, 2, 3)
+"""Standard deviations within which errors are counted; of normal errors, 68.3, 95.4 and 99.7 %."""
+
 PLOTS: Final = {
     "ecss-errors.png": "Attitude errors by kind, across and about the boresight",
     "ecss-availability.png": "Correct and wrong attitudes against body rate, bodies near the field, false stars and particles",
@@ -61,6 +64,23 @@ class Outcomes:
 
 
 @dataclass(frozen=True)
+class Stated:
+    """A standard deviation that the device states with its attitudes, compared with their errors."""
+
+    axes: str
+    arcsec: float
+    """Median of the stated ones."""
+    shares: tuple[float, ...]
+    """Fractions of the errors about each axis within `SIGMAS` stated standard deviations."""
+
+    @classmethod
+    def of(cls, axes: str, errors: np.ndarray, stated: np.ndarray) -> Stated:
+        """Compare errors (n, axes) with the stated uncertainties (n,), both in arcseconds."""
+        within = np.abs(errors) / stated[:, None]
+        return cls(axes, float(np.median(stated)), tuple(float(np.mean(within <= limit)) for limit in SIGMAS))
+
+
+@dataclass(frozen=True)
 class EcssReport:
     """Figures of a campaign."""
 
@@ -73,6 +93,8 @@ class EcssReport:
     """Correct, wrong and invalid attitudes by condition; the first is at rest."""
     stars: float
     """Median number of stars detected at rest."""
+    stated: tuple[Stated, Stated]
+    """The uncertainty that the device states at rest, across the boresight and about it."""
 
     @property
     def total(self) -> ErrorLine:
@@ -113,6 +135,16 @@ class EcssReport:
             "wrong": sum(outcome.wrong for outcome in self.outcomes),
             "frames_of_all_conditions": sum(outcome.frames for outcome in self.outcomes),
             "stars_median": self.stars,
+            "stated": {
+                item.axes: {
+                    "arcsec": item.arcsec,
+                    **{
+                        f"within_{limit}_sigma": share
+                        for limit, share in zip(SIGMAS, item.shares, strict=True)
+                    },
+                }
+                for item in self.stated
+            },
         }
 
 
@@ -124,7 +156,8 @@ def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confi
     joined = {name: _joined(pieces) for name, pieces in by_name.items()}
     static = _series(joined[STATIC])
     rest = joined[REST]
-    found = np.abs(rest["error_arcsec"][~np.isnan(rest["error_arcsec"]).any(axis=1)])
+    valid = ~np.isnan(rest["error_arcsec"]).any(axis=1)
+    found, stated = np.abs(rest["error_arcsec"][valid]), rest["stated_arcsec"][valid]
     measured = np.quantile(found, confidence, axis=0) if len(found) else np.full(3, np.nan)
     return EcssReport(
         plan,
@@ -142,6 +175,10 @@ def make_report(plan: EcssPlan, parts: Iterable[tuple[str, int, Results]], confi
             if condition.influence not in (STATIC, THERMAL, DATED)
         ),
         float(np.median(rest["labels"][:, 2])),
+        (
+            Stated.of("across the boresight", found[:, :2], stated[:, 0]),
+            Stated.of("about the boresight", found[:, 2:], stated[:, 1]),
+        ),
     )
 
 
@@ -184,6 +221,7 @@ def as_markdown(report: EcssReport, plots: Sequence[str] = ()) -> str:
         report=report,
         plan=report.plan,
         interval=INTERVAL,
+        sigmas=SIGMAS,
         influences=INFLUENCES,
         plots={plot: PLOTS[plot] for plot in plots},
         error_row=_error_row,

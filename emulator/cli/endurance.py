@@ -134,10 +134,11 @@ def live_from_seed(unit: str, seed: int, steps: int, kind: str, folder: Path) ->
     """Generate a life and live it."""
     from starhil.emulator.endurance.unit_under_test import links_of
     from starhil.hil_tests.endurance.life import make_life
+    from starhil.hil_tests.judge.definition import unit_of
     from starhil.protocol.icd import load_unit
 
     icd = load_unit(unit)
-    life = make_life(icd, unit, links_of(icd), seed, steps, is_long=kind == "long")
+    life = make_life(unit_of(icd), unit, links_of(icd), seed, steps, is_long=kind == "long")
     return {**live(unit, life, rendered=kind == "rendered", folder=folder), "kind": kind}
 
 
@@ -170,6 +171,7 @@ def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -
     from starhil.emulator.endurance.simulated_loop import SimulatedLoop
     from starhil.emulator.endurance.unit_under_test import UnitUnderTest
     from starhil.hil_tests.endurance.run import LifeRun
+    from starhil.hil_tests.judge.definition import unit_of
     from starhil.protocol.icd import load_unit
 
     icd = load_unit(life.unit)
@@ -187,7 +189,7 @@ def run_once(life: Any, *, rendered: bool = False, record: Path | None = None) -
             record=record,
         )
         try:
-            return loop.run_until_complete(LifeRun(life, icd, unit, SIGMA_ARCSEC[rendered]).run())
+            return loop.run_until_complete(LifeRun(life, unit_of(icd), unit, SIGMA_ARCSEC[rendered]).run())
         finally:
             unit.dispose()
             loop.close()
@@ -201,13 +203,13 @@ def write_life(life: Any, violation: str, folder: Path) -> list[Path]:
     """Write a life as JSON, as a session, and as the recording of its last time under power, if that can be repeated."""
     from starhil.hil_tests.endurance.life import UNRECORDED
     from starhil.hil_tests.endurance.session_text import session_of
-    from starhil.protocol.icd import load_unit
+    from starhil.hil_tests.judge.definition import read_unit
 
     name = f"{Path(life.unit).name}-{life.seed}"
     folder.mkdir(parents=True, exist_ok=True)
     file, session, recording = folder / f"{name}.json", folder / f"{name}.toml", folder / f"{name}-recording"
     file.write_text(json.dumps({**asdict(life), "violation": violation}, indent=1) + "\n", encoding="utf-8")
-    session.write_text(session_of(life, load_unit(life.unit), violation), encoding="utf-8")
+    session.write_text(session_of(life, read_unit(life.unit), violation), encoding="utf-8")
     if UNRECORDED & {step["do"] for step in life.steps}:
         return [file, session]
     run_once(life, record=recording)

@@ -61,7 +61,7 @@ def _field_getter(field: Field, icd: InterfaceDefinition) -> Getter | None:
     getter: Getter = getter_of(name) if own is None else own.function
     if own is None and name.startswith(HEALTH):
         return _health(getter, field, icd)
-    declared = quantity_of(name, icd.model, icd.plugin)
+    declared = quantity_of(name, icd)
     scale = None if declared is None else factor(declared.unit, field.unit)
     if scale not in (None, 1.0):
         getter = _scaled(getter, float(scale or 1.0))

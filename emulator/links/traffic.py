@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from starhil.emulator.links.base import Link
 from starhil.emulator.signals import Signal
-from starhil.protocol.can_framing import CanDeviceReceiver, CanFrame, CanHostReceiver, CanId, MessageType
+from starhil.protocol.can_framing import REQUEST_KINDS, CanDeviceReceiver, CanFrame, CanHostReceiver, CanId
 from starhil.protocol.codec import Row
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
@@ -26,12 +26,6 @@ CONSOLE_ADDRESS: Final = 253
 
 MAX_ADDRESSES: Final = 64
 """Maximum number of addresses whose segments are joined: a link fault can cause many random CAN IDs."""
-
-_REQUEST_TYPES: Final = (
-    MessageType.TELECOMMAND,
-    MessageType.TELEMETRY_REQUEST,
-    MessageType.TELECOMMAND_EXTENDED,
-)
 
 _CANOPEN: Final = (
     (0x080, "SYNC or EMCY"), (0x180, "TPDO 1"), (0x200, "RPDO 1"), (0x280, "TPDO 2"), (0x300, "RPDO 2"),
@@ -138,7 +132,7 @@ class Decoder:
         if not frame.extended or self._icd.link.can is None:
             return ()
         can_id = CanId.unpack(frame.id)
-        request = can_id.type in _REQUEST_TYPES
+        request = can_id.type in REQUEST_KINDS
         key = (request, can_id.destination)
         if key not in self._can:
             if len(self._can) >= MAX_ADDRESSES:

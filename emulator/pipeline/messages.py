@@ -66,6 +66,9 @@ class PipelineSetup:
     """Whether frames may be displayed, so that previews must be possible."""
     dark_frames: int = 0
     """Number of frames averaged into the dark frame that is subtracted from each image; 0: none."""
+    calibration: list[list[float]] | None = None
+    """Covariance (9, 9) of the calibrated camera's parameters, as in `starid.calibration.Calibration`; None: they are
+    exact."""
     images: dict[str, Any] = field(default_factory=dict)
     """Source of images instead of rendering: keys of `[images]` in a profile."""
 

@@ -46,6 +46,7 @@ from starhil.emulator.truth.source import ZERO_RATE, TruthState
 from starid.aberration import aberrated
 from starid.arrays import Array
 from starid.attitude import Attitude
+from starid.calibration import attitude_covariance
 from starid.camera import Camera
 from starid.catalog import load_catalog
 from starid.errors import StaridError
@@ -124,6 +125,8 @@ class Pipeline:
         self.images: ImageSource | None = None
         """Source of images; None: they are rendered."""
         self._dark: DarkMap | None = None
+        self._calibration = None if setup.calibration is None else np.array(setup.calibration)
+        """Covariance (9, 9) of the calibrated camera's parameters; None: they are exact."""
 
     def warm_up(self, helper: subprocess.Popen[bytes] | None = None) -> None:
         """Render and solve frames, lost in space and tracking, so that every kernel is compiled.
@@ -267,12 +270,18 @@ class Pipeline:
                 window_px=float(min(settings.tracking_margin, *windows_px)),
                 observer_velocity=request.observer_velocity,
             )
-        if solution.valid and _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
+        if not solution.valid:
+            return solution
+        if _within_margin(identifier, solution, xy, request) < settings.min_stars_matched:
             reason = (
                 Reason.TOO_FEW_STARS if solution.star_count < settings.min_stars_matched else Reason.RESIDUAL
             )
             return Solution.invalid(reason, mode=solution.mode, elapsed=solution.elapsed)
-        return solution
+        if self._calibration is None:
+            return solution
+        camera, used = calibrated_camera(self.camera, settings), solution.detection_index
+        known = attitude_covariance(camera, self._calibration, xy[used], sigma[used])
+        return replace(solution, covariance=solution.covariance + known)
 
     def _identifier_setup(self, request: FrameRequest | IndexRequest) -> StarIdentifierSetup:
         """Return the setup of the star identifier for the parameters and the calibrated camera."""

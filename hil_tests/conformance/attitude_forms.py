@@ -22,6 +22,7 @@ from starhil.hil_tests.attitude import (
     conjugate,
     from_radec_roll,
     from_reported,
+    from_rotation_vector,
     from_vector_part,
     product,
     to_matrix,
@@ -71,17 +72,16 @@ def _quaternion(parts: Sequence[float], conventions: Conventions) -> Axes:
 
 
 def _rotation_vector(vector: Sequence[float], conventions: Conventions) -> Axes:
-    angle = math.hypot(*vector)
-    scale = math.sin(angle / 2.0) / angle if angle else 0.0
-    return _quaternion([*(part * scale for part in vector), math.cos(angle / 2.0)], conventions)
+    return _quaternion(from_rotation_vector(vector), conventions)
 
 
 def _euler(sequence: str) -> Callable[[Sequence[float], Conventions], Axes]:
     def read(angles: Sequence[float], conventions: Conventions) -> Axes:
         turned = Quaternion(0.0, 0.0, 0.0, 1.0)
         for letter, angle in zip(sequence, angles, strict=True):
-            about = [math.sin(angle / 2.0) if axis == letter else 0.0 for axis in "xyz"]
-            turned = product(turned, (*about, math.cos(angle / 2.0)))
+            turned = product(
+                turned, from_rotation_vector([angle if axis == letter else 0.0 for axis in "xyz"])
+            )
         reported = turned if conventions.quaternion == "attitude" else conjugate(turned)
         return _quaternion(reported, conventions)
 

@@ -4,8 +4,8 @@
     70 > abort TOGGLE {text}
     if 1003 kept 1003:0
 
-A file has `[[area]]` with `name`, `clause` and `intrusive`, and below it `[[area.case]]` with `name`, `title`, its own
-`clause` and `intrusive` if they differ, and `dialogue`. `REQUEST > ANSWER` sends bytes by SDO, padded to 8, and looks at
+They are in files of cases (`case_file`), in areas with `links = ["canopen"]`; one step per line, `#` begins a comment.
+`REQUEST > ANSWER` sends bytes by SDO, padded to 8, and looks at
 the next frame of the node; without a request, it looks at the frame after that, and after `wait` for as long as a
 transfer may take to time out. An answer is one of
 
@@ -61,15 +61,12 @@ from __future__ import annotations
 
 import inspect
 import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cache, partial
 from pathlib import Path
 from string import Formatter
-from typing import Annotated, Any, Final, Self
-
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from typing import Annotated, Any, Final
 
 from starhil.hil_tests.conformance.canopen_names import FINDERS, PARTS, TPDO, Names, default_id, provoke
 from starhil.hil_tests.conformance.canopen_probe import (
@@ -95,12 +92,10 @@ from starhil.hil_tests.conformance.case import (
     check,
     check_equal,
 )
+from starhil.hil_tests.conformance.case_file import read_case_file
 from starhil.hil_tests.errors import BenchError
 from starhil.hil_tests.judge.canopen import ABORT, HEARTBEAT, SDO_RESPONSE, SEGMENT, SYNC, upload_request
-from starhil.protocol.errors import reason
 from starhil.protocol.names import did_you_mean
-from starhil.protocol.user_file import read_user_text
-from starhil.protocol.validation_messages import problems
 
 LONGEST_TIMEOUT_S: Final = 12.0
 """Maximum time in which a node aborts a transfer whose client stops sending."""
@@ -199,10 +194,10 @@ def _parts(line: str) -> tuple[str, list[str], str]:
     return "", words, answer
 
 
-def lines_of(text: str) -> list[tuple[int, str]]:
+def _lines(text: str) -> list[tuple[int, str]]:
     """Return the lines of a dialogue with their numbers, without comments and empty lines."""
-    lines = ((number, line.partition("#")[0].strip()) for number, line in enumerate(text.splitlines(), 1))
-    return [(number, line) for number, line in lines if line]
+    lines = ((number, line.partition("#")[0].split(";")) for number, line in enumerate(text.splitlines(), 1))
+    return [(number, step.strip()) for number, steps in lines for step in steps if step.strip()]
 
 
 def _faults(line: str) -> Iterator[str]:
@@ -244,72 +239,40 @@ def _faults_of_request(words: Sequence[str], answer: str) -> Iterator[str]:
 # --- files ---
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
-
-    name: str = Field(pattern=r"^[\w-]+$")
-    clause: str | None = None
-    intrusive: bool | None = None
-
-
-class Dialogue(_Table):
-    """A case as a dialogue; its name is the last part of the ID."""
-
-    title: str
-    dialogue: str
-
-    @model_validator(mode="after")
-    def _check_lines(self) -> Self:
-        found = [
-            f"line {number} of the dialogue: {fault}"
-            for number, line in lines_of(self.dialogue)
-            for fault in _faults(line)
-        ]
-        if found:
-            raise ValueError(*found)
-        return self
-
-
-class DialogueArea(_Table):
-    """The cases of one area of the protocol."""
-
-    clause: str
-    intrusive: bool = False
-    cases: list[Dialogue] = Field(alias="case")
-
-
-class DialogueFile(BaseModel):
-    """A file of dialogues."""
-
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    areas: list[DialogueArea] = Field(alias="area")
-
-
 def dialogue_cases(path: Path) -> list[Case[CanopenProbe]]:
-    """Return the cases of a file.
+    """Return the cases on CANopen in a file of cases.
 
     Raises BenchError: the file cannot be read, or has errors; one line for each.
     """
-    try:
-        document = tomllib.loads(read_user_text(path))
-        areas = DialogueFile.model_validate(document).areas
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise BenchError(f"{path}: {reason(error)}") from None
-    except ValidationError as error:
-        raise BenchError(*(f"{path}: {item}" for item in problems(error, DialogueFile, document))) from None
+    file = read_case_file(path)
+    items = [(area, item) for area in file.area if "canopen" in area.links for item in area.cases]
+    texts = _Texts(file.texts)
+    found = [
+        f"{path}: {area.name}.{item.id}: line {number}: {fault}"
+        for area, item in items
+        for number, line in _lines(item.lines.format_map(texts))
+        for fault in _faults(line)
+    ]
+    if found:
+        raise BenchError(*found)
     return [
         case_in(
             f"canopen.{area.name}",
-            item.name,
+            item.id,
             item.title,
-            partial(_hold, [line for _, line in lines_of(item.dialogue)]),
+            partial(_hold, [line for _, line in _lines(item.lines.format_map(texts))]),
             item.clause or area.clause,
             intrusive=area.intrusive if item.intrusive is None else item.intrusive,
         )
-        for area in areas
-        for item in area.cases
+        for area, item in items
     ]
+
+
+class _Texts(dict[str, str]):
+    """Texts of a file for names in braces; other names remain."""
+
+    def __missing__(self, name: str) -> str:
+        return f"{{{name}}}"
 
 
 # --- holding a dialogue ---

@@ -40,7 +40,7 @@ def attitude(probe: CanopenProbe) -> None:
 
 
 def _dialogues(name: str) -> list[Case[CanopenProbe]]:
-    return dialogue_cases(Path(__file__).parent / "dialogues" / f"{name}.toml")
+    return dialogue_cases(Path(__file__).with_name(f"canopen_{name}_cases.toml"))
 
 
 CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
@@ -51,11 +51,11 @@ CANOPEN_CASES: Final[tuple[Case[CanopenProbe], ...]] = (
 
 
 def canopen_suite(unit: Unit) -> tuple[Case[Any], ...]:
-    """Return the cases for a unit on CANopen, with those of files in its folder `dialogues`, which replace any with the same ID.
+    """Return the cases for a unit on CANopen, with those of its own files, which replace any with the same ID.
 
     Raises IcdError: the unit has no CANopen node. Raises BenchError: a file has errors.
     """
-    files = sorted(unit.folder.glob("dialogues/*.toml")) if unit.folder is not None else ()
+    files = sorted(unit.folder.glob("*_cases.toml")) if unit.folder is not None else ()
     found = (
         *CANOPEN_CASES,
         *canopen_unit_cases(unit),

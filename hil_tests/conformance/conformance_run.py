@@ -29,7 +29,7 @@ from starhil.hil_tests.conformance.runner import (
 from starhil.hil_tests.conformance.serial_probe import DEFAULT_BAUD, SerialProbe
 from starhil.hil_tests.conformance.suites import can_suite, serial_suite, settings_of
 from starhil.hil_tests.control import ControlClient, Truth
-from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointing
+from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command, pointed
 from starhil.hil_tests.errors import BenchError, EmulatorProcessError
 from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.judge.definition import Unit, read_unit
@@ -289,7 +289,7 @@ def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorPr
         can=channel,
         dialect=request.dialect,
         seed=1,
-        settings=(*pointing(POINTING, request.settings), *request.settings),
+        settings=pointed(POINTING, request.settings),
         state_dir=folder,
         extra=extra,
     )

@@ -134,16 +134,8 @@ class LinkProbe(ABC):
         """Send a request without waiting; `answered` unless no answer is expected."""
 
     @abstractmethod
-    def send_text(self, text: str) -> None:
-        """Send hexadecimal bytes, or a CAN frame in which HH and DD are the addresses of host and device."""
-
-    @abstractmethod
-    def expecting(self, *answers: str) -> None:
-        """Record the rows that raw traffic is going to request, in order."""
-
-    @abstractmethod
-    def expect_exactly(self, answer: str) -> None:
-        """Take the next answer to raw traffic, given by row ID on serial and as a frame pattern on CAN."""
+    def exchange(self, sent: str, answers: Sequence[str]) -> None:
+        """Send raw traffic, and take the answers to it, which must be these; both in the format of `case_file`."""
 
     @abstractmethod
     def next_answer(self, timeout_s: float | None = None) -> Answer:
@@ -227,9 +219,12 @@ class LinkProbe(ABC):
     def ask(self, row: Row | int, data: bytes = b"", klass: str = "") -> Answer:
         """Send a request and return the answer; of an answer in several parts, the last."""
         self.post(row, data, klass)
-        answer = self.next_answer()
-        while not answer.final:
-            answer = self.next_answer()
+        return self.last_answer()
+
+    def last_answer(self) -> Answer:
+        """Return the next answer; of one in several parts, the last."""
+        while not (answer := self.next_answer()).final:
+            pass
         return answer
 
     def data_of(self, row: Row) -> bytes:
@@ -282,12 +277,14 @@ class LinkProbe(ABC):
             self.expect_silence(f"no answer can express the refusal of {what} on this link")
             self.check_reported(request.id, error)
             return
-        answer = self.ask(row, data, klass)
-        wanted = f"refusal of {what}"
-        if self.has_codes:
-            wanted += f" with code {self.unit.code(error)}"
-        refused = answer.kind == "nack" and (not self.has_codes or answer.code == self.unit.code(error))
-        check(refused, wanted, answer)
+        self.post(row, data, klass)
+        self.expect_nack(f"refusal of {what}", error)
+
+    def expect_nack(self, what: str, error: str) -> None:
+        """Take the next answer, which must be a refusal with the code of an error, if refusals have one on this link."""
+        answer, code = self.last_answer(), self.unit.code(error) if self.has_codes else None
+        refused = answer.kind == "nack" and code in (None, answer.code)
+        check(refused, what if code is None else f"{what} with code {code}", answer)
 
     def expect_refused(self, name: str, error: str, **values: Value) -> None:
         """Send a telecommand by name, which must be refused with a code."""

@@ -1,7 +1,7 @@
 """Conformance on the serial line: framing, check, header, echoes, pace and recovery, for the link of any unit.
 
-The cases of a CubeSpace line are a table of bytes; those of a composed line change one part of a message that the
-judge has written.
+The cases of a CubeSpace line at its limits are bytes in a file; those of a composed line change one part of a message
+that the judge has written.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any, Final
 
 from starhil.hil_tests.conformance.case import (
     Case,
-    CaseArea,
     CaseFailed,
     CaseSkipped,
     case_in,
@@ -22,10 +21,10 @@ from starhil.hil_tests.conformance.case import (
     check_equal,
     rule,
 )
-from starhil.hil_tests.conformance.link_probe import INVALID_ID, INVALID_LENGTH, lively_row
+from starhil.hil_tests.conformance.case_file import CUBESPACE_CASES, read_case_file
+from starhil.hil_tests.conformance.link_probe import INVALID_ID, lively_row
 from starhil.hil_tests.conformance.row_cases import CLOCK_S, row_cases
 from starhil.hil_tests.conformance.serial_probe import BITS_A_BYTE, SerialProbe
-from starhil.hil_tests.conformance.wire_tables import Exchange, add_exchange_cases, filled
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.framings import Framing
 from starhil.hil_tests.judge.headers import Header
@@ -34,14 +33,10 @@ from starhil.hil_tests.judge.serial import Headed, SerialLine
 
 CLAUSE: Final = "[link.serial]"
 CUBESPACE: Final = "serial framing 1F 7F … 1F FF (libCubeObc, AlbertaSat adcs_io.c)"
-STUFFING: Final = "1F in the data is doubled (libCubeObc, CTS)"
-UNSTUFFED: Final = "flight software differs: AlbertaSat, RADSAT"
-REPLIES: Final = "reply formats: a AlbertaSat, b RADSAT, c libCubeObc"
 DEFAULT_MAX_SIZE: Final = 512
 """Longest message that a receiver accepts, unless the definition or a row asks for more."""
 ESCAPE: Final = 0x1F
 """Escape byte of CubeSpace, and the ID that it would be: 31."""
-SHORT_PAUSE_S: Final = 0.1
 CLOCK_GRAIN_S: Final = 1e-4
 
 Run = Callable[[SerialProbe], None]
@@ -55,7 +50,7 @@ def serial_cases(unit: Unit) -> Iterator[Case[Any]]:
     yield from _framing(line, framing, in_text=bool(lively.request))
     highest = 255
     if line.dialect is not None:
-        yield from _cubespace(unit)
+        yield from read_case_file(CUBESPACE_CASES).cases("serial", serial_names(unit))
     texts = [row for row in unit.rows if row.request]
     if texts:
         yield from _texts(texts)
@@ -171,75 +166,21 @@ def _framing(line: SerialLine, framing: Framing, *, in_text: bool) -> Iterator[C
         yield case_in("framing", name, title, run, source)
 
 
-READ: Final = "1F 7F {row} 1F FF"
-"""Request for a short row; {row_id} is its ID as a decimal number, {other} and {other_id} another one's."""
+def serial_names(unit: Unit) -> dict[str, str]:
+    """Return the texts for names in braces.
 
-EXCHANGES: Final = (
-    Exchange("two-rows", "requests for two rows sent together are answered in order", (READ + "1F 7F {other} 1F FF",), ("{row_id}", "{other_id}")),
-    Exchange("twenty-at-once", "twenty requests sent together are all answered", (READ * 20,), ("{row_id}",) * 20),
-    Exchange("cut-in-escape", "a request may be split after 1F", ("1F", "7F {row} 1F", "FF"), ("{row_id}",), pause_s=0.02),
-    Exchange("pause", "a pause of 0.1 s within a request has no effect", ("1F 7F", "{row} 1F FF"), ("{row_id}",), pause_s=SHORT_PAUSE_S, clause=rule(1)),
-    Exchange("junk-before", "bytes before a request are ignored", ("00 55 AA FF" + READ,), ("{row_id}",)),
-    Exchange("junk-between", "bytes between requests are ignored", (READ + "00 FF 7F" + READ,), ("{row_id}", "{row_id}")),
-    Exchange("junk-after", "bytes after a request do not affect the next one", (READ + "42", READ), ("{row_id}", "{row_id}"), pause_s=0.02),
-    Exchange("escape-before", "a single 1F before a request is ignored", ("1F" + READ,), ("{row_id}",)),
-    Exchange("escapes-before", "several 1F before a request are ignored", ("1F 1F 1F" + READ,), ("{row_id}",)),
-    Exchange("junk-escape", "1F and a meaningless byte before a request are ignored", ("1F 00" + READ,), ("{row_id}",)),
-    Exchange("end-alone", "an end mark without a start is not answered", ("1F FF",)),
-    Exchange("end-before", "an end mark before a request is ignored", ("1F FF" + READ,), ("{row_id}",)),
-    Exchange("start-alone", "a start mark alone is not answered", ("1F 7F",)),
-    Exchange("starts", "a second start mark restarts the message", ("1F 7F" + READ,), ("{row_id}",)),
-    Exchange("cut-off", "a message interrupted by another is dropped, and the other answered", ("1F 7F {other}" + READ,), ("{row_id}",)),
-    Exchange("cut-off-data", "a message with data that is interrupted by another is dropped", ("1F 7F 02 11 22 33" + READ,), ("{row_id}",)),
-    Exchange("empty", "a message without an ID is not answered", ("1F 7F 1F FF",)),
-    Exchange("empty-then-good", "a request after an empty message is answered", ("1F 7F 1F FF" + READ,), ("{row_id}",)),
-    Exchange("bad-escape", "a bad escape within a message aborts it without effect", ("1F 7F {row} 1F 00",), clause=rule(3)),
-    Exchange("bad-escape-then-good", "a request after a bad escape is answered", ("1F 7F {row} 1F 00" + READ,), ("{row_id}",), clause=rule(3)),
-    Exchange("start-of-ack", "1F 07 is the start of a reply, not of a request", ("1F 07 {row} 1F FF",), clause=REPLIES),
-    Exchange("start-of-nack", "1F 0F is the start of a reply, not of a request", ("1F 0F {row} 1F FF",), clause=REPLIES),
-    Exchange("start-of-event", "1F 2F is the start of an event, not of a request", ("1F 2F {row} 1F FF",), clause=REPLIES),
-    Exchange("start-of-unsolicited", "1F 4F is the start of unsolicited telemetry, not of a request", ("1F 4F {row} 1F FF",), clause=REPLIES),
-    Exchange("noise", "noise is not answered", ("FF" * 64 + "00" * 64 + "7F" * 64,)),
-    Exchange("escapes", "a run of 1F is not answered", ("1F" * 200,)),
-    Exchange("ends", "a run of end marks is not answered", ("1F FF" * 100,)),
-)  # fmt: skip
-
-
-def _cubespace(unit: Unit) -> Iterator[Case[SerialProbe]]:
-    """Yield the cases of the framing `1F 7F … 1F FF` at its limits."""
-    rows = sorted(unit.telemetry.values(), key=lambda row: row.size)[:2]
-    names = zip(("row", "other"), (rows[0], rows[-1]), strict=True)
-    texts = {f"{name}{part}": text for name, row in names for part, text in _id_texts(row)}
-    area = CaseArea[SerialProbe]("framing", CUBESPACE)
-    add_exchange_cases(area, filled(EXCHANGES, texts))
-    yield from area.cases
-    title = "a message of 512 bytes is received and refused for its length"
-    yield case_in("framing", "longest", title, longest, rule(4))
-    if any(row.id == ESCAPE for row in unit.rows):
-        return
-    # the second is sent with data, because some senders stuff only the data
-    for name, title, text, clause in (
-        ("id", "ID 1F doubled is ID 31, which does not exist", "1F 7F 1F 1F 1F FF", STUFFING),
-        ("id-single", "ID 1F not doubled is ID 31, too", "1F 7F 1F 00 01 1F FF", UNSTUFFED),
-    ):
-        yield case_in("stuffing", name, title, partial(_refuses_31, text), clause, intrusive=True)
-
-
-def _id_texts(row: Row) -> tuple[tuple[str, str], ...]:
-    """Return the endings of the names for the ID of a row, and its texts: hexadecimal, decimal."""
-    return ("", f"{row.id:02X}"), ("_id", str(row.id))
-
-
-def longest(probe: SerialProbe) -> None:
-    probe.expect_refusal(probe.lively, bytes(DEFAULT_MAX_SIZE - 1), INVALID_LENGTH)
-
-
-def _refuses_31(text: str, probe: SerialProbe) -> None:
-    probe.send_text(text)
-    probe.expecting(str(ESCAPE))
-    answer = probe.next_answer()
-    code = probe.unit.code(INVALID_ID)
-    check(answer.kind == "nack" and answer.code == code, f"refusal with code {code}", answer)
+    `row`, `other`, `lively`: ID of telemetry in hexadecimal, `row_id` decimal; `read`: CubeSpace's request for `row`; `no_row_31`:
+    the ID 31, if no row has it.
+    """
+    small = sorted(unit.telemetry.values(), key=lambda row: row.size)[:2]
+    lively = lively_row(unit, SerialLine(unit).envelope.can_refuse)
+    found: dict[str, str] = {}
+    for name, row in (("row", small[0]), ("other", small[-1]), ("lively", lively)):
+        found |= {name: f"{row.id:02X}", f"{name}_id": str(row.id)}
+    found["read"] = f"1F 7F {found['row']} 1F FF"
+    if all(row.id != ESCAPE for row in unit.rows):
+        found["no_row_31"] = str(ESCAPE)
+    return found
 
 
 # --- texts ---
@@ -251,9 +192,7 @@ def _expect_text_refused(probe: SerialProbe) -> None:
         probe.expect_silence("no text refuses a request on this link")
         return
     probe.line.expect(probe.unit.request(probe.lively))
-    answer = probe.next_answer()
-    refused = answer.kind == "nack" and (not probe.has_codes or answer.code == probe.unit.code(INVALID_ID))
-    check(refused, "the text of a refusal for an unknown request", answer)
+    probe.expect_nack("the text of a refusal for an unknown request", INVALID_ID)
 
 
 def _texts(rows: list[Row]) -> Iterator[Case[SerialProbe]]:

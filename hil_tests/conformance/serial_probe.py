@@ -6,7 +6,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from starhil.hil_tests.conformance.case import check
 from starhil.hil_tests.conformance.link_probe import LATE_S, LinkProbe, ProbeTimes, Settings, late
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
@@ -68,10 +67,6 @@ class SerialProbe(LinkProbe):
         seconds = len(data) * BITS_A_BYTE / (self.baud or DEFAULT_BAUD)
         self._line_free = max(self._line_free, self.now()) + seconds
 
-    def send_text(self, text: str) -> None:
-        """Send bytes written in hexadecimal."""
-        self.send(bytes.fromhex(text))
-
     def _note(self, way: str, data: bytes) -> None:
         more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
         self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
@@ -126,17 +121,18 @@ class SerialProbe(LinkProbe):
         """Return whether a refusal differs from the data, which in dialects a and b may be one byte as well."""
         return self.dialect not in ("a", "b") or row.size != 1
 
-    def expecting(self, *answers: str) -> None:
-        """Record the requested rows, given by their IDs, in order."""
-        for row_id in answers:
-            self.line.expect(self.unit.request(int(row_id)))
-
-    def expect_exactly(self, answer: str) -> None:
-        """Take the next answer, which must be the telemetry of the row with this ID."""
-        row = self.unit.row(self.unit.request(int(answer)))
-        check(row is not None, f"a row with ID {answer}", "none")
-        if row is not None:
-            self.expect_telemetry(row)
+    def exchange(self, sent: str, answers: Sequence[str]) -> None:
+        """Send bytes, and take the telemetry or the refusal of each row."""
+        requests = [self.unit.request(int(answer.partition("!")[0])) for answer in answers]
+        for request in requests:
+            self.line.expect(request)
+        self.send(bytes.fromhex(sent))
+        for request, answer in zip(requests, answers, strict=True):
+            row, error = self.unit.row(request), answer.partition("!")[2]
+            if error or row is None:
+                self.expect_nack(f"refusal of {request}", error)
+            else:
+                self.expect_telemetry(row)
 
     def post_request(self, request: Request, *, answered: bool = True) -> None:
         """Send a request without waiting."""

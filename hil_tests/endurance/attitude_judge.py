@@ -3,16 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
-from starhil.hil_tests.attitude import Quaternion, conjugate, from_matrix, product
-from starhil.hil_tests.endurance.truth import Error, Motion, Vector, cross, frame_turned, of_pairs
-from starhil.hil_tests.endurance.violation import Known, Violation, resolution
-from starhil.protocol.codec import Field
+from starhil.hil_tests.attitude import (
+    ARCSEC_PER_RAD,
+    Quaternion,
+    Vector,
+    conjugate,
+    cross,
+    from_directions,
+    from_matrix,
+    from_radec_roll,
+    from_reported,
+    from_rotation_vector,
+    product,
+    rotation_vector,
+)
+from starhil.hil_tests.endurance.violation import Known, Violation
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field
 from starhil.protocol.conventions import Conventions
 from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import Value
 
 SIGMAS: Final = 6.0
 """A valid attitude is within this many of its stated standard deviations of the truth."""
@@ -24,13 +37,48 @@ STALE_S: Final = 2.0
 LONGEST_PERIOD_S: Final = 100.0
 """Longest update period that a unit can have."""
 KEPT_PERIODS: Final = 20
+MOUNTING: Final = ("alpha", "beta", "gamma")
+"""Names of the angles by which the frame is turned about x, y and z, in this order."""
 SMALLEST_SCALAR: Final = 0.1
 """Smallest scalar that is computed from the other three numbers of a quaternion."""
-ARCSEC: Final = math.radians(1.0 / 3600.0)
-NO_TURN: Final = Quaternion(0.0, 0.0, 0.0, 1.0)
+ARCSEC: Final = 1.0 / ARCSEC_PER_RAD
 
 Readings = Mapping[str, tuple[Field, Value]]
 """Field and value of each quantity of a row."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A rotation at a constant body rate, in the sensor frame, since a simulation time; `attitude` is that of the start."""
+
+    start_s: float
+    attitude: Quaternion
+    rate_rad_s: Vector
+
+    @classmethod
+    def of(cls, truth: Mapping[str, Any], start_s: float) -> Motion:
+        """Return the motion of a truth table of kind `fixed` or `rate`."""
+        angles = truth["attitude"]
+        attitude = from_radec_roll(angles["ra_deg"], angles["dec_deg"], angles.get("roll_deg", 0.0))
+        x, y, z = (math.radians(value) for value in truth.get("rate_deg_s", (0.0, 0.0, 0.0)))
+        return cls(start_s, attitude, (x, y, z))
+
+    def at(self, t_s: float) -> Quaternion:
+        """Return the attitude at a time."""
+        turned = from_rotation_vector([-rate * (t_s - self.start_s) for rate in self.rate_rad_s])
+        return product(turned, self.attitude)
+
+    def error(self, measured: Quaternion, t_s: float, slack_s: float) -> Vector:
+        """Return the rotation vector from the true attitude at a time, uncertain by `slack_s` both ways, to a measured one."""
+        error = rotation_vector(product(measured, conjugate(self.at(t_s))))
+        speed2 = sum(rate * rate for rate in self.rate_rad_s)
+        if speed2 == 0.0:
+            return error
+        # the frame turns by -rate * t, so a later exposure is an error along -rate
+        late_s = -sum(part * rate for part, rate in zip(error, self.rate_rad_s, strict=True)) / speed2
+        shift_s = min(max(late_s, -slack_s), slack_s)
+        x, y, z = (part + rate * shift_s for part, rate in zip(error, self.rate_rad_s, strict=True))
+        return x, y, z
 
 
 class AttitudeJudge:
@@ -48,7 +96,6 @@ class AttitudeJudge:
         self.motions: list[Motion] = []
         self.dark_since_s: float | None = None
         self._periods: list[tuple[float, float]] = []
-        self._turn_cache: tuple[tuple[float, ...], Quaternion] = ((), NO_TURN)
 
     def started(self, now_s: float, values: Mapping[str, Known | None]) -> None:
         """The unit has started with these parameters."""
@@ -70,7 +117,7 @@ class AttitudeJudge:
         stars = _stars(read)
         if not read["attitude.valid"][1]:
             if any(
-                abs(number) > resolution(field) for number, (field, _) in zip(numbers, reported, strict=True)
+                abs(number) > field.resolution for number, (field, _) in zip(numbers, reported, strict=True)
             ):
                 raise Violation(f"{row}: quaternion {numbers} though the attitude is invalid")
             if stars:
@@ -85,7 +132,7 @@ class AttitudeJudge:
         if not math.isfinite(window_s):
             return
         if len(numbers) >= 3:
-            finest = max(resolution(field) for field, _ in reported) + 1e-7
+            finest = max(field.resolution for field, _ in reported) + 1e-7
             self._judge_quaternion(row, numbers, 4.0 * finest, read, (now_s, window_s), values)
         if len(stars) >= 2:
             self._judge_stars(row, stars, (now_s, window_s), values)
@@ -109,9 +156,8 @@ class AttitudeJudge:
         length = math.sqrt(sum(number * number for number in numbers))
         if abs(length - 1.0) > tolerance:
             raise Violation(f"{row}: the quaternion has length {length!r}")
-        x, y, z, w = (number / length for number in numbers)
-        q = Quaternion(x, y, z, w)
-        measured = self._to_sensor(conjugate(q) if self._conventions.quaternion == "attitude" else q, values)
+        q = Quaternion(*(number / length for number in numbers))
+        measured = self._without_mounting(from_reported(q, self._conventions), values)
         if measured is not None:
             self.count += 1
             self._check_error(row, self._errors(measured, *window), read, tolerance)
@@ -135,14 +181,16 @@ class AttitudeJudge:
             )
         if apart < 10.0 * star_rad:
             return
-        measured = self._to_sensor(of_pairs((one, other), (one_icrs, other_icrs)), values)
+        reported = from_directions((one, other), (one_icrs, other_icrs))
+        axes = from_matrix(self._conventions.rows)
+        measured = self._without_mounting(product(conjugate(axes), reported), values)
         if measured is None:
             return
         self.count += 1
         tolerance = star_rad * (1.0 + 1.0 / apart)
         self._check_error(row, self._errors(measured, *window), {}, tolerance)
 
-    def _check_error(self, row: str, errors: list[Error], read: Readings, tolerance_rad: float) -> None:
+    def _check_error(self, row: str, errors: Sequence[Vector], read: Readings, tolerance_rad: float) -> None:
         """Check the errors to the truth against what is stated, or else the largest that may be left unstated."""
         stated = [read.get("attitude.sigma_cross"), read.get("attitude.sigma_roll")]
         cross, roll = (
@@ -151,58 +199,55 @@ class AttitudeJudge:
             * SIGMAS
             for item, largest in zip(stated, self._sigma_arcsec, strict=True)
         )
-        if any(
-            item.cross_rad <= cross + tolerance_rad and abs(item.z) <= roll + tolerance_rad for item in errors
-        ):
+        found = [(math.hypot(x, y), abs(z)) for x, y, z in errors]
+        if any(one <= cross + tolerance_rad and other <= roll + tolerance_rad for one, other in found):
             return
-        best = min(errors, key=lambda item: item.cross_rad + abs(item.z))
+        across, about = min(found, key=sum)
         raise Violation(
-            f"{row}: a valid attitude {best.cross_rad / ARCSEC:.2f} arcsec across and {abs(best.z) / ARCSEC:.2f} about "
+            f"{row}: a valid attitude {across / ARCSEC:.2f} arcsec across and {about / ARCSEC:.2f} about "
             f"the boresight from the truth; {SIGMAS:g} sigma are {cross / ARCSEC:.2f} and {roll / ARCSEC:.2f}"
         )
 
-    def _errors(self, measured: Quaternion, now_s: float, window_s: float) -> list[Error]:
+    def _errors(self, measured: Quaternion, now_s: float, window_s: float) -> list[Vector]:
         """Return the errors to the truth at the times at which the exposure may have been."""
-        errors: list[Error] = []
+        errors: list[Vector] = []
         begin_s = now_s - window_s
         for number, motion in enumerate(self.motions):
             later = self.motions[number + 1].start_s if number + 1 < len(self.motions) else now_s
             if later < begin_s:
                 continue
             start_s, end_s = max(begin_s, motion.start_s), max(min(later, now_s), motion.start_s)
-            turn_rad = motion.speed_rad_s * (end_s - start_s)
+            turn_rad = math.hypot(*motion.rate_rad_s) * (end_s - start_s)
             count = 1 + min(5000, math.ceil(turn_rad / 0.02))
             slack_s = 0.5 * (end_s - start_s) / count + 1e-3
             for step in range(count):
                 mid_s = start_s + (step + 0.5) * (end_s - start_s) / count
-                errors.append(Error.between(measured, motion.at(mid_s)).along(motion.rate_rad_s, slack_s))
+                errors.append(motion.error(measured, mid_s, slack_s))
         return errors
 
-    def _to_sensor(self, reported: Quaternion, values: Mapping[str, Known | None]) -> Quaternion | None:
-        """Return an attitude of the reported frame in the sensor frame; None if the mounting is not known."""
-        angles = [values[f"mounting_{name}"] for name in ("alpha", "beta", "gamma")]
-        if any(angle is None for angle in angles):
-            return None
-        numbers = tuple(float(angle[0]) for angle in angles if angle is not None)
-        if self._turn_cache[0] != numbers:
-            turn = NO_TURN
-            for axis, angle in enumerate(numbers):
-                unit = [float(index == axis) for index in range(3)]
-                turn = product(frame_turned(unit, math.radians(angle)), turn)
-            self._turn_cache = (numbers, product(from_matrix(self._conventions.rows), turn))
-        return product(conjugate(self._turn_cache[1]), reported)
+    def _without_mounting(
+        self, attitude: Quaternion, values: Mapping[str, Known | None]
+    ) -> Quaternion | None:
+        """Return an attitude of the mounted sensor in its own frame; None if the mounting is not known."""
+        for axis in reversed(range(3)):
+            angle = values[f"mounting_{MOUNTING[axis]}"]
+            if angle is None:
+                return None
+            turn = [math.radians(float(angle[0])) if index == axis else 0.0 for index in range(3)]
+            attitude = product(from_rotation_vector(turn), attitude)
+        return attitude
 
     def check_period(
         self, where: str, field: Field, value: Value, now_s: float, values: Mapping[str, Known | None]
     ) -> None:
         """Check the time between exposures, which changes with the next image after a telecommand."""
-        low, high = field.physical_limits
+        low, high = field.limits
         scale = factor("s", field.unit) or 1.0
         recent = self._recent_periods(now_s, values)
         if isinstance(value, (str, bytes)) or not all(map(math.isfinite, recent)):
             return
         possible = [min(max(period * scale, low), high) for period in recent]
-        if all(abs(value - period) > resolution(field) + 1e-6 * period for period in possible):
+        if all(abs(value - period) > field.resolution + 1e-6 * period for period in possible):
             raise Violation(f"{where}: {value!r}, not {possible[0]!r}")
 
     def _recent_periods(self, now_s: float, values: Mapping[str, Known | None]) -> list[float]:
@@ -244,6 +289,6 @@ def _stars(read: Readings) -> list[tuple[Vector, Vector, float]]:
             (
                 (numbers[0], numbers[1], numbers[2]),
                 (numbers[3], numbers[4], numbers[5]),
-                resolution(items[0][0]),
+                items[0][0].resolution,
             )
         )

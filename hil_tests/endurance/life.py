@@ -34,11 +34,9 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.violation import quantity_of
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.device_model import PARAMETER
-from starhil.protocol.values import Parameter, Value
+from starhil.hil_tests.judge.definition import Parameter, Unit
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
 
 Step = dict[str, Any]
 
@@ -120,7 +118,7 @@ class Outcome:
 
 
 def make_life(
-    icd: InterfaceDefinition,
+    definition: Unit,
     unit: str,
     links: tuple[str, ...],
     seed: int,
@@ -130,7 +128,7 @@ def make_life(
 ) -> Life:
     """Generate a life of `count` steps."""
     random_of_life = random.Random(f"{unit} {seed}")  # noqa: S311 (reproducible, not secret)
-    commanded = any(row.action == "set_mode" for row in icd.telecommands.values())
+    commanded = any(row.action == "set_mode" for row in definition.telecommands.values())
     start_mode = random_of_life.choice(["standby", "lost_in_space"]) if commanded else "lost_in_space"
     update_rate = round(10.0 ** random_of_life.uniform(-2.0, 1.0), 3)
     if is_long:
@@ -143,7 +141,7 @@ def make_life(
         "start_unix_s": float(random_of_life.choice([1_767_225_600, 2**31 - 3600, 4_102_444_800]))
     }
     used = tuple(link for link in links if random_of_life.random() < 0.6) or (random_of_life.choice(links),)
-    generator = LifeGenerator(icd, used, random_of_life, is_long=is_long)
+    generator = LifeGenerator(definition, used, random_of_life, is_long=is_long)
     return Life(unit, seed, used, profile, tuple(islice(generator.steps(), count)))
 
 
@@ -152,17 +150,17 @@ class LifeGenerator:
 
     def __init__(
         self,
-        icd: InterfaceDefinition,
+        definition: Unit,
         links: tuple[str, ...],
         random_of_life: random.Random,
         *,
         is_long: bool = False,
     ) -> None:
-        self._icd = icd
+        self._definition = definition
         self._links = links
         self._random = random_of_life
-        self._telemetry = list(icd.telemetry.values())
-        self._telecommands = list(icd.telecommands.values())
+        self._telemetry = list(definition.telemetry.values())
+        self._telecommands = list(definition.telecommands.values())
         self._attitude_rows = [
             row for row in self._telemetry if any(field.value == "attitude.valid" for field in row.fields)
         ]
@@ -231,7 +229,7 @@ class LifeGenerator:
         return [
             row
             for row in self._telemetry
-            if any(quantity_of(field).startswith(beginnings) for field in row.fields)
+            if any(field.quantity.startswith(beginnings) for field in row.fields)
         ]
 
     # --- time and requests ---
@@ -261,21 +259,19 @@ class LifeGenerator:
         if not self._telecommands:
             return self._read_any()
         (row,) = self._random.choices(self._telecommands, self._command_weights)
-        return self._request(row, row.encode(self._values(row), check=False))
+        return self._request(row, row.encode(self._values(row)))
 
     def _mode(self) -> Step:
         if not self._mode_rows:
             return self._read_any()
         row = self._random.choice(self._mode_rows)
         values = self._values(row)
-        for field in row.named_fields.values():
+        for field in row.named.values():
             if field.argument == "mode" and field.enum is not None:
-                wanted = [
-                    name for name in ("lost_in_space", "tracking", "standby") if name in field.enum.values
-                ]
+                wanted = [name for name in ("lost_in_space", "tracking", "standby") if name in field.enum]
                 if wanted:
                     values[field.name] = self._random.choice([wanted[0], *wanted])
-        return self._request(row, row.encode(values, check=False))
+        return self._request(row, row.encode(values))
 
     def _read_count(self) -> Step:
         return self._request(self._random.choice(self._count_rows or self._telemetry))
@@ -284,7 +280,7 @@ class LifeGenerator:
         if not self._clock_rows:
             return self._read_count()
         row = self._random.choice(self._clock_rows)
-        return self._request(row, row.encode(self._values(row), check=False))
+        return self._request(row, row.encode(self._values(row)))
 
     def _stream(self) -> Step:
         """Let the unit send telemetry without requests."""
@@ -292,13 +288,13 @@ class LifeGenerator:
             return self._read_any()
         row = self._random.choice(self._stream_rows)
         values: dict[str, Value] = {}
-        for name, field in row.named_fields.items():
+        for name, field in row.named.items():
             if field.argument == "rate":
                 values[name] = self._random.choice([0.0, 10.0 ** self._random.uniform(-2.0, 0.7)])
             elif (field.argument or "").startswith("telemetry"):
                 number = self._random.choice(self._attitude_rows + self._telemetry).id
                 values[name] = number if self._random.random() < 0.5 or row.size < 8 else 0
-        return self._request(row, row.encode(values, check=False))
+        return self._request(row, row.encode(values))
 
     def _flood(self) -> Step:
         """Repeat the shortest request of its kind, often enough in a life if the unit has counters of 16 bits."""
@@ -332,15 +328,15 @@ class LifeGenerator:
     # --- values ---
 
     def _values(self, row: Row) -> dict[str, Value]:
-        values = {name: self._value(field) for name, field in row.named_fields.items() if field.const is None}
+        values = {name: self._value(field) for name, field in row.named.items() if field.const is None}
         if row.action == "set_parameter":
             self._choose_parameter(row, values)
         return values
 
     def _choose_parameter(self, row: Row, values: dict[str, Value]) -> None:
         """Set one parameter of the unit, mostly to a value within its limits."""
-        by_argument = {field.argument: field for field in row.named_fields.values()}
-        parameters = list(self._icd.parameters.values())
+        by_argument = {field.argument: field for field in row.named.values()}
+        parameters = list(self._definition.parameters.values())
         if self._random.random() < ADDRESS_SHARE:
             parameters = [known for known in parameters if known.name in ADDRESSES] or parameters
         parameter = self._random.choice(parameters)
@@ -352,10 +348,10 @@ class LifeGenerator:
     def _parameter_value(self, parameter: Parameter) -> float:
         chance = self._random.random()
         if chance < USUAL_SHARE and parameter.name not in ADDRESSES:
-            return parameter.to_number(parameter.default)
+            return parameter.default_number
         if parameter.enum is not None:
-            return float(self._random.choice(list(parameter.enum.values.values())))
-        low, high = (0.0, 1.0) if parameter.type == "bool" else (parameter.minimum, parameter.maximum)
+            return float(self._random.choice(list(parameter.enum.values())))
+        low, high = parameter.minimum, parameter.maximum
         span = high - low
         edges = [low, high, low - 1.0, high + 1.0, low - 1e-3 * span, high + 1e-3 * span, -0.0, 5e-324]
         value = self._random.choice(edges) if chance > 0.9 else self._random.uniform(low, high)
@@ -365,16 +361,16 @@ class LifeGenerator:
         """Return a value within the limits of a field."""
         chance = self._random.random()
         if field.argument in ("unix", "seconds") and chance < 0.5:
-            low, high = field.physical_limits
+            low, high = field.limits
             inside = [second for second in EDGE_CLOCKS_S if low <= second <= high]
             if inside:
                 return self._random.choice(inside)
         if field.parameter is not None and chance < USUAL_SHARE:
-            default = self._icd.device_parameters[field.parameter].default
+            default = self._definition.device_parameters[field.parameter].default
             if field.kind in ("integer", "float", "bits") and not isinstance(default, str):
-                low, high = field.physical_limits
+                low, high = field.limits
                 return min(max(default, low), high)
-            if isinstance(default, str) and field.enum is not None and default in field.enum.values:
+            if isinstance(default, str) and default in (field.enum or {}):
                 return default
         match field.kind:
             case "flag":
@@ -384,9 +380,9 @@ class LifeGenerator:
             case "text":
                 return "x" * self._random.randint(0, field.size)
             case "enum":
-                return self._random.choice(list(field.enum.values)) if field.enum is not None else 0
+                return self._random.choice(list(field.enum or ()))
             case "float":
-                low, high = field.physical_limits
+                low, high = field.limits
                 edges = [low, high, 0.0, 1.0]
                 finite = [edge for edge in edges if low <= edge <= high and abs(edge) < 1e30]
                 if finite and (chance > 0.9 or high - low > 1e9):
@@ -399,7 +395,7 @@ class LifeGenerator:
                     if chance > 0.9
                     else self._random.randint(low_raw, high_raw)
                 )
-                return field.to_physical(raw)
+                return field.physical(raw)
 
     # --- invalid input ---
 
@@ -408,11 +404,14 @@ class LifeGenerator:
         row = self._random.choice(rows)
         match self._random.randrange(3):
             case 0:
-                on_wire = any(item.code is not None for item in self._icd.classes)
+                on_wire = any(item.code is not None for item in self._definition.classes)
                 known = {other.id for other in rows if not on_wire or other.klass == row.klass}
                 unknown = [number for number in range(256) if number not in known]
                 number = self._random.choice(unknown) if unknown else row.id
-                kind = row.kind if self._icd.classes else self._icd.kind_of_id(number).value
+                kind = row.kind
+                if not self._definition.classes:
+                    is_telemetry = self._definition.is_telemetry("", number)
+                    kind = "telemetry" if is_telemetry else "telecommand"
                 return self._raw_request(row.klass, number, kind, b"")
             case 1:
                 size = row.size if row.kind == "telecommand" else 0

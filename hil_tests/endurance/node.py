@@ -8,19 +8,16 @@ Lives do not change the mapping.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import replace
+from typing import Final
 
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.violation import Violation
 from starhil.hil_tests.judge import canopen
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.rows import Row
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import Field
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.codec import Field
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.values import Value
 
 DEVICE_ERROR: Final = 0xFF00
 """Base of the EMCY error codes of the error mode (docs/canopen.md)."""
@@ -32,49 +29,18 @@ TPDO: Final = 0x1800
 Readings = dict[str, tuple[Field, Value]]
 
 
-@dataclass(frozen=True)
-class _Mapped:
-    """An entry of a TPDO: its size, and the field that it carries, possibly in a narrower type.
-
-    `fields` are those of the row by name, in the definition.
-    """
-
-    size: int
-    row: Row
-    name: str
-    packed: Any
-    fields: Mapping[str, Field]
-
-    def read(self, data: bytes) -> Readings:
-        """Return the quantities that are carried."""
-        packed, field, place = self.packed, self.fields[self.name], self.row.named[self.name]
-        if packed is not None and packed.wrap:
-            return {}
-        if packed is not None and not place.width:
-            raw = int.from_bytes(data, "little", signed=packed.type.startswith("i"))
-            return {} if field.value is None else {field.value: (field, raw * packed.scale)}
-        content = bytearray(self.row.size)
-        content[place.offset : place.offset + place.size] = canopen.with_byte_order(place, data)
-        values = self.row.decode(bytes(content))
-        return {
-            other.value: (self.fields[name], values[name])
-            for name, other in self.row.named.items()
-            if other.offset == place.offset and other.value is not None
-        }
-
-
 class Node:
-    """Judges the messages of a node; `unit` is its definition in the judge's types."""
+    """Judges the messages of a node."""
 
-    def __init__(self, icd: InterfaceDefinition, unit: Unit) -> None:
-        self._errors: Mapping[int, str] = icd.enum("device_error").names
-        self._tpdos: dict[tuple[int, bool], list[_Mapped]] = {}
+    def __init__(self, unit: Unit) -> None:
+        self._unit = unit
+        self._tpdos: dict[tuple[int, bool], list[canopen.Entry]] = {}
         """Entries by CAN ID, and whether the node ID is added to it."""
-        mapped = _mapped(icd, unit)
+        entries = {entry.name.lower(): entry for entry in canopen.entries(unit, unit.canopen)}
         for number, model in enumerate(unit.canopen.tpdo):
             if model.enabled:
                 can_id = canopen.pdo_can_id(0, TPDO + number, model)
-                self._tpdos[can_id, model.relative] = [mapped[name.lower()] for name in model.objects]
+                self._tpdos[can_id, model.relative] = [entries[name.lower()] for name in model.objects]
         self._together: Readings = {}
 
     def judge(self, frame: CanFrame, node: int, oracle: Oracle) -> int:
@@ -93,12 +59,12 @@ class Node:
             )
         return 0
 
-    def _keep(self, frame: CanFrame, entries: list[_Mapped]) -> None:
+    def _keep(self, frame: CanFrame, entries: list[canopen.Entry]) -> None:
         if len(frame.data) != sum(entry.size for entry in entries):
             raise Violation(f"TPDO {frame.id:03X}h: {len(frame.data)} bytes")
         offset = 0
         for entry in entries:
-            self._together |= entry.read(frame.data[offset : offset + entry.size])
+            self._together |= read_entry(entry, self._unit, frame.data[offset : offset + entry.size])
             offset += entry.size
 
     def judge_instant(self, oracle: Oracle) -> None:
@@ -114,24 +80,30 @@ class Node:
         oracle.judge_attitude("TPDOs", read)
 
     def _judge_emergency(self, code: int, oracle: Oracle) -> None:
-        if code and code - DEVICE_ERROR not in self._errors:
+        if code and code - DEVICE_ERROR not in self._unit.device_errors.values():
             raise Violation(f"canopen: EMCY {code:04X}h, which no event has caused")
         if code and "error" not in oracle.modes:
             raise Violation(f"canopen: EMCY {code:04X}h in {', '.join(sorted(oracle.modes))}")
 
 
-def _mapped(icd: InterfaceDefinition, unit: Unit) -> Mapping[str, _Mapped]:
-    """Return the entries that carry a field, by their names in the mapping of a definition: `INDEX.NAME` or `INDEX`."""
-    found: dict[str, _Mapped] = {}
-    for entry in canopen.entries(unit, unit.canopen):
-        if (packed := entry.packed) is not None:
-            row_name, _, name = packed.source.partition(".")
-        elif entry.row is not None and entry.slot is not None:
-            row_name, name = entry.row.name, entry.slot.name
-        else:
-            continue
-        fields = dict(icd.telemetry[row_name].named_fields)
-        if packed is not None and not fields[name].width:
-            fields[name] = fields[name].changed(kind="integer", scale=packed.scale)
-        found[entry.name.lower()] = _Mapped(entry.size, unit.telemetry[row_name], name, packed, fields)
-    return found
+def read_entry(entry: canopen.Entry, unit: Unit, data: bytes) -> Readings:
+    """Return the quantities that the data of an entry carry: fields of a row, or one of them in a narrower type."""
+    row, slot, packed = entry.row, entry.slot, entry.packed
+    if packed is not None:
+        row_name, _, name = packed.source.partition(".")
+        row = unit.telemetry[row_name]
+        slot = row.named[name]
+    if row is None or slot is None or (packed is not None and packed.wrap):
+        return {}
+    if packed is not None and not slot.width:
+        raw = int.from_bytes(data, "little", signed=packed.type.startswith("i"))
+        narrow = replace(slot, kind="integer", scale=packed.scale)
+        return {} if slot.value is None else {slot.value: (narrow, raw * packed.scale)}
+    content = bytearray(row.size)
+    content[slot.offset : slot.offset + slot.size] = canopen.with_byte_order(slot, data)
+    values = row.decode(bytes(content))
+    return {
+        item.value: (item, values[name])
+        for name, item in row.named.items()
+        if item.offset == slot.offset and item.value is not None
+    }

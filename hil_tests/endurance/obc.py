@@ -15,16 +15,13 @@ from starhil.hil_tests.endurance.life import ADDRESSES, Outcome
 from starhil.hil_tests.endurance.node import Node
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.ports import CanopenPort, CanPort, Port, SerialPort, objects_of
-from starhil.hil_tests.endurance.unit import Unit
+from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
-from starhil.hil_tests.judge.messages import Answer, Request
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Answer, Request, Value
+from starhil.hil_tests.judge.rows import Row
 from starhil.hil_tests.judge.serial import SerialLine
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.codec import Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.link_schema import FixedFraming
-from starhil.protocol.messages import ErrorCode
-from starhil.protocol.values import Value
 
 TIME_OUT_S: Final = 0.7
 """Silence after which a unit has dropped an incomplete message."""
@@ -35,18 +32,16 @@ TURN_S: Final = 1e-6
 class Obc:
     """The OBC's end of all links of a unit; requests and readings are counted in `outcome`."""
 
-    def __init__(self, icd: InterfaceDefinition, unit: Unit, oracle: Oracle, outcome: Outcome) -> None:
-        self._icd = icd
+    def __init__(self, definition: Unit, unit: LiveUnit, oracle: Oracle, outcome: Outcome) -> None:
+        self._definition = definition
         self._unit = unit
         self._oracle = oracle
         self._outcome = outcome
-        self._fixed_framing = icd.link.serial is not None and isinstance(
-            icd.link.serial.framing, FixedFraming
-        )
-        self._judged = oracle.judged
-        self._line = SerialLine(self._judged) if icd.link.serial is not None else None
-        self._objects = {} if icd.canopen is None else objects_of(self._judged)
-        self._node = None if icd.canopen is None else Node(icd, self._judged)
+        serial = definition.serial
+        self._fixed_framing = serial is not None and serial.framing.kind == "fixed"
+        self._line = None if serial is None else SerialLine(definition)
+        self._objects = {} if definition.canopen is None else objects_of(definition)
+        self._node = None if definition.canopen is None else Node(definition)
         self._ports: dict[str, Port] = {}
 
     def connect(self) -> None:
@@ -55,8 +50,9 @@ class Obc:
             name = _ADDRESS[link]
             in_use = self._oracle.in_use(name)
             if in_use is None:
-                in_use = self._icd.device_parameters[name].default
-                if name in self._icd.parameters:
+                parameter = self._definition.device_parameters[name]
+                in_use = parameter.default
+                if parameter.id:
                     self._oracle.disturbed.add(link)  # until the unit is restored
             self._ports[link] = self._port(link, in_use)
 
@@ -64,11 +60,11 @@ class Obc:
         deliver, take = partial(self._unit.deliver, link), partial(self._unit.take, link)
         match link:
             case "serial":
-                return SerialPort(self._judged, deliver, take, str(address))
+                return SerialPort(self._definition, deliver, take, str(address))
             case "can":
                 return CanPort(deliver, take, int(address))
             case _:
-                return CanopenPort(self._judged, self._objects, deliver, take, int(address))
+                return CanopenPort(self._definition, self._objects, deliver, take, int(address))
 
     async def pass_time(self, seconds: float, *, most: int | None = None) -> None:
         """Let time pass, and judge what comes meanwhile."""
@@ -118,7 +114,7 @@ class Obc:
             if not self._oracle.bursts:
                 raise Violation(f"{link}: a packet of a file that nobody requested")
             return
-        row = self._icd.rows_by_key.get((event.klass, event.row_id or 0))
+        row = self._definition.by_key.get((event.klass, event.row_id or 0))
         if event.kind != "unsolicited":
             raise Violation(f"{link}: {event} without a request")
         if row is None or row.kind != "telemetry":
@@ -139,7 +135,7 @@ class Obc:
 
     async def _request(self, link: str, key: Sequence[Any], data: bytes) -> None:
         klass, row_id, kind = key
-        row = self._icd.rows_by_key.get((klass, row_id))
+        row = self._definition.by_key.get((klass, row_id))
         if row is not None and row.kind != kind:
             row = None
         if link == "canopen" and not self._in_dictionary(row, data):
@@ -194,7 +190,7 @@ class Obc:
         link: str,
         row: Row | None,
         request: Request,
-        verdict: ErrorCode | None,
+        verdict: str | None,
         replies: list[Answer],
         *,
         counts: bool,
@@ -215,20 +211,20 @@ class Obc:
             if verdict is None and expected:
                 await self._unknown_outcome(link, request)
                 return
-        elif verdict not in (None, ErrorCode.OK):
+        elif verdict not in (None, "ok"):
             self._judge_acceptance(sent, link, row)
         elif sum(reply.final for reply in replies) != 1:
             raise Violation(f"{sent}: {sum(reply.final for reply in replies)} answers")
         if counts and not request.telemetry:
-            refused_code = ErrorCode.INTERNAL if nack is not None else ErrorCode.OK
+            refused_code = "internal" if nack is not None else "ok"
             sure = verdict is not None or not (nack or silent)
             await self._executed(row, request, verdict or refused_code, sure=sure)
-        if silent and nack is None and verdict is not ErrorCode.OK:
+        if silent and nack is None and verdict != "ok":
             await self.settle(link)
             if self._fixed_framing:
                 self._oracle.forget()
         for reply in replies:
-            if reply.kind == "telemetry" and verdict in (None, ErrorCode.OK):
+            if reply.kind == "telemetry" and verdict in (None, "ok"):
                 self._read(what, row, request, reply)
 
     def _check_form(self, sent: str, replies: list[Answer]) -> None:
@@ -239,10 +235,10 @@ class Obc:
     def _expected_answers(self, link: str, row: Row | None) -> Sequence[str]:
         if row is None:
             return ("reply",)
-        return () if link == "serial" and row.name in self._judged.unanswered else row.answers
+        return () if link == "serial" and row.name in self._definition.unanswered else row.answers
 
-    def _judge_silence(self, sent: str, verdict: ErrorCode | None, *, refusable: bool) -> None:
-        if verdict is ErrorCode.OK:
+    def _judge_silence(self, sent: str, verdict: str | None, *, refusable: bool) -> None:
+        if verdict == "ok":
             raise Violation(f"{sent}: no answer")
         if verdict is not None and refusable and not self._fixed_framing:
             raise Violation(f"{sent}: no answer, must be refused")
@@ -254,17 +250,16 @@ class Obc:
         if row is None or row.size != 1 or not ambiguous:
             raise Violation(f"{sent}: accepted, must be refused")
 
-    def _judge_refusal(self, sent: str, link: str, nack: Answer, verdict: ErrorCode | None) -> None:
-        if verdict is ErrorCode.OK:
+    def _judge_refusal(self, sent: str, link: str, nack: Answer, verdict: str | None) -> None:
+        if verdict == "ok":
             raise Violation(f"{sent}: refused with {nack.code}, must be accepted")
         if verdict is not None and not self._same_code(link, nack, verdict):
-            wanted = int(self._icd.error_number(verdict))
-            raise Violation(f"{sent}: refused with {nack.code}, not {wanted}")
+            raise Violation(f"{sent}: refused with {nack.code}, not {self._definition.code(verdict)}")
 
-    async def _executed(self, row: Row | None, request: Request, code: ErrorCode, *, sure: bool) -> None:
+    async def _executed(self, row: Row | None, request: Request, code: str, *, sure: bool) -> None:
         oracle = self._oracle
         oracle.executed(row, request.id, request.data, code, sure=sure)
-        if row is None or code is not ErrorCode.OK:
+        if row is None or code != "ok":
             return
         if row.action == "reset":
             start_s = self._unit.now_s
@@ -274,25 +269,25 @@ class Obc:
             oracle.restarted(start_s)
             oracle.time_passed(self._unit.now_s)
             self.connect()
-        elif any(field.parameter in ADDRESSES for field in row.fields) or row.action in _SETTERS:
+        elif any(field.parameter in ADDRESSES for field in row.named.values()) or row.action in _SETTERS:
             await self.pass_time(TURN_S)
             self.connect()
 
     def _read(self, what: str, row: Row | None, request: Request, reply: Answer) -> None:
         number = request.id if reply.row_id is None else reply.row_id
-        other = self._icd.rows_by_key.get((reply.klass or request.klass, number)) or row
+        other = self._definition.by_key.get((reply.klass or request.klass, number)) or row
         named = set() if row is None else {item.partition(":")[2] or row.name for item in row.answers}
         if other is None or other.kind != "telemetry" or other.name not in named:
             raise Violation(f"{what}: {reply}")
         self._outcome.readings += 1
         self._oracle.read(other, reply.data)
 
-    def _same_code(self, link: str, nack: Answer, verdict: ErrorCode) -> bool:
+    def _same_code(self, link: str, nack: Answer, verdict: str) -> bool:
         if link == "serial" and self._line is not None and not self._line.envelope.has_codes:
             return True
         if link == "canopen":
             return nack.code != 0  # aborts have codes of their own
-        return nack.code == int(self._icd.error_number(verdict))
+        return nack.code == self._definition.code(verdict)
 
     def _can_refuse(self, link: str, klass: str) -> bool:
         return link != "serial" or self._line is None or self._line.envelope.can_refuse(klass)
@@ -303,8 +298,8 @@ class Obc:
         """Send telemetry requests without waiting; the answers come in order."""
         if link == "canopen" or self._oracle.stuck or link in self._oracle.disturbed:
             return
-        known = [self._icd.rows_by_key[klass, row_id] for klass, row_id, _ in rows]
-        asked = [row for row in known if self._oracle.verdict(row, "telemetry", b"") is ErrorCode.OK]
+        known = [self._definition.by_key[klass, row_id] for klass, row_id, _ in rows]
+        asked = [row for row in known if self._oracle.verdict(row, "telemetry", b"") == "ok"]
         self._outcome.requests += len(asked)
         self._ports[link].ask(*(Request(row.id, klass=row.klass, telemetry=True) for row in asked))
         replies = self._answers(link)
@@ -328,7 +323,7 @@ class Obc:
         """Send the first part of a request, as a client that goes away, which a bus must not see answered."""
         if link in self._oracle.disturbed:
             return
-        known = self._icd.rows_by_key[row[0], row[1]]
+        known = self._definition.by_key[row[0], row[1]]
         content = bytes(known.size) if known.kind == "telecommand" else b""
         self._ports[link].cut(Request(known.id, content, known.klass, known.kind == "telemetry"), share)
         if link != "serial":
@@ -368,7 +363,7 @@ class Obc:
         if not replies:
             raise Violation(f"{link}: {row.name}: no answer after all faults have ended")
         self._oracle.read(row, replies[-1].data)
-        if not self._judged.telemetry[row.name].decode(replies[-1].data)[field]:
+        if not self._definition.telemetry[row.name].decode(replies[-1].data)[field]:
             raise Violation(f"{row.name}: no valid attitude {recovery_s:g} s after the last fault has ended")
 
 

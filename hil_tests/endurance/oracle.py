@@ -13,16 +13,12 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge
-from starhil.hil_tests.endurance.truth import Motion
-from starhil.hil_tests.endurance.violation import Known, Violation, quantity_of, resolution
-from starhil.hil_tests.judge.definition import unit_of
-from starhil.protocol.codec import Field, Row
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.device_model import PARAMETER
-from starhil.protocol.messages import ErrorCode
+from starhil.hil_tests.endurance.attitude_judge import AttitudeJudge, Motion
+from starhil.hil_tests.endurance.violation import Known, Violation
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Value
+from starhil.hil_tests.judge.rows import PARAMETER, Field, Row
 from starhil.protocol.units_of_measure import factor
-from starhil.protocol.values import MessageError, Value
 
 BOOT_S: Final = 0.6
 """Longest boot of the profile of a run."""
@@ -43,18 +39,17 @@ class Oracle:
 
     def __init__(
         self,
-        icd: InterfaceDefinition,
+        definition: Unit,
         parameters: Mapping[str, Value],
         start_unix_s: float,
         sigma_arcsec: tuple[float, float],
     ) -> None:
-        self._icd = icd
-        self.judged: Final = unit_of(icd)
+        self._definition = definition
         self._start_unix_ns = round(start_unix_s * SECOND_NS)
         calibrated = {"focal_length", "centroid_x", "centroid_y", "k1", "k2", "p1", "p2"}
         self._defaults: dict[str, Known | None] = {
             name: None if name in calibrated else (parameter.default, 1e-9)
-            for name, parameter in icd.device_parameters.items()
+            for name, parameter in definition.device_parameters.items()
         }
         self._defaults.update({name: (value, 1e-9) for name, value in parameters.items()})
         self._stored: dict[str, Known | None] = {}
@@ -62,7 +57,7 @@ class Oracle:
         self.modes: set[str] = {"boot"}
         self.counts: dict[str, int | None] = {}
         self._boot_count: int | None = None
-        self.attitudes: Final = AttitudeJudge(icd.conventions, sigma_arcsec)
+        self.attitudes: Final = AttitudeJudge(definition.conventions, sigma_arcsec)
         self.disk_full = False
         self.stuck = False
         self.disturbed: set[str] = set()
@@ -72,7 +67,7 @@ class Oracle:
         self.now_s = 0.0
         self._frames: int | None = None
         self._selected: int | None = None
-        self._last: tuple[int, ErrorCode] | None = None
+        self._last: tuple[int, str] | None = None
         self._checks: dict[str, Callable[[str, Field, Value], None]] = {
             "mode": self._check_mode,
             "error.active": self._check_in_error,
@@ -112,7 +107,7 @@ class Oracle:
         self._clock: tuple[float, int] | None = (at_s, self._start_unix_ns)
         self._has_imaged = False
         self._frames = None
-        self._selected = next(iter(self._icd.parameters_by_id), None)
+        self._selected = next(iter(self._definition.parameters_by_id), None)
         self._last = None
         self.bursts = self._subscribed = False
         self.attitudes.started(at_s, self.values)
@@ -163,17 +158,17 @@ class Oracle:
 
     # --- requests ---
 
-    def verdict(self, row: Row | None, kind: str, data: bytes) -> ErrorCode | None:
-        """Return OK if a request must be accepted, the code with which it must be refused, or None: either."""
+    def verdict(self, row: Row | None, kind: str, data: bytes) -> str | None:
+        """Return "ok" if a request must be accepted, the error with which it must be refused, or None: either."""
         if row is None:
-            return ErrorCode.INVALID_ID
+            return "invalid_id"
         if kind == "telemetry":
-            images = any((field.value or "").startswith(("image.", "file.")) for field in row.fields)
-            return ErrorCode.INVALID_LENGTH if data else None if images else ErrorCode.OK
+            images = any((field.value or "").startswith(("image.", "file.")) for field in row.named.values())
+            return "invalid_length" if data else None if images else "ok"
         if len(data) != row.size:
-            return ErrorCode.INVALID_LENGTH
+            return "invalid_length"
         if self.is_outside(row, data):
-            return ErrorCode.INVALID_PARAMETER
+            return "invalid_parameter"
         arguments = self._arguments(row, data)
         match row.action:
             case "set_mode":
@@ -181,40 +176,35 @@ class Oracle:
             case "set_parameter":
                 return self._parameter_verdict(arguments)
             case "select_parameter":
-                known = int(float(arguments["parameter"])) in self._icd.parameters_by_id
-                return ErrorCode.OK if known else ErrorCode.INVALID_PARAMETER
+                known = int(float(arguments["parameter"])) in self._definition.parameters_by_id
+                return "ok" if known else "invalid_parameter"
             case "save_parameters":
-                return ErrorCode.INTERNAL if self.disk_full else ErrorCode.OK
-            case "set_parameters" if any(field.parameter in _BOUND for field in row.fields):
+                return "internal" if self.disk_full else "ok"
+            case "set_parameters" if any(field.parameter in _BOUND for field in row.named.values()):
                 return None
             case None | "nothing" | "reset" | "set_clock" | "clear_counters":
-                return ErrorCode.OK
+                return "ok"
             case "restore_parameters" | "default_parameters" | "set_parameters":
-                return ErrorCode.OK
+                return "ok"
             case _:
                 return None
 
     def is_outside(self, row: Row | None, data: bytes) -> bool:
         """Return whether a value of a telecommand is outside its limits."""
-        fields = () if row is None else self.judged.telecommands[row.name].named.values()
-        return any(field.fault(field.read(data)) for field in fields)
+        return row is not None and any(field.fault(field.read(data)) for field in row.named.values())
 
-    def _mode_verdict(self, wanted: str) -> ErrorCode | None:
+    def _mode_verdict(self, wanted: str) -> str | None:
         votes = {wanted in _COMMANDED.get(mode, _RUNNING) for mode in self.modes}
         if votes == {False} or (wanted == "tracking" and not self._has_imaged):
-            return ErrorCode.SEQUENCE
+            return "sequence"
         certain = votes == {True} and wanted != "tracking" and "error" not in self.modes
-        return ErrorCode.OK if certain else None
+        return "ok" if certain else None
 
-    def _parameter_verdict(self, arguments: Mapping[str, Any]) -> ErrorCode | None:
-        parameter = self._icd.parameters_by_id.get(int(arguments["parameter"]))
-        try:
-            if parameter is None:
-                return ErrorCode.INVALID_PARAMETER
-            parameter.check(arguments["value"])
-        except MessageError:
-            return ErrorCode.INVALID_PARAMETER
-        return None if parameter.name in _BOUND else ErrorCode.OK
+    def _parameter_verdict(self, arguments: Mapping[str, Any]) -> str | None:
+        parameter = self._definition.parameters_by_id.get(int(arguments["parameter"]))
+        if parameter is None or parameter.value_of(arguments["value"]) is None:
+            return "invalid_parameter"
+        return None if parameter.name in _BOUND else "ok"
 
     def counted(self, kind: str) -> None:
         """A request was received."""
@@ -222,22 +212,23 @@ class Oracle:
         count = self.counts[name]
         self.counts[name] = None if count is None else (count + 1) & 0xFFFF
 
-    def executed(self, row: Row | None, row_id: int, data: bytes, code: ErrorCode, *, sure: bool) -> None:
+    def executed(self, row: Row | None, row_id: int, data: bytes, code: str, *, sure: bool) -> None:
         """A telecommand was answered with a code, which is the one expected or not for sure."""
         self._last = (row_id, code) if sure else None
-        if row is not None and code is ErrorCode.OK:
+        if row is not None and code == "ok":
             self._take_effect(row, self._arguments(row, data))
 
     def _take_effect(self, row: Row, arguments: Mapping[str, Any]) -> None:
         match row.action:
             case "set_parameters":
                 self._set({
-                    field.parameter: (arguments[field.name], resolution(field))
-                    for field in row.named_fields.values() if field.parameter is not None
+                    field.parameter: (arguments[field.name], field.resolution)
+                    for field in row.named.values() if field.parameter is not None
                 })  # fmt: skip
             case "set_parameter":
-                parameter = self._icd.parameters_by_id[int(arguments["parameter"])]
-                self._set({parameter.name: (parameter.check(arguments["value"]), 1e-9)})
+                parameter = self._definition.parameters_by_id[int(arguments["parameter"])]
+                value = parameter.value_of(arguments["value"])
+                self._set({parameter.name: None if value is None else (value, 1e-9)})
                 self._selected = parameter.id
             case "select_parameter":
                 self._selected = int(arguments["parameter"])
@@ -267,9 +258,9 @@ class Oracle:
 
     def _arguments(self, row: Row, data: bytes) -> dict[str, Any]:
         """Return the values of a telecommand by argument, in the argument's unit, and by name for other fields."""
-        values = self.judged.telecommands[row.name].decode(data)
         found: dict[str, Any] = dict(row.arguments)
-        for name, field in row.named_fields.items():
+        values = row.decode(data)
+        for name, field in row.named.items():
             value = values[name]
             if field.argument in _CLOCK and not isinstance(value, (str, bytes)):
                 value = float(value) * (factor(field.unit, _CLOCK[field.argument]) or 1.0)
@@ -282,14 +273,14 @@ class Oracle:
             self.attitudes.retimed(self.now_s, self.values)
 
     def _set_clock(self, arguments: Mapping[str, Any]) -> None:
-        if self._icd.conventions.epoch_ns is None:  # the day is that of the clock
+        if self._definition.conventions.epoch_ns is None:  # the day is that of the clock
             self._clock = None
         else:
             total = sum(
                 round(float(arguments.get(name) or 0) * (factor(unit, "ns") or 1.0))
                 for name, unit in _CLOCK.items()
             )
-            self._clock = (self.now_s, total + self._icd.conventions.epoch_ns)
+            self._clock = (self.now_s, total + self._definition.conventions.epoch_ns)
 
     @property
     def streams(self) -> bool:
@@ -303,13 +294,11 @@ class Oracle:
         """Judge the telemetry of a row, received now."""
         if len(data) != row.size:
             raise Violation(f"{row.name}: {len(data)} bytes, not {row.size}")
-        values = self.judged.telemetry[row.name].decode(data)
         by_quantity: dict[str, tuple[Field, Value]] = {}
-        for name, value in values.items():
-            field = row.named_fields[name]
+        for name, value in row.decode(data).items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise Violation(f"{row.name}.{name}: {value}")
-            by_quantity[quantity_of(field)] = (field, value)
+            by_quantity[row.named[name].quantity] = (row.named[name], value)
         self.judge(row.name, by_quantity)
         self.judge_attitude(row.name, by_quantity)
 
@@ -335,17 +324,17 @@ class Oracle:
     def _check_parameter(self, where: str, field: Field, value: Value, name: str) -> None:
         known = self.values[name]
         if known is None:
-            if not field.aliases and not (field.kind == "enum" and not isinstance(value, str)):
-                self._set({name: (value, resolution(field))})
+            if not field.shared and not (field.kind == "enum" and not isinstance(value, str)):
+                self._set({name: (value, field.resolution)})
             return
         expected, tolerance = known
         wrong = False
         if isinstance(expected, bool) or isinstance(value, bool):
             wrong = field.kind in ("flag", "integer", "bits", "enum") and bool(value) != bool(expected)
         elif isinstance(expected, str) or isinstance(value, str):
-            wrong = type(value) is type(expected) and not field.aliases and value != expected
+            wrong = type(value) is type(expected) and not field.shared and value != expected
         else:
-            unit = self._icd.device_parameters[name].unit
+            unit = self._definition.device_parameters[name].unit
             self._expect(where, field, value, float(expected) * (factor(unit, field.unit) or 1.0), tolerance)
         if wrong:
             raise Violation(f"{where}: {value!r}, but the parameter {name} is {expected!r}")
@@ -356,18 +345,18 @@ class Oracle:
         """Check a number, which telemetry clips or wraps to the range of its field."""
         if not isinstance(value, (int, float)):
             return
-        low, high = field.physical_limits
+        low, high = field.limits
         step = abs(field.scale) if field.kind != "float" else 0.0
         if field.wrap:
             span = high - low + step
             off = abs((float(value) - expected + 0.5 * span) % span - 0.5 * span)
         else:
             off = abs(float(value) - min(max(expected, low), high))
-        if off > tolerance + resolution(field) + 1.2e-7 * abs(expected) * (field.kind == "float"):
+        if off > tolerance + field.resolution + 1.2e-7 * abs(expected) * (field.kind == "float"):
             raise Violation(f"{where}: {value!r}, not {expected!r}")
 
     def _check_mode(self, where: str, field: Field, value: Value) -> None:
-        if field.aliases or not isinstance(value, str):
+        if field.shared or not isinstance(value, str):
             return
         if value not in self.modes:
             raise Violation(f"{where}: {value}, but only {', '.join(sorted(self.modes))} is possible")
@@ -392,9 +381,9 @@ class Oracle:
             case "selected.id":
                 number = self._selected
             case "selected.value" if self._selected is not None:
-                parameter = self._icd.parameters_by_id[self._selected]
+                parameter = self._definition.parameters_by_id[self._selected]
                 known = self.values[parameter.name]
-                names = {} if parameter.enum is None else parameter.enum.values
+                names = parameter.enum or {}
                 return None if known is None else (float(names.get(str(known[0]), known[0])), known[1])
             case "request.last" if self._last is not None:
                 number = self._last[0]
@@ -417,7 +406,7 @@ class Oracle:
             return None
         since_s, unix_ns = self._clock
         elapsed_ns = round((self.now_s - since_s) * SECOND_NS)
-        return self._icd.conventions.reported_ns(unix_ns + elapsed_ns) / SECOND_NS
+        return float(self._definition.conventions.reported_ns(unix_ns + elapsed_ns) / SECOND_NS)
 
     def _uptime_s(self) -> float | None:
         return None if self._started_s is None else self.now_s - self._started_s
@@ -441,8 +430,8 @@ class Oracle:
         self.attitudes.check_period(where, field, value, self.now_s, self.values)
 
     def _check_error(self, where: str, _field: Field, value: Value) -> None:
-        if self._last is not None and isinstance(value, str) and value != self._last[1].name.lower():
-            raise Violation(f"{where}: {value}, not {self._last[1].name.lower()}")
+        if self._last is not None and isinstance(value, str) and value != self._last[1]:
+            raise Violation(f"{where}: {value}, not {self._last[1]}")
 
 
 _RUNNING: Final = frozenset({"standby", *IMAGING})

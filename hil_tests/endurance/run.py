@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, Final
 
+from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import MOST_EVENTS, Life, Outcome
 from starhil.hil_tests.endurance.obc import Obc
 from starhil.hil_tests.endurance.oracle import RECOVERY_S, Oracle
-from starhil.hil_tests.endurance.truth import Motion
-from starhil.hil_tests.endurance.unit import Unit
+from starhil.hil_tests.endurance.unit import LiveUnit
 from starhil.hil_tests.endurance.violation import Violation
-from starhil.protocol.definition import InterfaceDefinition
+from starhil.hil_tests.judge.definition import Unit
 
 DESCRIPTOR_LIMIT: Final = 4
 QUEUE_LIMIT: Final = 5000
@@ -24,16 +24,16 @@ class LifeRun:
     """Executes the steps of a life on a unit; `sigma_arcsec` are the largest standard deviations that it may leave unstated."""
 
     def __init__(
-        self, life: Life, icd: InterfaceDefinition, unit: Unit, sigma_arcsec: tuple[float, float]
+        self, life: Life, definition: Unit, unit: LiveUnit, sigma_arcsec: tuple[float, float]
     ) -> None:
         self._life = life
-        self._icd = icd
+        self._definition = definition
         self._unit = unit
         parameters = dict(life.profile.get("parameters", {}))
         start_unix_s = life.profile.get("run", {}).get("start_unix_s", 1_767_225_600.0)
         self.outcome = Outcome()
-        self._oracle = Oracle(icd, parameters, start_unix_s, sigma_arcsec)
-        self._obc = obc = Obc(icd, unit, self._oracle, self.outcome)
+        self._oracle = Oracle(definition, parameters, start_unix_s, sigma_arcsec)
+        self._obc = obc = Obc(definition, unit, self._oracle, self.outcome)
         self._not_read: set[str] = set()
         """Links whose peer does not read."""
         self._lived_s = 0.0
@@ -172,15 +172,15 @@ class LifeRun:
         await self._truth(ORION)
         await self._obc.pass_time(RECOVERY_S / 3.0)
         self._obc.connect()
-        for row in self._icd.telecommands.values():
+        for row in self._definition.telecommands.values():
             if row.action == "set_mode":
-                fields = [field for field in row.named_fields.values() if field.argument == "mode"]
+                fields = [field for field in row.named.values() if field.argument == "mode"]
                 data = row.encode({fields[0].name: "lost_in_space"})
                 await self._obc.request(self._unit.links[0], (row.klass, row.id, row.kind), data.hex())
                 break
         await self._obc.pass_time(RECOVERY_S)
-        for row in self._icd.telemetry.values():
-            valid = [field for field in row.named_fields.values() if field.value == "attitude.valid"]
+        for row in self._definition.telemetry.values():
+            valid = [field for field in row.named.values() if field.value == "attitude.valid"]
             if valid:
                 await self._obc.expect_valid(row, valid[0].name, RECOVERY_S)
                 break

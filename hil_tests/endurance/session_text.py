@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 
 from starhil.hil_tests.endurance.life import Life
+from starhil.hil_tests.endurance.ports import HOST
+from starhil.hil_tests.judge import can
+from starhil.hil_tests.judge.definition import Unit
+from starhil.hil_tests.judge.messages import Request
+from starhil.hil_tests.judge.serial import SerialLine
 from starhil.hil_tests.raw_traffic import format_frame
-from starhil.protocol.can_framing import encode_request_frames
-from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.messages import Request, RequestKind
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.can_framing import CanFrame
 
 LONGEST_WAIT_S = 3600.0
 
 
-def session_of(life: Life, icd: InterfaceDefinition, violation: str) -> str:
+def session_of(life: Life, definition: Unit, violation: str) -> str:
     """Return a session script with the requests of a life on serial and CAN, and its waits.
 
     What a session cannot do (faults, truth, power, CANopen) stands in a comment where it was done.
@@ -34,12 +36,11 @@ def session_of(life: Life, icd: InterfaceDefinition, violation: str) -> str:
                 lines += ["", "[[step]]", name, f"wait_s = {min(step['s'], LONGEST_WAIT_S)}"]
             case "request" if step["link"] != "canopen":
                 klass, row_id, kind = step["row"]
-                data = bytes.fromhex(step.get("data", ""))
-                request = Request(RequestKind(kind), row_id, data, klass=klass)
+                request = Request(row_id, bytes.fromhex(step.get("data", "")), klass, kind == "telemetry")
                 if step["link"] == "serial":
-                    sent = [build_serial_stack(icd).encode_request(request).hex(" ")]
+                    sent = [SerialLine(definition).encode(request).hex(" ")]
                 else:
-                    sent = [format_frame(frame) for frame in encode_request_frames(request, 1, 4)]
+                    sent = [format_frame(CanFrame(*frame)) for frame in can.frames_of(request, HOST, 4)]
                 lines += ["", "[[step]]", name, f'link = "{step["link"]}"', f"send = {json.dumps(sent)}"]
             case _:
                 lines += ["", f"# step {number}, not possible in a session: {json.dumps(step)}"]

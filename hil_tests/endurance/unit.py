@@ -8,7 +8,7 @@ from typing import Any, Protocol
 from starhil.protocol.can_framing import CanFrame
 
 
-class Unit(Protocol):
+class LiveUnit(Protocol):
     """A unit with its power and surroundings, in simulated time."""
 
     links: tuple[str, ...]

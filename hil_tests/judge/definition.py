@@ -15,9 +15,8 @@ from typing import Any, Literal
 
 from starhil.hil_tests.judge.framings import Framing, Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
-from starhil.hil_tests.judge.rows import SIZES, Field, Row
+from starhil.hil_tests.judge.rows import PARAMETER, SIZES, Field, Row, single
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.device_model import PARAMETER
 from starhil.protocol.framings import Receiving
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import find_unit
@@ -25,15 +24,34 @@ from starhil.protocol.names import find_unit
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter that the unit exposes."""
+    """A parameter of the device; `id` is 0 if the unit does not expose it."""
 
     id: int
     name: str
     type: str
+    unit: str
     minimum: float
     maximum: float
-    default: float
+    default: bool | int | float | str
     enum: Mapping[str, int] | None
+
+    @property
+    def default_number(self) -> float:
+        """Number of the default, as telecommands that set any parameter carry it."""
+        return float(self.enum[str(self.default)] if self.enum is not None else self.default)
+
+    def value_of(self, number: float) -> bool | int | float | str | None:
+        """Return the value for which a number stands; None if it is none of the parameter's."""
+        if self.enum is not None:
+            return next((name for name, known in self.enum.items() if known == number), None)
+        low, high = self.minimum, self.maximum
+        if self.type == "f32":  # the limits may be rounded to single precision
+            low, high = min(low, single(low)), max(high, single(high))
+        if not low <= number <= high:
+            return None
+        if self.type.startswith("f"):
+            return number
+        return None if number % 1 else bool(number) if self.type == "bool" else int(number)
 
 
 @dataclass(frozen=True)
@@ -44,12 +62,14 @@ class Unit:
     ----------
     folder
         Folder of its files, in which its own cases stand; None for a definition in one file.
+    parameters, device_parameters
+        Parameters that the unit exposes, and all of the device, by name.
     serial, can
         Models of `[link.serial]` and `[link.can]`; None if the unit does not have the link.
     unanswered
         Rows that the serial line does not answer.
-    errors
-        Number of each error by name.
+    errors, device_errors
+        Number of each error of a request, and of each cause of the error mode, by name.
     telecommand_crc
         Whether a telecommand may be followed by its CRC-8.
     canopen
@@ -62,6 +82,7 @@ class Unit:
     telecommands: Mapping[str, Row]
     telemetry: Mapping[str, Row]
     parameters: Mapping[str, Parameter]
+    device_parameters: Mapping[str, Parameter]
     serial: Any
     can: Any
     byte_order: Literal["little", "big"]
@@ -69,6 +90,7 @@ class Unit:
     classes: tuple[Any, ...] = ()
     unanswered: frozenset[str] = frozenset()
     errors: Mapping[str, int] = field(default_factory=dict)
+    device_errors: Mapping[str, int] = field(default_factory=dict)
     first_telemetry_id: int | None = None
     telecommand_crc: bool = False
     plugin: Any = None
@@ -81,12 +103,18 @@ class Unit:
         return tuple(row for table in tables for row in sorted(table.values(), key=lambda row: row.id))
 
     @cached_property
-    def _by_key(self) -> Mapping[tuple[str, int], Row]:
+    def parameters_by_id(self) -> Mapping[int, Parameter]:
+        """Parameters that the unit exposes, by ID."""
+        return {item.id: item for item in self.parameters.values()}
+
+    @cached_property
+    def by_key(self) -> Mapping[tuple[str, int], Row]:
+        """Rows by class and ID."""
         return {(row.klass, row.id): row for row in self.rows}
 
     def row(self, request: Request) -> Row | None:
         """Return the row of a request; without a class, the first row with its ID."""
-        found = self._by_key.get((request.klass, request.id))
+        found = self.by_key.get((request.klass, request.id))
         if found is None and not request.klass:
             found = next((row for row in self.rows if row.id == request.id), None)
         return found
@@ -149,6 +177,7 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         telecommands={row.name: _row(row, icd) for row in icd.telecommands.values()},
         telemetry={row.name: _row(row, icd) for row in icd.telemetry.values()},
         parameters={item.name: _parameter(item) for item in icd.parameters.values()},
+        device_parameters={item.name: _parameter(item) for item in icd.device_parameters.values()},
         serial=serial,
         can=icd.link.can,
         byte_order=icd.conventions.byte_order,
@@ -159,6 +188,7 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
             | set(getattr(serial.framing, "unanswered", ()) if serial is not None else ())
         ),
         errors=icd.errors,
+        device_errors=icd.enum("device_error").values,
         first_telemetry_id=icd.first_telemetry_id,
         telecommand_crc=icd.conventions.telecommand_crc,
         plugin=icd.plugin,
@@ -168,8 +198,8 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
 
 def _parameter(item: Any) -> Parameter:
     enum = None if item.enum is None else item.enum.values
-    default = enum[item.default] if enum is not None else float(item.default)
-    return Parameter(item.id, item.name, item.type, item.minimum, item.maximum, float(default), enum)
+    limits = item.minimum, item.maximum
+    return Parameter(item.id, item.name, item.type, item.unit, *limits, item.default, enum)
 
 
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
@@ -201,6 +231,7 @@ def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
                 bound.maximum if item.maximum is None else item.maximum, None if item.enum is None else item.enum.values, default, item.const,
                 item.value, item.argument, item.telecommand, item.unit, frozenset(item.aliases.values()),
                 item.parameter or (value.removeprefix(PARAMETER) if (value := item.value or "").startswith(PARAMETER) else None),
+                item.wrap,
             )  # fmt: skip
             shift += item.width
         offset += size

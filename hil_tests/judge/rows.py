@@ -28,6 +28,8 @@ SIZES: Final = {
 """Bytes of each type of number."""
 LARGEST: Final = {"f32": (2.0 - 2.0**-23) * 2.0**127, "f64": math.inf}
 """Largest finite number of each floating type; any finite number fits f64."""
+PARAMETER: Final = "parameter."
+"""Beginning of the name of a quantity that is a parameter."""
 FLAGS: Final = {"false": False, "true": True}
 """An enumeration with no other names is a flag."""
 
@@ -54,6 +56,8 @@ class Field:
         Names of the enumeration whose number stands for further values too.
     parameter
         Parameter that it sets or reports.
+    wrap
+        Whether a number outside the limits is sent modulo the range instead of as the nearest limit.
     """
 
     name: str
@@ -77,6 +81,17 @@ class Field:
     unit: str = ""
     shared: frozenset[str] = frozenset()
     parameter: str | None = None
+    wrap: bool = False
+
+    @property
+    def quantity(self) -> str:
+        """Quantity that it reports; empty if it reports none."""
+        return self.value or (PARAMETER + self.parameter if self.parameter else "")
+
+    @property
+    def resolution(self) -> float:
+        """Largest difference between a number and what the field carries of it."""
+        return (1e-9 if self.kind == "float" else 0.51) * abs(self.scale)
 
     @property
     def type_limits(self) -> tuple[int, int]:
@@ -198,7 +213,7 @@ class Field:
             return None if raw in self.enum.values() else "not in its enumeration"
         low, high = self.limits
         if self.type == "f32" and self.kind == "float":  # the limits may be rounded to single precision
-            low, high = min(low, _single(low)), max(high, _single(high))
+            low, high = min(low, single(low)), max(high, single(high))
         inside = low <= raw * self.scale + self.bias <= high and math.isfinite(raw)
         if self.kind != "float":
             inside = self.raw_limits[0] <= raw <= self.raw_limits[1]
@@ -228,7 +243,7 @@ class Field:
                 return self.physical(chosen)
 
 
-def _single(number: float) -> float:
+def single(number: float) -> float:
     """Round to single precision."""
     return (
         float(struct.unpack("<f", struct.pack("<f", number))[0]) if abs(number) <= LARGEST["f32"] else number

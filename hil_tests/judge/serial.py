@@ -2,12 +2,20 @@
 
     request ──► body ──► framing ──► line          line ──► framing ──► body ──► answer
 
-    composed   | header by roles | data | check |       or a text                  `Headed`
+    composed   | header by roles | data | check |       or a text                 `Headed`
     dialect a  | ID | data or error |           CubeComputer (AlbertaSat)         `Dialect`
     dialect b  | data or error |                CubeSense node (RADSAT)
     dialect c  | ID | data or error |           generation 2; 7F 07 0F 4F 2F name the kind (libCubeObc)
 
 An answer without an ID belongs to the oldest request that has not been answered, so requests are noted in order.
+
+One line may have several formats (`[[link.serial.format]]`), told apart by the first byte of an answer, and requests and
+answers that are texts (libgs hyp_st200.c, whose driver looks for READY in what it reads, and for F1 in a record):
+
+    OBC  ► show record CR                      text (`request`)
+         ◄ F1 … 51 bytes, stuffed … CRC-8      first byte F1: format of the class
+    OBC  ► set keep-alive off CR
+         ◄ READY CR LF                         any other first byte: `acknowledge`, `refusal`
 """
 
 from __future__ import annotations
@@ -16,17 +24,15 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, Protocol
+from typing import Any, Final, NamedTuple
 
 from starhil.hil_tests.judge.checks import check_function, described
 from starhil.hil_tests.judge.definition import Unit, plugin_check, plugin_framing
-from starhil.hil_tests.judge.formats import CODE, first_byte_of, format_models, text_answer
 from starhil.hil_tests.judge.framings import Framing, Taken
 from starhil.hil_tests.judge.framings.counted import Counted
 from starhil.hil_tests.judge.framings.delimited import Delimited
 from starhil.hil_tests.judge.framings.escaped import Escaped
 from starhil.hil_tests.judge.framings.slip import Slip
-from starhil.hil_tests.judge.framings.stuffed import Stuffed
 from starhil.hil_tests.judge.headers import Header, Opened
 from starhil.hil_tests.judge.messages import (
     BURST_ID,
@@ -37,6 +43,8 @@ from starhil.hil_tests.judge.messages import (
     Request,
 )
 
+CODE: Final = "{code}"
+"""Where a refusal that is a text has its code."""
 MIXING: Final = 0x9E3779B1
 """Odd, so that numbers do not repeat, and with bits in every byte."""
 CUBESPACE: Final = (0x1F, 0x7F, 0xFF)
@@ -47,28 +55,12 @@ TELEMETRY: Final = 0x07
 """Start byte of telemetry in generation 2, which is an acknowledge with data."""
 
 
-class Envelope(Protocol):
-    """What surrounds the data of a message within its framing."""
+class Format(NamedTuple):
+    """Framing and envelope of the messages of some classes; of all others without classes."""
 
-    def body(self, request: Request) -> bytes:
-        """Return the body of a request."""
-
-    def size(self, begun: bytes, asked: Request | None) -> int | None:
-        """Return the size of the answer's body that begins with these bytes; None if more are needed."""
-
-    def answer(self, taken: Taken, asked: Request | None) -> Answer:
-        """Return the answer in a body; `asked` is the oldest request without an answer."""
-
-    def can_refuse(self, klass: str) -> bool:
-        """Return whether answers of a class can express a refusal."""
-
-    sequence_bits: int
-    """Bits of the number of a request; 0 if there is none."""
-    numbers: int
-    """How many numbers an answer may have."""
-    has_codes: bool
-    """Whether a refusal carries a code."""
-    has_unsolicited: bool
+    classes: tuple[str, ...]
+    framing: Framing
+    envelope: Envelope
 
 
 class SerialLine:
@@ -80,25 +72,25 @@ class SerialLine:
     def __init__(self, unit: Unit, dialect: str | None = None) -> None:
         link = unit.serial
         self._unit = unit
-        self._requests_in: list[tuple[tuple[str, ...], Framing, Envelope]]
-        self._answers_in: list[tuple[tuple[str, ...], Framing, Envelope]]
+        self._requests_in: list[Format]
+        self._answers_in: list[Format]
         self.dialect: str | None = None
         self._requests = 0
         if link.framing.kind == "cubespace":
             self.dialect = link.framing.dialect or dialect or "b"
             escape, start, end = CUBESPACE
             starts = (start, *KINDS) if self.dialect == "c" else (start,)
-            self._requests_in = [((), Escaped(escape, starts, end), Dialect(unit, self.dialect))]
+            self._requests_in = [Format((), Escaped(escape, starts, end), Dialect(unit, self.dialect))]
             self._answers_in = self._requests_in
         else:
             self._requests_in = list(_formats(unit, "request"))
             self._answers_in = list(_formats(unit, "reply"))
-        self.envelope = self._answers_in[-1][2]
+        self.envelope = self._answers_in[-1].envelope
         self.clear()
 
     def request_format(self, klass: str) -> tuple[Framing, Envelope]:
         """Return framing and envelope of the requests of a class."""
-        return _of_class(self._requests_in, klass)
+        return _of_class(self._requests_in, klass)[1:]
 
     def clear(self) -> None:
         """Forget everything received and asked."""
@@ -127,7 +119,7 @@ class SerialLine:
 
     def telemetry_frame(self, body: bytes, klass: str) -> bytes:
         """Return the body of a telemetry answer as bytes on the line."""
-        framing, _ = _of_class(self._answers_in, klass)
+        framing = _of_class(self._answers_in, klass).framing
         if isinstance(framing, Escaped) and self.dialect == "c":
             return framing.encode(body, TELEMETRY)
         return framing.encode(body)
@@ -142,8 +134,7 @@ class SerialLine:
         answers = []
         while self.received:
             asked = self._asked[0] if self._asked else None
-            number = first_byte_of((framing for _, framing, _ in self._answers_in), self.received[0])
-            _, framing, envelope = self._answers_in[number]
+            _, framing, envelope = self._answer_format(self.received[:1])
             echo = (
                 None
                 if asked is None or self._echoed or not self._answers(asked, "echo")
@@ -163,6 +154,14 @@ class SerialLine:
             if answer is not None:
                 answers.append(answer)
         return answers
+
+    def _answer_format(self, begun: bytearray) -> Format:
+        """Return the format of an answer that begins with a byte: one that always does, or one that may."""
+        for wanted in (bytes(begun), b""):
+            for item in self._answers_in:
+                if item.framing.start[:1] == wanted:
+                    return item
+        return self._answers_in[-1]
 
     def _answer(
         self, envelope: Envelope, taken: Taken, asked: Request | None, echo: bytes | None
@@ -191,19 +190,25 @@ def _size_of_echo(size: int, _begun: bytes) -> int:
     return size
 
 
-def _of_class(
-    formats: list[tuple[tuple[str, ...], Framing, Envelope]], klass: str
-) -> tuple[Framing, Envelope]:
-    return next((item[1:] for item in formats if klass in item[0]), formats[-1][1:])
+def _of_class(formats: list[Format], klass: str) -> Format:
+    return next((item for item in formats if klass in item.classes), formats[-1])
 
 
-def _formats(unit: Unit, direction: str) -> Iterator[tuple[tuple[str, ...], Framing, Envelope]]:
-    """Yield classes, framing and envelope of each format of a direction; without classes for all others, last."""
+def _formats(unit: Unit, direction: str) -> Iterator[Format]:
+    """Yield the formats of a direction in the order in which they apply; the last is that of all other messages."""
+    link = unit.serial
     elsewhere: tuple[str, ...] = ()
-    for model in format_models(unit.serial, direction):
-        framing = _framing(unit, model.framing)
-        yield model.classes, framing, Headed(unit, framing, model.check, model.classes, elsewhere)
-        elsewhere += model.classes
+    for model in link.format:
+        if model.direction not in (None, direction):
+            continue
+        classes = tuple(model.classes or ())
+        framing = _framing(unit, model.framing or link.framing)
+        yield Format(classes, framing, Headed(unit, framing, model.check or link.check, classes, elsewhere))
+        if not classes:
+            return
+        elsewhere += classes
+    framing = _framing(unit, link.framing)
+    yield Format((), framing, Headed(unit, framing, link.check, (), elsewhere))
 
 
 def _framing(unit: Unit, model: Any) -> Framing:
@@ -213,7 +218,7 @@ def _framing(unit: Unit, model: Any) -> Framing:
         case "slip":
             return Slip(model)
         case "length" | "fixed":
-            return Counted(model.start, model.end) if model.stuffing is None else Stuffed(model)
+            return Counted(model)
         case "delimited":
             return Delimited(model)
         case _:
@@ -233,8 +238,8 @@ class Headed:
         unit: Unit,
         framing: Framing,
         check: Any,
-        classes: tuple[str, ...] = (),
-        elsewhere: tuple[str, ...] = (),
+        classes: tuple[str, ...],
+        elsewhere: tuple[str, ...],
     ) -> None:
         link = unit.serial
         self._unit = unit
@@ -307,7 +312,7 @@ class Headed:
         end = len(taken.body) - self.check_size
         text = taken.body[: max(end, 0)]
         if not self._classes and self.closed(b"", text) == taken.body:
-            found = text_answer(self._unit.serial, text, asked, taken.body)
+            found = self._text_answer(text, asked, taken.body)
             if found is not None:
                 return found
         malformed = partial(Answer, "malformed", data=taken.body)
@@ -348,6 +353,23 @@ class Headed:
         code = values.get("status", 0)
         number = values["sequence"] if numbered else None
         return Answer(kind, code, data, request.id, klass, 0, final, time_s, taken.body, number)
+
+    def _text_answer(self, text: bytes, asked: Request | None, body: bytes) -> Answer | None:
+        """Return an acknowledge or refusal that is a text, exactly as in the definition; None if it is neither."""
+        link, words = self._unit.serial, text.decode("latin-1")
+        row_id, klass = (None, "") if asked is None else (asked.id, asked.klass)
+        if words == link.acknowledge:
+            kind: AnswerKind = "malformed" if asked is None or asked.telemetry else "ack"
+            return Answer(kind, data=text, row_id=row_id, klass=klass, body=body)
+        if link.refusal is None:
+            return None
+        before, marked, after = link.refusal.partition(CODE)
+        number = words[len(before) : len(words) - len(after)] if marked else ""
+        if words != before + number + after or (marked and not (number.isascii() and number.isdigit())):
+            return None
+        return Answer(
+            "malformed" if asked is None else "nack", int(number or 0), text, row_id, klass, body=body
+        )
 
     def can_refuse(self, klass: str) -> bool:
         """Return whether there is a text for refusals, or the header of a class has a status or an acknowledge bit."""
@@ -426,3 +448,7 @@ class Dialect:
         if kind == "unsolicited":
             return Answer("unsolicited", data=data, row_id=number, body=body)
         return Answer("malformed", data=body, body=body)
+
+
+Envelope = Headed | Dialect
+"""What surrounds the data of a message within its framing."""

@@ -10,7 +10,7 @@ from starhil.protocol.errors import ProtocolError
 
 
 class AbortCode(IntEnum):
-    """Reasons for which an SDO server may abort a transfer."""
+    """Reasons for which this node aborts a transfer, or which are published as errors of a row."""
 
     TOGGLE = 0x05030000
     TIMEOUT = 0x05040000
@@ -18,7 +18,6 @@ class AbortCode(IntEnum):
     BLOCK_SIZE = 0x05040002
     SEQUENCE = 0x05040003
     CRC = 0x05040004
-    OUT_OF_MEMORY = 0x05040005
     UNSUPPORTED_ACCESS = 0x06010000
     WRITE_ONLY = 0x06010001
     READ_ONLY = 0x06010002
@@ -26,7 +25,6 @@ class AbortCode(IntEnum):
     NOT_MAPPABLE = 0x06040041
     PDO_LENGTH = 0x06040042
     INCOMPATIBLE = 0x06040043
-    INTERNAL_INCOMPATIBLE = 0x06040047
     HARDWARE = 0x06060000
     LENGTH = 0x06070010
     LENGTH_HIGH = 0x06070012
@@ -35,20 +33,16 @@ class AbortCode(IntEnum):
     VALUE_RANGE = 0x06090030
     VALUE_HIGH = 0x06090031
     VALUE_LOW = 0x06090032
-    MAXIMUM_BELOW_MINIMUM = 0x06090036
-    NO_CONNECTION = 0x060A0023
     GENERAL = 0x08000000
     NOT_STORED = 0x08000020
-    LOCAL_CONTROL = 0x08000021
     DEVICE_STATE = 0x08000022
-    NO_DICTIONARY = 0x08000023
     NO_DATA = 0x08000024
 
 
 class SdoAbortError(ProtocolError):
-    """A refused access to the object dictionary, with the SDO abort code."""
+    """A refused access to the object dictionary, with the SDO abort code, which may be one that this node never sends."""
 
-    def __init__(self, code: AbortCode, detail: str = "") -> None:
+    def __init__(self, code: int, detail: str = "") -> None:
         self.code = code
-        text = f"0x{code:08X} {SdoAbortedError.CODES.get(code, code.name)}"
+        text = f"0x{code:08X} {SdoAbortedError.CODES.get(code, 'unknown')}"
         super().__init__(f"{text}: {detail}" if detail else text)

@@ -11,7 +11,7 @@ from typing import Any, Final
 from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
 
 from starhil.protocol.canopen.cob import BIT_30, INVALID
-from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING
+from starhil.protocol.canopen.pdo_mapping import LARGEST_MAPPING, Direction
 from starhil.protocol.canopen_schema import CanopenModel, PdoModel
 
 U8: Final = datatypes.UNSIGNED8
@@ -118,9 +118,9 @@ def add_communication(
         add_record(
             od, item["name"], list(_members(layout, item)), array=item.get("array", False), count=count
         )
-    for kind, pdos in (("RPDO", rpdos), ("TPDO", tpdos)):
+    for direction, pdos in ((Direction.RECEIVE, rpdos), (Direction.TRANSMIT, tpdos)):
         for number, (model, mapping) in enumerate(pdos):
-            _add_pdo(od, kind, number, model, mapping)
+            _add_pdo(od, direction, number, model, mapping)
 
 
 @cache
@@ -149,11 +149,13 @@ def _members(layout: CanopenModel, record: Mapping[str, Any]) -> Iterator[ODVari
         first = subindex + 1
 
 
-def _add_pdo(od: ObjectDictionary, kind: str, number: int, model: PdoModel, mapping: Sequence[int]) -> None:
+def _add_pdo(
+    od: ObjectDictionary, direction: Direction, number: int, model: PdoModel, mapping: Sequence[int]
+) -> None:
     """Add the communication and the mapping parameter of an RPDO or a TPDO."""
-    transmits = kind == "TPDO"
-    first, predefined = (0x1800, TPDO_CAN_IDS) if transmits else (0x1400, RPDO_CAN_IDS)
-    index, name = first + number, f"{kind} {number + 1}"
+    transmits = direction is Direction.TRANSMIT
+    kind, predefined = ("TPDO", TPDO_CAN_IDS) if transmits else ("RPDO", RPDO_CAN_IDS)
+    index, name = direction + number, f"{kind} {number + 1}"
     can_id = model.can_id or (predefined[number] if number < len(predefined) else 0)
     cob_id = can_id | (BIT_30 if transmits else 0) | (0 if model.enabled else INVALID)
     relative = model.relative and bool(can_id)
@@ -166,7 +168,7 @@ def _add_pdo(od: ObjectDictionary, kind: str, number: int, model: PdoModel, mapp
         settings.insert(2, variable("Inhibit time", index, 3, U16, "rw", round(model.inhibit_ms * 10)))
         settings.append(variable("SYNC start value", index, 6, U8, "rw", 0))
     add_record(od, f"{name} communication parameter: {model.name}", settings)
-    index += 0x200
+    index = direction.mapping(number)
     members = [
         variable(f"Mapped object {subindex}", index, subindex, U32, "rw", value)
         for subindex, value in enumerate((*mapping, *[0] * (LARGEST_MAPPING - len(mapping))), 1)

@@ -7,7 +7,7 @@ current value as bytes on the wire and the functions that read and write it in t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -92,19 +92,20 @@ def encode(variable: ODVariable, value: Value) -> bytes:
 
 
 class Dictionary:
-    """Object dictionary of one node, with an entry for each variable; `load_defaults` sets their default values."""
+    """Object dictionary of one node, with an entry for each variable; `load_defaults` sets their default values.
 
-    def __init__(self, od: ObjectDictionary) -> None:
+    `connected` are the entries that read or write the device.
+    """
+
+    def __init__(self, od: ObjectDictionary, connected: Iterable[Entry] = ()) -> None:
         self.od = od
-        self.entries: dict[tuple[int, int], Entry] = {}
+        self.entries = {entry.key: entry for entry in connected}
         for item in od.values():
-            variables = (
-                [item] if isinstance(item, ODVariable) else [item[number] for number in item.subindices]
-            )
-            for variable in variables:
-                entry = Entry(variable)
+            members = [item] if isinstance(item, ODVariable) else item.subindices.values()
+            for variable in members:
+                key = variable.index, variable.subindex
+                entry = self.entries.setdefault(key, Entry(variable))
                 entry.persistent = variable.writable and variable.readable
-                self.entries[entry.key] = entry
         self.changed: set[tuple[int, int]] = set()
         """Keys written since the node last cleared them."""
         self.instant = 0

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -23,8 +23,6 @@ ARRAY: Final = 0x8
 RECORD: Final = 0x9
 HEAD: Final = Path(__file__).with_name("head.eds")
 
-Section = list[tuple[str, str]]
-
 
 def build_eds(dictionary: Dictionary) -> str:
     """Return the EDS of an object dictionary.
@@ -32,20 +30,19 @@ def build_eds(dictionary: Dictionary) -> str:
     Raises IcdError for two objects, or two entries of an object, with the same name.
     """
     scope = Scope("EDS")
-    sections: list[tuple[str, Section, str]] = []
-    indices = sorted(dictionary.od.indices)
     lists: dict[str, list[int]] = {"MandatoryObjects": [], "OptionalObjects": [], "ManufacturerObjects": []}
-    for index in indices:
+    for index in sorted(dictionary.od.indices):
         kind = "Mandatory" if index in MANDATORY else "Manufacturer" if index in MANUFACTURER else "Optional"
         lists[f"{kind}Objects"].append(index)
+    text = _head(dictionary)
     for name, members in lists.items():
-        entries = [(str(position), f"0x{index:04X}") for position, index in enumerate(members, 1)]
-        sections.append((name, [("SupportedObjects", str(len(members))), *entries], ""))
+        numbered = {str(number): f"0x{index:04X}" for number, index in enumerate(members, 1)}
+        text += _section(name, {"SupportedObjects": str(len(members))} | numbered)
         for index in members:
             item = dictionary.od.indices[index]
             scope.claim(eds_text(item.name), f"object {index:04X}h")
-            sections.extend(_object(item))
-    return _head(dictionary) + "\n".join(_text(sections)) + "\n"
+            text += "".join(_object(item))
+    return text
 
 
 def _head(dictionary: Dictionary) -> str:
@@ -64,32 +61,28 @@ def _head(dictionary: Dictionary) -> str:
     )
 
 
-def _text(sections: Iterable[tuple[str, Section, str]]) -> Iterator[str]:
-    for name, entries, remark in sections:
-        if remark:
-            yield f"; {eds_text(remark)}"
-        yield f"[{name}]"
-        for key, value in entries:
-            yield f"{key}={eds_text(value)}"
-        yield ""
+def _section(name: str, entries: Mapping[str, str], remark: str = "") -> str:
+    comment = f"; {eds_text(remark)}\n" if remark else ""
+    return (
+        f"{comment}[{name}]\n"
+        + "".join(f"{key}={eds_text(value)}\n" for key, value in entries.items())
+        + "\n"
+    )
 
 
-def _object(item: ODVariable | ODRecord | ODArray) -> Iterator[tuple[str, Section, str]]:
+def _object(item: ODVariable | ODRecord | ODArray) -> Iterator[str]:
+    """Yield the section of an object, and those of its members."""
     if isinstance(item, ODVariable):
-        yield f"{item.index:04X}", _variable(item), _remark(item)
+        yield _section(f"{item.index:04X}", _variable(item), _remark(item))
         return
     kind = ARRAY if isinstance(item, ODArray) else RECORD
-    entries = [
-        ("ParameterName", item.name),
-        ("ObjectType", f"0x{kind:X}"),
-        ("SubNumber", f"0x{len(item.subindices):X}"),
-    ]
-    yield f"{item.index:04X}", entries, ""
+    count = f"0x{len(item.subindices):X}"
+    entries = {"ParameterName": item.name, "ObjectType": f"0x{kind:X}", "SubNumber": count}
+    yield _section(f"{item.index:04X}", entries)
     scope = Scope("EDS")
-    for subindex in sorted(item.subindices):
-        member = item.subindices[subindex]
+    for subindex, member in sorted(item.subindices.items()):
         scope.claim(eds_text(member.name), f"object {item.index:04X}h, sub-index {subindex}")
-        yield f"{item.index:04X}sub{subindex:X}", _variable(member), _remark(member)
+        yield _section(f"{item.index:04X}sub{subindex:X}", _variable(member), _remark(member))
 
 
 def _remark(item: ODVariable) -> str:
@@ -99,25 +92,19 @@ def _remark(item: ODVariable) -> str:
     return " ".join(part for part in (item.description, unit, f"({names})" if names else "") if part)
 
 
-def _variable(item: ODVariable) -> Section:
+def _variable(item: ODVariable) -> dict[str, str]:
     data_type = item.data_type or 0
-    kind = DOMAIN if data_type == datatypes.DOMAIN else VARIABLE
-    entries = [
-        ("ParameterName", item.name),
-        ("ObjectType", f"0x{kind:X}"),
-        ("DataType", f"0x{data_type:04X}"),
-        ("AccessType", item.access_type),
-    ]
+    entries = {
+        "ParameterName": item.name,
+        "ObjectType": f"0x{DOMAIN if data_type == datatypes.DOMAIN else VARIABLE:X}",
+        "DataType": f"0x{data_type:04X}",
+        "AccessType": item.access_type,
+    }
     if item.default is not None:
-        entries.append(("DefaultValue", _default(item, data_type)))
-    if data_type in datatypes.INTEGER_TYPES:
-        entries += [
-            (key, str(int(limit)))
-            for key, limit in (("LowLimit", item.min), ("HighLimit", item.max))
-            if limit is not None
-        ]
-    entries.append(("PDOMapping", str(int(item.pdo_mappable))))
-    return entries
+        entries["DefaultValue"] = _default(item, data_type)
+    limits = {"LowLimit": item.min, "HighLimit": item.max} if data_type in datatypes.INTEGER_TYPES else {}
+    entries |= {key: str(int(limit)) for key, limit in limits.items() if limit is not None}
+    return entries | {"PDOMapping": str(int(item.pdo_mappable))}
 
 
 def _default(item: ODVariable, data_type: int) -> str:

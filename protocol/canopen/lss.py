@@ -29,33 +29,26 @@ OUT_OF_RANGE: Final = 1
 STORAGE_FAILED: Final = 2
 
 
+SWITCH_SELECTIVE: Final = range(0x40, 0x44)
+IDENTIFY: Final = range(0x46, 0x4C)
+INQUIRE_IDENTITY: Final = range(0x5A, 0x5E)
+"""Command specifiers of frames in order, each with a number of the identity: vendor-ID, product code, revision, serial
+number; revision and serial number as lower and upper limit to identify."""
+
+
 class Command(IntEnum):
-    """LSS command specifiers."""
+    """The other LSS command specifiers."""
 
     SWITCH_GLOBAL = 0x04
     CONFIGURE_NODE_ID = 0x11
     CONFIGURE_BIT_TIMING = 0x13
     ACTIVATE_BIT_TIMING = 0x15
     STORE = 0x17
-    SWITCH_VENDOR = 0x40
-    SWITCH_PRODUCT = 0x41
-    SWITCH_REVISION = 0x42
-    SWITCH_SERIAL = 0x43
     SWITCHED = 0x44
-    IDENTIFY_VENDOR = 0x46
-    IDENTIFY_PRODUCT = 0x47
-    IDENTIFY_REVISION_LOW = 0x48
-    IDENTIFY_REVISION_HIGH = 0x49
-    IDENTIFY_SERIAL_LOW = 0x4A
-    IDENTIFY_SERIAL_HIGH = 0x4B
     IDENTIFY_NON_CONFIGURED = 0x4C
     IDENTIFIED = 0x4F
     NON_CONFIGURED = 0x50
     FASTSCAN = 0x51
-    INQUIRE_VENDOR = 0x5A
-    INQUIRE_PRODUCT = 0x5B
-    INQUIRE_REVISION = 0x5C
-    INQUIRE_SERIAL = 0x5D
     INQUIRE_NODE_ID = 0x5E
 
 
@@ -83,8 +76,8 @@ class LssSlave:
         self.pending_node_id = context.node_id
         self.pending_bit_rate = bit_rate
         self.configuring = False
-        self._selected = 0
-        self._identified = 0
+        self._matched = dict.fromkeys((SWITCH_SELECTIVE, IDENTIFY), 0)
+        """Number of frames in order that matched."""
         self._scan_position = 0
 
     def receive(self, data: bytes) -> None:
@@ -95,10 +88,17 @@ class LssSlave:
         number = int.from_bytes(data[1:5], "little")
         if command == Command.SWITCH_GLOBAL:
             self._switch_global(data[1])
-        elif Command.SWITCH_VENDOR <= command <= Command.SWITCH_SERIAL:
-            self._switch_selective(command, number)
-        elif Command.IDENTIFY_VENDOR <= command <= Command.IDENTIFY_SERIAL_HIGH:
-            self._identify(command, number)
+        elif command in SWITCH_SELECTIVE:
+            step = command - SWITCH_SELECTIVE.start
+            if self._all_match(SWITCH_SELECTIVE, step, matches=number == self._identity(step)):
+                self.configuring = True
+                self._send(Command.SWITCHED)
+        elif command in IDENTIFY:
+            step = command - IDENTIFY.start
+            own = self._identity((0, 1, 2, 2, 3, 3)[step])
+            matches = number == own if step < 2 else number <= own if step % 2 == 0 else number >= own
+            if self._all_match(IDENTIFY, step, matches=matches):
+                self._send(Command.IDENTIFIED)
         elif command == Command.IDENTIFY_NON_CONFIGURED:
             if self._unconfigured:
                 self._send(Command.NON_CONFIGURED)
@@ -119,44 +119,16 @@ class LssSlave:
         self._context.send(LSS_SLAVE, bytes([command]) + payload.ljust(LENGTH - 1, b"\0"))
 
     def _switch_global(self, mode: int) -> None:
-        if mode == 1:
-            self.configuring = True
-        elif mode == 0:
-            self._to_waiting()
-
-    def _to_waiting(self) -> None:
-        self.configuring = False
-        if self._context.node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
+        if mode in (0, 1):
+            self.configuring = mode == 1
+        if mode == 0 and self._context.node_id == UNCONFIGURED and self.pending_node_id != UNCONFIGURED:
             self._on_node_id(self.pending_node_id)
 
-    def _switch_selective(self, command: int, number: int) -> None:
-        """Select this node after four frames in order, each with one number of its identity."""
-        step = command - Command.SWITCH_VENDOR
-        if step == 0:
-            self._selected = 0
-        if step != self._selected or number != self._identity(step):
-            self._selected = 0
-            return
-        self._selected += 1
-        if self._selected == 4:
-            self._selected = 0
-            self.configuring = True
-            self._send(Command.SWITCHED)
-
-    def _identify(self, command: int, number: int) -> None:
-        """Identify after six frames in order: vendor, product, ranges of revision and serial."""
-        step = command - Command.IDENTIFY_VENDOR
-        if step == 0:
-            self._identified = 0
-        own = self._identity((0, 1, 2, 2, 3, 3)[step])
-        matches = number == own if step < 2 else number <= own if step % 2 == 0 else number >= own
-        if step != self._identified or not matches:
-            self._identified = 0
-            return
-        self._identified += 1
-        if self._identified == 6:
-            self._identified = 0
-            self._send(Command.IDENTIFIED)
+    def _all_match(self, frames: range, step: int, *, matches: bool) -> bool:
+        """Return whether this frame is the last of those in order, and all match."""
+        in_order = step in (0, self._matched[frames])
+        self._matched[frames] = step + 1 if matches and in_order else 0
+        return self._matched[frames] == len(frames)
 
     def _fastscan(self, number: int, bit: int, part: int, following: int) -> None:
         """Compare the upper bits of one number of the identity.
@@ -180,8 +152,8 @@ class LssSlave:
 
     def _configuration(self, command: int, data: bytes) -> None:
         """Execute a command that requires the configuration state."""
-        if Command.INQUIRE_VENDOR <= command <= Command.INQUIRE_SERIAL:
-            self._send(command, self._identity(command - Command.INQUIRE_VENDOR).to_bytes(4, "little"))
+        if command in INQUIRE_IDENTITY:
+            self._send(command, self._identity(command - INQUIRE_IDENTITY.start).to_bytes(4, "little"))
         elif command == Command.INQUIRE_NODE_ID:
             self._send(command, bytes([self._context.node_id]))
         elif command == Command.CONFIGURE_NODE_ID:
@@ -193,12 +165,11 @@ class LssSlave:
                 )
             self._send(command, bytes([OK if valid else OUT_OF_RANGE]))
         elif command == Command.CONFIGURE_BIT_TIMING:
-            bit_rate = BIT_RATES.get(data[2]) if data[1] == 0 else None
-            if bit_rate in self._allowed and bit_rate is not None:
+            bit_rate = BIT_RATES.get(data[2], 0)
+            valid = data[1] == 0 and bit_rate in self._allowed
+            if valid:
                 self.pending_bit_rate = bit_rate
-                self._send(command, bytes([OK]))
-            else:
-                self._send(command, bytes([OUT_OF_RANGE]))
+            self._send(command, bytes([OK if valid else OUT_OF_RANGE]))
         elif command == Command.ACTIVATE_BIT_TIMING:
             self._on_bit_rate(self.pending_bit_rate, int.from_bytes(data[1:3], "little") * 1e-3)
         elif command == Command.STORE:

@@ -5,38 +5,32 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 
-from starhil.protocol.canopen.abort import SdoAbortError
+from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.context import Context, EventKind, NmtState
 from starhil.protocol.canopen.dictionary import check_value
 from starhil.protocol.canopen.emergency import EmergencyCode, EmergencyProducer
-from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, MappedObject, PdoRecords
+from starhil.protocol.canopen.pdo_mapping import LAST_CYCLIC, Direction, Pdo
 
 
-class ReceivePdo:
+class ReceivePdo(Pdo):
     """Writes the mapped objects when its message arrives, or at the next SYNC if synchronous."""
 
-    def __init__(self, context: Context, emergency: EmergencyProducer, number: int) -> None:
-        self._context = context
-        self.records = PdoRecords(context.dictionary, Direction.RECEIVE, number)
+    direction = Direction.RECEIVE
+
+    def __init__(self, context: Context, number: int, emergency: EmergencyProducer) -> None:
+        super().__init__(context, number)
         self._key = bytes([number + 1])
         self._error = partial(emergency.communication_error, key=self._key)
-        self._objects: list[MappedObject] = []
         self._size = 0
         self._pending: bytes | None = None
         self.next_deadline: float | None = None
 
     def configure(self) -> None:
         """Apply the current records and drop messages that wait for SYNC."""
-        self.records.changed = False
-        self._objects = self.records.mapped()
+        super().configure()
         self._size = sum(mapped.size for mapped in self._objects)
         self._pending = None
         self.next_deadline = None
-
-    @property
-    def can_id(self) -> int | None:
-        """CAN ID of the message; None while the PDO is disabled or maps no objects."""
-        return self.records.can_id if self.records.valid and self._objects else None
 
     def receive(self, data: bytes) -> None:
         """Process a message; report a wrong length and drop a message that is too short."""
@@ -48,8 +42,8 @@ class ReceivePdo:
         self._error(EmergencyCode.PDO_LENGTH_LOW, active=False)
         self._error(EmergencyCode.RPDO_TIMEOUT, active=False)
         self._error(EmergencyCode.PDO_LENGTH_HIGH, detail, active=len(data) > self._size)
-        self.next_deadline = self._context.now + self.records.event_s if self.records.event_s else None
-        if self.records.transmission_type <= LAST_CYCLIC:
+        self.next_deadline = self._context.now + self._event_s if self._event_s else None
+        if self._synchronous:
             self._pending = data
         else:
             self._apply(data)
@@ -83,19 +77,23 @@ class ReceivePdo:
             for index, subindex, value in writes:
                 self._context.dictionary.write(index, subindex, value)
         except SdoAbortError as refusal:
-            self._context.report(EventKind.REFUSED, self.records.number + 1, f"RPDO: {refusal}")
+            self._context.report(EventKind.REFUSED, self.number + 1, f"RPDO: {refusal}")
             self._error(EmergencyCode.PROTOCOL, self._key + refusal.code.to_bytes(4, "little"))
             return
         self._error(EmergencyCode.PROTOCOL, active=False)
 
 
-class TransmitPdo:
+class TransmitPdo(Pdo):
     """Sends the mapped objects at SYNCs, at events or by its timer."""
 
+    direction = Direction.TRANSMIT
+
     def __init__(self, context: Context, number: int) -> None:
-        self._context = context
-        self.records = PdoRecords(context.dictionary, Direction.TRANSMIT, number)
-        self._objects: list[MappedObject] = []
+        super().__init__(context, number)
+        communication = self.direction + number
+        self._inhibit, self._sync_start = (context.dictionary.find(communication, item) for item in (3, 6))
+        self._inhibit.writer = self._check_disabled
+        self._sync_start.writer = self._check_sync_start
         self._keys: frozenset[tuple[int, int]] = frozenset()
         self._event = False
         self._syncs = 0
@@ -105,23 +103,18 @@ class TransmitPdo:
 
     def configure(self) -> None:
         """Apply the current records and restart the timers and the SYNC count."""
-        self.records.changed = False
-        self._objects = self.records.mapped()
+        super().configure()
         self._keys = frozenset(mapped.entry.key for mapped in self._objects if mapped.entry is not None)
         self._event = False
         self._syncs = 0
-        self._started = self.records.sync_start == 0
+        self._started = self._sync_start.number() == 0
         self._free_at = self._context.now
         self._restart_timer()
 
     @property
     def active(self) -> bool:
         """Whether the PDO may be sent."""
-        return self.records.valid and bool(self._objects) and self._context.state is NmtState.OPERATIONAL
-
-    @property
-    def _synchronous(self) -> bool:
-        return self.records.transmission_type <= LAST_CYCLIC
+        return self.exists and self._context.state is NmtState.OPERATIONAL
 
     @property
     def next_deadline(self) -> float | None:
@@ -135,18 +128,18 @@ class TransmitPdo:
     def start(self) -> None:
         """Enter OPERATIONAL: an event-driven PDO is sent once, acyclic ones wait for an event."""
         self._syncs = 0
-        self._started = self.records.sync_start == 0
+        self._started = self._sync_start.number() == 0
         self._restart_timer()
         self._event = not self._synchronous
 
-    def trigger(self, keys: frozenset[tuple[int, int]]) -> None:
+    def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
         """Mark an event of these objects; `tick` sends an event-driven PDO once the inhibit time allows."""
         if self.active and not self._keys.isdisjoint(keys):
             self._event = True
 
     def synchronise(self, counter: int) -> None:
         """Act on a SYNC with this counter (0 if it carries none)."""
-        kind = self.records.transmission_type
+        kind = self._type.number()
         if not self.active or not self._synchronous:
             return
         if kind == 0:
@@ -154,7 +147,7 @@ class TransmitPdo:
                 self._send()
             return
         if not self._started:
-            if counter and counter != self.records.sync_start:
+            if counter and counter != self._sync_start.number():
                 return
             self._started = True
             self._syncs = kind - 1
@@ -170,12 +163,12 @@ class TransmitPdo:
             return
         due = None if self._event else self._event_at
         self._send()
-        period = self.records.event_s
+        period = self._event_s
         if due is not None and period and due + period > self._context.now:
             self._event_at = due + period  # a late transmission does not shift the next one
 
     def _restart_timer(self) -> None:
-        period = self.records.event_s
+        period = self._event_s
         self._event_at = self._context.now + period if period else None
 
     def _send(self) -> None:
@@ -184,10 +177,19 @@ class TransmitPdo:
         try:
             data = b"".join(mapped.entry.read() for mapped in self._objects if mapped.entry is not None)
         except SdoAbortError as refusal:
-            self._context.report(EventKind.REFUSED, self.records.number + 1, f"TPDO: {refusal}")
+            self._context.report(EventKind.REFUSED, self.number + 1, f"TPDO: {refusal}")
             return
-        self._free_at = self._context.now + self.records.inhibit_s
-        self._context.send(self.records.can_id, data)
+        self._free_at = self._context.now + self._inhibit.number() * 1e-4
+        self._context.send(self.can_id, data)
+
+    def _check_disabled(self, data: bytes) -> None:
+        if self._valid:
+            raise SdoAbortError(AbortCode.VALUE_RANGE, f"disable the PDO before setting it to {data.hex()}")
+
+    def _check_sync_start(self, data: bytes) -> None:
+        if data[0] > LAST_CYCLIC:
+            raise SdoAbortError(AbortCode.VALUE_RANGE, "SYNC start value is 0 to 240")
+        self._check_disabled(data)
 
 
 class PdoService:
@@ -196,14 +198,15 @@ class PdoService:
     def __init__(self, context: Context, emergency: EmergencyProducer) -> None:
         self._context = context
         numbers = partial(Direction.numbers, indices=context.dictionary.od.indices)
-        self.receiving = [ReceivePdo(context, emergency, number) for number in numbers(Direction.RECEIVE)]
+        self.receiving = [ReceivePdo(context, number, emergency) for number in numbers(Direction.RECEIVE)]
         self.transmitting = [TransmitPdo(context, number) for number in numbers(Direction.TRANSMIT)]
         self._all: list[ReceivePdo | TransmitPdo] = [*self.transmitting, *self.receiving]
 
-    def configure(self, *, everything: bool = False) -> None:
-        """Configure the PDOs whose records have changed, or all."""
+    def configure(self, changed: Iterable[tuple[int, int]] | None = None) -> None:
+        """Configure the PDOs with one of the changed entries in their records, or all."""
+        indices = None if changed is None else {index for index, _ in changed}
         for pdo in self._all:
-            if everything or pdo.records.changed:
+            if indices is None or not indices.isdisjoint(pdo.indices):
                 pdo.configure()
 
     @property
@@ -219,13 +222,12 @@ class PdoService:
 
     def stop(self) -> None:
         """Leave OPERATIONAL: drop all pending messages."""
-        self.configure(everything=True)
+        self.configure()
 
     def trigger(self, keys: Iterable[tuple[int, int]]) -> None:
         """Trigger the TPDOs that map one of these objects."""
-        changed = frozenset(keys)
         for pdo in self.transmitting:
-            pdo.trigger(changed)
+            pdo.trigger(keys)
 
     def synchronise(self, counter: int) -> None:
         """Act on a SYNC: first send samples of this instant, then apply received messages."""

@@ -1,16 +1,17 @@
-"""PDO communication and mapping records, and the rules for changing them (CiA 301)."""
+"""The communication and mapping record of a PDO, and the rules for changing them (CiA 301)."""
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Sequence
 from dataclasses import dataclass
-from enum import Enum
-from typing import Final
+from enum import IntEnum
+from typing import ClassVar, Final
 
 import construct
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.cob import BIT_30, ID_MASK, check_change, exists
+from starhil.protocol.canopen.context import Context
 from starhil.protocol.canopen.dictionary import Dictionary, Entry, type_size
 
 LARGEST_MAPPING: Final = 8
@@ -31,25 +32,19 @@ MAPPING_ENTRY: Final = construct.Struct(
 """The 32-bit value of a mapping entry, most significant byte first."""
 
 
-class Direction(Enum):
-    """RPDO or TPDO, with the indices of the first communication and mapping record."""
+class Direction(IntEnum):
+    """RPDO or TPDO, as the index of its first communication record."""
 
-    RECEIVE = (0x1400, 0x1600)
-    TRANSMIT = (0x1800, 0x1A00)
+    RECEIVE = 0x1400
+    TRANSMIT = 0x1800
 
-    @property
-    def communication(self) -> int:
-        """Index of the first communication record."""
-        return self.value[0]
-
-    @property
-    def mapping(self) -> int:
-        """Index of the first mapping record."""
-        return self.value[1]
+    def mapping(self, number: int) -> int:
+        """Return the index of the mapping record of a PDO, 0 for the first."""
+        return self + 0x200 + number
 
     def numbers(self, indices: Container[int]) -> list[int]:
         """Return the PDOs of this direction that a dictionary with these indices has; the first is 0."""
-        return [number for number in range(0x200) if self.communication + number in indices]
+        return [number for number in range(0x200) if self + number in indices]
 
 
 @dataclass(frozen=True)
@@ -89,41 +84,43 @@ def resolve(dictionary: Dictionary, value: int, direction: Direction) -> MappedO
     return MappedObject(entry, entry.size)
 
 
-class PdoRecords:
-    """Communication and mapping record of a PDO, 0 for the first, with the rules for changing them."""
+def resolve_all(dictionary: Dictionary, values: Sequence[int], direction: Direction) -> list[MappedObject]:
+    """Return the objects of a mapping. Raises SdoAbortError as `resolve`, and PDO_LENGTH if a PDO cannot hold them."""
+    objects = [resolve(dictionary, value, direction) for value in values]
+    size = sum(mapped.size for mapped in objects)
+    if size > LARGEST_PDO:
+        raise SdoAbortError(AbortCode.PDO_LENGTH, f"{size} bytes, at most {LARGEST_PDO}")
+    return objects
 
-    def __init__(self, dictionary: Dictionary, direction: Direction, number: int) -> None:
-        self._dictionary = dictionary
-        self.direction = direction
+
+class Pdo:
+    """A PDO, 0 for the first: its communication and mapping record, and the rules for changing them."""
+
+    direction: ClassVar[Direction]
+
+    def __init__(self, context: Context, number: int) -> None:
+        self._context = context
         self.number = number
-        self.changed = True
-        """Whether a record was written since the PDO was configured."""
-        communication = direction.communication + number
-        mapping = direction.mapping + number
-        self._cob_id = dictionary.find(communication, 1)
-        self._type = dictionary.find(communication, 2)
-        self._inhibit = dictionary.entries.get((communication, 3))
-        self._event_timer = dictionary.entries.get((communication, 5))
-        self._sync_start = dictionary.entries.get((communication, 6))
-        self._count = dictionary.find(mapping, 0)
-        self._slots = [dictionary.find(mapping, position + 1) for position in range(LARGEST_MAPPING)]
-        self._cob_id.writer = self._write_cob_id
-        self._type.writer = self._write_type
-        for entry in (self._inhibit, self._sync_start):
-            if entry is not None:
-                entry.writer = self._write_when_invalid
-        if self._event_timer is not None:
-            self._event_timer.writer = self._write_event_timer
-        if self._sync_start is not None:
-            self._sync_start.writer = self._write_sync_start
-        self._count.writer = self._write_count
+        self.indices = communication, mapping = self.direction + number, self.direction.mapping(number)
+        """Indices of its records."""
+        self._objects: list[MappedObject] = []
+        find = context.dictionary.find
+        self._cob_id, self._type, self._event_timer = (find(communication, item) for item in (1, 2, 5))
+        self._count, *self._slots = (find(mapping, item) for item in range(LARGEST_MAPPING + 1))
+        self._cob_id.writer = self._check_cob_id
+        self._type.writer = self._check_type
+        self._count.writer = self._check_count
         for slot in self._slots:
-            slot.writer = self._write_slot
+            slot.writer = self._check_slot
+
+    def configure(self) -> None:
+        """Apply the current records; no objects are mapped while the mapping is disabled."""
+        self._objects = self._mapped(self._count.number())
 
     @property
-    def valid(self) -> bool:
-        """Whether the PDO is enabled."""
-        return exists(self._cob_id.number())
+    def exists(self) -> bool:
+        """Whether the PDO is enabled and maps objects."""
+        return self._valid and bool(self._objects)
 
     @property
     def can_id(self) -> int:
@@ -131,65 +128,31 @@ class PdoRecords:
         return self._cob_id.number() & ID_MASK
 
     @property
-    def transmission_type(self) -> int:
-        """Transmission type: when the PDO is sent or applied."""
-        return self._type.number()
+    def _valid(self) -> bool:
+        return exists(self._cob_id.number())
 
     @property
-    def inhibit_s(self) -> float:
-        """Shortest time between two transmissions, s."""
-        return 0.0 if self._inhibit is None else self._inhibit.number() * 1e-4
+    def _synchronous(self) -> bool:
+        return self._type.number() <= LAST_CYCLIC
 
     @property
-    def event_s(self) -> float:
-        """TPDO: longest time between two transmissions.
+    def _event_s(self) -> float:
+        """TPDO: longest time between two transmissions. RPDO: deadline of the next message; s, 0 for none."""
+        return self._event_timer.number() * 1e-3
 
-        RPDO: deadline of the next message; s, 0 for none.
-        """
-        return 0.0 if self._event_timer is None else self._event_timer.number() * 1e-3
-
-    @property
-    def sync_start(self) -> int:
-        """SYNC counter at which the PDO starts, 0 for any."""
-        return 0 if self._sync_start is None else self._sync_start.number()
-
-    def mapped(self) -> list[MappedObject]:
-        """Return the mapped objects in order; none while the mapping is disabled."""
-        count = min(self._count.number(), LARGEST_MAPPING)
-        return [resolve(self._dictionary, slot.number(), self.direction) for slot in self._slots[:count]]
-
-    def _write_cob_id(self, data: bytes) -> None:
+    def _check_cob_id(self, data: bytes) -> None:
         new = int.from_bytes(data, "little")
         if self.direction is Direction.TRANSMIT and not new & BIT_30:
             raise SdoAbortError(
                 AbortCode.VALUE_RANGE, "remote requests are not supported: bit 30 must be set"
             )
         check_change(self._cob_id.number(), new, enabled=exists)
-        self.changed = True
 
-    def _write_type(self, data: bytes) -> None:
+    def _check_type(self, data: bytes) -> None:
         if data[0] > LAST_CYCLIC and data[0] not in EVENT_DRIVEN:
             raise SdoAbortError(AbortCode.VALUE_RANGE, f"transmission type {data[0]} is not supported")
-        self.changed = True
 
-    def _write_when_invalid(self, data: bytes) -> None:
-        if self.valid:
-            raise SdoAbortError(AbortCode.VALUE_RANGE, f"disable the PDO before setting it to {data.hex()}")
-        self.changed = True
-
-    def _write_event_timer(self, _data: bytes) -> None:
-        self.changed = True
-
-    def _write_sync_start(self, data: bytes) -> None:
-        if data[0] > LAST_CYCLIC:
-            raise SdoAbortError(AbortCode.VALUE_RANGE, "SYNC start value is 0 to 240")
-        self._write_when_invalid(data)
-
-    def _require_disabled(self) -> None:
-        if self.valid:
-            raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS, "disable the PDO before changing its mapping")
-
-    def _write_slot(self, data: bytes) -> None:
+    def _check_slot(self, data: bytes) -> None:
         self._require_disabled()
         if self._count.number():
             raise SdoAbortError(
@@ -197,16 +160,18 @@ class PdoRecords:
             )
         value = int.from_bytes(data, "little")
         if value:
-            resolve(self._dictionary, value, self.direction)
+            resolve(self._context.dictionary, value, self.direction)
 
-    def _write_count(self, data: bytes) -> None:
+    def _check_count(self, data: bytes) -> None:
         self._require_disabled()
         if data[0] > LARGEST_MAPPING:
             raise SdoAbortError(AbortCode.PDO_LENGTH, f"{data[0]} objects, at most {LARGEST_MAPPING}")
-        objects = [
-            resolve(self._dictionary, slot.number(), self.direction) for slot in self._slots[: data[0]]
-        ]
-        size = sum(mapped.size for mapped in objects)
-        if size > LARGEST_PDO:
-            raise SdoAbortError(AbortCode.PDO_LENGTH, f"{size} bytes, at most {LARGEST_PDO}")
-        self.changed = True
+        self._mapped(data[0])
+
+    def _mapped(self, count: int) -> list[MappedObject]:
+        values = [slot.number() for slot in self._slots[:count]]
+        return resolve_all(self._context.dictionary, values, self.direction)
+
+    def _require_disabled(self) -> None:
+        if self._valid:
+            raise SdoAbortError(AbortCode.UNSUPPORTED_ACCESS, "disable the PDO before changing its mapping")

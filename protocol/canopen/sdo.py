@@ -119,6 +119,6 @@ class SdoServer:
         self._waiting = answers
         return []
 
-    def _abort(self, code: AbortCode, index: int, subindex: int) -> bytes:
+    def _abort(self, code: int, index: int, subindex: int) -> bytes:
         self.reset()
         return bytes([ABORT]) + index.to_bytes(2, "little") + bytes([subindex]) + code.to_bytes(4, "little")

@@ -15,7 +15,7 @@ from starhil.protocol.messages import ErrorCode
 SdoTransfer = Generator[bytes, bytes, bytes]
 """Returns the data of an upload, or no data after a download; raises `SdoAbortError` on an abort."""
 
-ERROR_OF_ABORT: Final = {
+ERROR_OF_ABORT: Final[dict[int, ErrorCode]] = {
     AbortCode.NO_OBJECT: ErrorCode.INVALID_ID,
     AbortCode.NO_SUBINDEX: ErrorCode.INVALID_ID,
     AbortCode.LENGTH: ErrorCode.INVALID_LENGTH,
@@ -105,10 +105,7 @@ def requests_of(transfer: SdoTransfer) -> list[bytes]:
 
 
 def _checked(answer: bytes) -> bytes:
-    """Return an answer if it has 8 bytes and is not an abort."""
+    """Return an answer that is not an abort."""
     if answer[0] == _ABORT:
-        number = int.from_bytes(answer[4:], "little")
-        if number in set(AbortCode):
-            raise SdoAbortError(AbortCode(number))
-        raise SdoAbortError(AbortCode.GENERAL, f"code 0x{number:08X}")
+        raise SdoAbortError(int.from_bytes(answer[4:], "little"))
     return answer

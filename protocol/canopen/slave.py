@@ -249,7 +249,7 @@ class CanopenSlave:
         if self.dictionary.changed:
             changed = frozenset(self.dictionary.changed)
             self.dictionary.changed.clear()
-            self.pdos.configure()
+            self.pdos.configure(changed)
             self.pdos.trigger(changed)
             self.pdos.tick()
             self._route()
@@ -280,7 +280,7 @@ class CanopenSlave:
             (self.time.can_id, self.time.receive),
             (SDO_RECEIVE + self.node_id, self._on_sdo),
             *((ERROR_CONTROL + other, partial(self._on_heartbeat, other)) for other in range(1, 128)),
-            *((pdo.can_id, partial(self._on_pdo, pdo)) for pdo in self.pdos.receiving),
+            *((pdo.can_id, partial(self._on_pdo, pdo)) for pdo in self.pdos.receiving if pdo.exists),
         ]
         for can_id, handler in handlers:
             if can_id is not None:
@@ -376,11 +376,11 @@ class CanopenSlave:
         Replace an invalid stored PDO mapping by the defaults.
         """
         try:
-            self.pdos.configure(everything=True)
+            self.pdos.configure()
         except SdoAbortError as refusal:
             self._context.report(EventKind.STORAGE_ERROR, detail=f"stored PDO mapping: {refusal}")
             self.store.set_defaults(COMMUNICATION)
-            self.pdos.configure(everything=True)
+            self.pdos.configure()
         self.sync.configure()
         self.error_control.configure()
         self._route()

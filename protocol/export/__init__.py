@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
-from types import MappingProxyType, ModuleType
+from types import ModuleType
 from typing import Final, cast
 
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 
-FORMATS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "markdown": "tables for people, as Markdown",
-        "html": "tables for people, as one HTML page",
-        "dbc": "CAN database (cantools, canmatrix, Vector tools)",
-        "eds": "electronic data sheet of the CANopen node (CiA 306)",
-        "xtce": "XML Telemetric and Command Exchange 1.2 (Yamcs and others)",
-        "cosmos": "command and telemetry definition of OpenC3 COSMOS",
-    }
-)
-"""Description of each format that is a single text, by name."""
+FORMATS: Final = ("markdown", "html", "dbc", "eds", "xtce", "cosmos")
+"""Formats that are a single text."""
 
-FOLDER_FORMATS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "c": "C99 codec and serial link, header and source",
-        "cosmos-plugin": "plugin for OpenC3 COSMOS: target, interface and serial protocol",
-    }
-)
-"""Description of each format that consists of several files, by name."""
+FOLDER_FORMATS: Final = ("c", "cosmos-plugin")
+"""Formats that consist of several files."""
 
 
 def export(icd: InterfaceDefinition, name: str) -> str:
@@ -48,7 +34,7 @@ def export_folder(icd: InterfaceDefinition, name: str) -> Mapping[str, str]:
     return cast("Callable[[InterfaceDefinition], Mapping[str, str]]", render)(icd)
 
 
-def _exporter(name: str, formats: Mapping[str, str]) -> ModuleType:
+def _exporter(name: str, formats: Sequence[str]) -> ModuleType:
     if name not in formats:
         raise ProtocolError(f"no export format {name!r}; choose one of {', '.join(formats)}")
     return import_module(f"starhil.protocol.export.{name.replace('-', '_')}")

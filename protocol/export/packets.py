@@ -10,7 +10,7 @@ from typing import Final
 
 from starhil.protocol.codec import Field, Row
 from starhil.protocol.definition import InterfaceDefinition
-from starhil.protocol.link_schema import FixedFraming, LengthFraming, MessageClass
+from starhil.protocol.link_schema import CustomCheck, CustomFraming, FixedFraming, LengthFraming, MessageClass
 from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.values import IcdError
 
@@ -19,8 +19,13 @@ CLASS_SHIFT: Final = 8
 
 
 def check_one_format(stack: SerialStack, target: str) -> None:
-    """Raise IcdError for a serial link with texts, several formats or byte stuffing, which code for a target does not have."""
+    """Raise IcdError for a serial link with what code for a target does not have: parts from a plugin, texts, several formats."""
     framing = stack.link.framing
+    for what, model in (("framing", framing), ("check", stack.link.check)):
+        if isinstance(model, CustomFraming | CustomCheck):
+            raise IcdError(
+                f"link.serial.{what}: {model.name!r} is Python code in the unit's plugin and cannot be exported"
+            )
     stuffed = isinstance(framing, LengthFraming | FixedFraming) and framing.stuffing is not None
     for what, there in (
         ("requests that are texts", stack.text_formats),

@@ -9,8 +9,6 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from starhil.protocol.values import IcdError
-
 FOLDER = Path(__file__).parent
 
 
@@ -36,13 +34,6 @@ def text_of(name: str) -> str:
 
 
 def part_of(name: str, heading: str) -> str:
-    """Return the part of a file of `export` under a heading, a comment of one word; raise IcdError if it has none."""
-    found = re.search(
-        rf"^(?:#|//) {heading}\n(.*?)(?=^(?:#|//) \w+$|\Z)", text_of(name), re.MULTILINE | re.DOTALL
-    )
-    if found is None:
-        raise IcdError(
-            f"link.serial: {Path(name).name.partition('.')[0]} of kind {heading!r} is Python code in the unit's "
-            "plugin and cannot be exported"
-        )
-    return found[1].strip("\n") + "\n"
+    """Return the part of a file of `export` under a heading, a comment of one word."""
+    _, *parts = re.split(r"^(?:#|//) (\w+)\n", text_of(name), flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True))[heading].strip("\n") + "\n"

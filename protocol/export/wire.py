@@ -5,14 +5,13 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Any, Final
+from typing import Any
 
 from pydantic import BaseModel
 
 from starhil.protocol.can_framing import MessageType
 from starhil.protocol.canopen_schema import CanopenModel, PdoModel, PlacedObject
 from starhil.protocol.conventions import EPOCHS, Order
-from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.export.templates import text_of
 from starhil.protocol.link_schema import (
@@ -22,20 +21,8 @@ from starhil.protocol.link_schema import (
     HeaderFieldModel,
     SerialLinkModel,
 )
-from starhil.protocol.messages import ErrorCode, Reply, ReplyKind, Request
-from starhil.protocol.serial_stack import SerialStack
+from starhil.protocol.messages import ErrorCode
 from starhil.protocol.values import Section
-
-_TELEMETRY: Final = 0x80
-_TELECOMMAND: Final = 0x60
-_DATA: Final = 0xDA
-_PLACEHOLDERS: Final = {
-    f"{_TELEMETRY:02X}": "id",
-    f"{_TELECOMMAND:02X}": "id",
-    f"{_DATA:02X}": "data",
-    f"{ErrorCode.INVALID_PARAMETER:02X}": "code",
-}
-"""Placeholder names for bytes of the example messages."""
 
 
 def texts_of(table: str) -> dict[str, Any]:
@@ -69,9 +56,10 @@ def sections(icd: InterfaceDefinition) -> tuple[Section, ...]:
     if _has_error_codes(icd):
         found.append(_errors(icd))
     if icd.link.serial is not None:
-        cubespace = isinstance(icd.link.serial.framing, CubeSpaceFraming)
-        serial = icd.link.serial
-        found.append(_serial(icd, serial) if cubespace else _composed(icd, serial))
+        if isinstance(icd.link.serial.framing, CubeSpaceFraming):
+            found.append(_cubespace(icd, icd.link.serial.framing))
+        else:
+            found.append(_composed(icd, icd.link.serial))
     if icd.link.can is not None:
         found.append(_can())
     if icd.canopen is not None:
@@ -212,38 +200,18 @@ def _fixed_value(const: int | None, default: int | None) -> str:
     return "" if default is None else f"default {default:X}h"
 
 
-def _serial(icd: InterfaceDefinition, link: SerialLinkModel) -> Section:
-    stack = SerialStack(link)
-    data = bytes((_DATA,))
-    refusal = ErrorCode.INVALID_PARAMETER
-    kinds = (
-        Reply(ReplyKind.TELEMETRY, _TELEMETRY, data),
-        Reply(ReplyKind.ACK, _TELECOMMAND),
-        Reply(ReplyKind.NACK, _TELECOMMAND, code=refusal),
-        Reply(ReplyKind.UNSOLICITED, _TELEMETRY, data),
-        Reply(ReplyKind.EVENT, _TELEMETRY, data),
-    )
-    request = _format_message(stack.encode_request(Request.of(_TELECOMMAND, data)))
+def _cubespace(icd: InterfaceDefinition, framing: CubeSpaceFraming) -> Section:
+    texts = texts_of("cubespace")
     rows = sorted(icd.telecommands_by_id.values(), key=lambda row: row.id)
-    silent = " or ".join(f"`{row.name}` ({row.id})" for row in rows if not stack.answers(row))
+    silent = " or ".join(
+        f"`{row.name}` ({row.id})" for row in rows if not row.answers or row.name in framing.unanswered
+    )
     return _section(
         "cubespace",
-        ((dialect.value, *(_reply(stack, reply, dialect) for reply in kinds)) for dialect in Dialect),
-        request=request,
+        ((name, *cells) for name, cells in texts["replies"].items() if framing.dialect in (None, name)),
+        **texts["one_dialect" if framing.dialect else "all_dialects"],
         silence=f"On this line, {silent} is neither acknowledged nor refused." if silent else "",
     )
-
-
-def _reply(stack: SerialStack, reply: Reply, dialect: Dialect) -> str:
-    in_dialect = stack.in_dialect(dialect)
-    if in_dialect is None or reply.kind not in in_dialect.headers:
-        return "none"
-    return _format_message(stack.encode_reply(reply, dialect))
-
-
-def _format_message(message: bytes) -> str:
-    """Format an example message, with placeholders for its variable bytes."""
-    return " ".join(_PLACEHOLDERS.get(byte, byte) for byte in message.hex(" ").upper().split())
 
 
 def _can() -> Section:

@@ -39,8 +39,6 @@ class Statistics:
     received: int = 0
     dropped: int = 0
     """Items not sent because the peer did not read or the port was lost."""
-    errors: int = 0
-    """Failures reported to the error callback."""
     reconnects: int = 0
     """Number of times that a lost port or bus came back."""
 
@@ -92,7 +90,6 @@ class Transport(ABC, Generic[Item]):
             self._on_receive(item)
 
     def _report_error(self, text: str) -> None:
-        self.statistics.errors += 1
         if self._on_error is not None:
             self._on_error(TransportError(text))
 
@@ -107,13 +104,6 @@ class ReconnectingTransport(Transport[Item]):
         super().__init__(description)
         self._closing = False
         self._reconnection: asyncio.Task[None] | None = None
-
-    async def _open(self) -> None:
-        await self._connect()
-
-    @abstractmethod
-    async def _connect(self) -> None:
-        """Open the port or raise TransportError."""
 
     @abstractmethod
     def _disconnect(self) -> None:
@@ -142,7 +132,7 @@ class ReconnectingTransport(Transport[Item]):
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, LAST_PAUSE_S)
             try:
-                await self._connect()
+                await self._open()
             except ProtocolError:
                 continue
             except Exception as error:  # noqa: BLE001 (after any failure the port may come back)

@@ -20,7 +20,8 @@ from starhil.protocol.transports.python_can import OpenBus, PythonCanTransport
 
 CanTransport = Transport[CanFrame]
 
-DEFAULT_BITRATE: Final = 1_000_000
+BITRATE: Final = 1_000_000
+"""Bit rate of adapters that the transport configures (slcan), bit/s."""
 
 RECEIVE_BUFFER: Final = 4 * 1024 * 1024
 """Receive buffer of a kernel CAN socket (bytes), where the system allows it."""
@@ -45,38 +46,27 @@ def kernel_can_is_up(name: str) -> bool:
     return bool(struct.unpack_from("16sh", answer)[1] & _IFF_UP)
 
 
-def open_can(
-    spec: str = "auto",
-    *,
-    bitrate: int = DEFAULT_BITRATE,
-    hub_host: str = DEFAULT_HOST,
-    hub_port: int = DEFAULT_PORT,
-) -> CanTransport:
+def open_can(spec: str = "auto") -> CanTransport:
     """Return the CAN transport that a specification names; `start` opens it.
 
-    Parameters
-    ----------
-    spec:
-        `auto` (vcan0 if the kernel has it, otherwise the hub at `hub_host:hub_port`, which is started in this
-        process if none answers there), a kernel interface such as `vcan0` or `socketcan:can0`,
-        `socketcand:HOST:PORT/BUS`, `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only),
-        or `slcan:PORT`.
-    bitrate:
-        Bit rate (bit/s) of adapters that the transport configures (slcan).
+    It is `auto` (vcan0 if the kernel has it, otherwise the hub at the default address, which is started in this
+    process if none answers there), a kernel interface such as `vcan0` or `socketcan:can0`,
+    `socketcand:HOST:PORT/BUS`, `virtual:NAME` (one process), `udp_multicast:GROUP` (this machine only),
+    or `slcan:PORT`.
 
     Raises TransportError: the specification is invalid.
     """
     if spec == "auto":
         if kernel_can_is_up(DEFAULT_BUS):
-            return _python_can("socketcan", DEFAULT_BUS, bitrate)
-        return AutoHubTransport(hub_host, hub_port)
+            return _python_can("socketcan", DEFAULT_BUS)
+        return AutoHubTransport(DEFAULT_HOST, DEFAULT_PORT)
     interface, colon, channel = spec.partition(":")
     if not colon:
         interface, channel = "socketcan", spec
     if interface == "socketcand":
         return _socketcand(spec, channel)
     if interface in can.VALID_INTERFACES and channel:
-        return _python_can(interface, channel, bitrate)
+        return _python_can(interface, channel)
     raise TransportError(f"CAN {spec}: must be {_FORMS}")
 
 
@@ -93,12 +83,12 @@ def _socketcand(spec: str, where: str) -> CanTransport:
     return HubTransport(host, int(port), bus or DEFAULT_BUS)
 
 
-def _python_can(interface: str, channel: str, bitrate: int) -> CanTransport:
+def _python_can(interface: str, channel: str) -> CanTransport:
     options: dict[str, Any] = {}
     if interface == "udp_multicast":
         options["hop_limit"] = 0
     elif interface == "slcan":
-        options["bitrate"] = bitrate
+        options["bitrate"] = BITRATE
     opener: OpenBus = partial(_open_bus, interface, channel, options)
     return PythonCanTransport(f"{interface}:{channel}", opener, echoes=interface == "udp_multicast")
 

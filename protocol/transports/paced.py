@@ -8,12 +8,11 @@ import os
 import termios
 from abc import abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterator
-from functools import partial
+from collections.abc import Iterator
 from itertools import takewhile
 from typing import Final
 
-from starhil.protocol.transports.base import Statistics, Transport
+from starhil.protocol.transports.base import Transport
 
 BACKLOG_LIMIT: Final = 64 * 1024
 """Maximum number of bytes that wait for the line or for a peer that does not read."""
@@ -28,53 +27,60 @@ BITS_PER_BYTE: Final = 10
 """Start bit, 8 data bits, stop bit."""
 
 
-class PacedWriter:
-    """Writes each message whole, at the time at which its last byte would arrive over the line.
+class SerialTransport(Transport[bytes]):
+    """A serial port."""
 
-    A UART has no gaps within a message. Bytes written one by one would have some whenever the machine is busy.
+    @abstractmethod
+    def set_baud(self, baud: int) -> None:
+        """Change the bit rate as soon as the queue has been sent."""
 
-    Parameters
-    ----------
-    write:
-        Writes without blocking and returns how many bytes were accepted (0 if the port is full). OSError
-        means that the port is lost; the bytes are dropped, as on a line without a peer.
-    baud:
-        Bit rate of the line, or None for no pacing.
+
+class PacedTransport(SerialTransport):
+    """Base of the ports that write each message whole, at the time at which its last byte would arrive over the line.
+
+    A UART has no gaps within a message. Bytes written one by one would have some whenever the machine is busy. `pace` is the
+    bit rate of the line, or None for no pacing.
     """
 
-    def __init__(self, write: Callable[[bytes], int], baud: int | None, statistics: Statistics) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._write = write
-        self.baud = baud
+    def __init__(self, description: str, pace: int | None) -> None:
+        super().__init__(description)
+        self._pace = pace
         self._free_at = float("-inf")
         """When the last byte of the queue will have been sent."""
-        self._statistics = statistics
         self._queue: deque[tuple[float, bytes]] = deque()
         """Messages, each with the time at which it is due."""
         self._written = 0
         """Number of bytes of the first message that have been written."""
         self._backlog = 0
+        """Number of waiting bytes."""
         self._timer: asyncio.TimerHandle | None = None
         self._idle = asyncio.Event()
         self._idle.set()
-        self._idle_action: Callable[[], None] | None = None
+        self._next_baud: int | None = None
+        """Bit rate from the end of the queue on."""
 
-    @property
-    def backlog(self) -> int:
-        """Number of waiting bytes."""
-        return self._backlog
+    @abstractmethod
+    def _has_peer(self) -> bool:
+        """Return whether the port is open, with a peer as far as that is known."""
 
-    def send(self, data: bytes) -> bool:
-        """Queue a complete message, or drop it."""
-        if self._backlog + len(data) > BACKLOG_LIMIT:
-            self._statistics.dropped += len(data)
+    @abstractmethod
+    def _write(self, data: bytes) -> int:
+        """Write without blocking; return how many bytes were accepted, 0 if the port is full.
+
+        Raises OSError: the port is lost; the bytes are dropped, as on a line without a peer.
+        """
+
+    def send(self, item: bytes) -> bool:
+        """Queue a complete message, or drop it; without a peer it is dropped."""
+        if not self._has_peer() or self._backlog + len(item) > BACKLOG_LIMIT:
+            self.statistics.dropped += len(item)
             return False
-        if data:
-            due = self._loop.time()
-            if self.baud is not None:
-                due = self._free_at = max(due, self._free_at) + len(data) * BITS_PER_BYTE / self.baud
-            self._queue.append((due, data))
-            self._backlog += len(data)
+        if item:
+            due = asyncio.get_running_loop().time()
+            if self._pace is not None:
+                due = self._free_at = max(due, self._free_at) + len(item) * BITS_PER_BYTE / self._pace
+            self._queue.append((due, item))
+            self._backlog += len(item)
             self._idle.clear()
             if self._timer is None:
                 self._write_due()
@@ -84,22 +90,26 @@ class PacedWriter:
         """Wait until the queue is empty."""
         await self._idle.wait()
 
-    def when_idle(self, action: Callable[[], None]) -> None:
-        """Call `action` once the queue is empty; replaces an earlier action."""
-        self._idle_action = action
-        if self._idle.is_set():
+    def set_baud(self, baud: int) -> None:
+        """Change the bit rate once the queue is empty."""
+        self._next_baud = baud
+        if not self._queue:
             self._become_idle()
 
-    def _become_idle(self) -> None:
-        """Release `drain` and call the action of `when_idle`."""
-        self._idle.set()
-        action, self._idle_action = self._idle_action, None
-        if action is not None:
-            action()
+    def _change_rate(self, baud: int) -> None:
+        """Change the bit rate; the queue is empty."""
+        if self._pace is not None:
+            self._pace = baud
 
-    def clear(self) -> None:
+    def _become_idle(self) -> None:
+        self._idle.set()
+        baud, self._next_baud = self._next_baud, None
+        if baud is not None:
+            self._change_rate(baud)
+
+    def _clear(self) -> None:
         """Drop the queue and free the line."""
-        self._statistics.dropped += self._backlog
+        self.statistics.dropped += self._backlog
         self._free_at = float("-inf")
         self._queue.clear()
         self._backlog = self._written = 0
@@ -111,7 +121,8 @@ class PacedWriter:
     def _write_due(self) -> None:
         """Write the messages that are due and set the timer for the next one."""
         self._timer = None
-        now = self._loop.time()
+        loop = asyncio.get_running_loop()
+        now = loop.time()
         waiting = takewhile(lambda item: item[0] <= now + GRAIN_S, self._queue)
         due = b"".join(data for _, data in waiting)[self._written :]
         accepted = 0
@@ -119,78 +130,22 @@ class PacedWriter:
             try:
                 accepted = self._write(due)
             except OSError:
-                self.clear()
+                self._clear()
                 return
             self._remove_written(accepted)
         if self._queue:
             next_time = now + RETRY_S if accepted < len(due) else self._queue[0][0]
-            self._timer = self._loop.call_at(next_time, self._write_due)
+            self._timer = loop.call_at(next_time, self._write_due)
         else:
             self._become_idle()
 
     def _remove_written(self, count: int) -> None:
-        self._statistics.sent += count
+        self.statistics.sent += count
         self._backlog -= count
         count += self._written
         while self._queue and count >= len(self._queue[0][1]):
             count -= len(self._queue.popleft()[1])
         self._written = count
-
-
-class SerialTransport(Transport[bytes]):
-    """A serial port."""
-
-    @abstractmethod
-    def set_baud(self, baud: int) -> None:
-        """Change the bit rate as soon as the queue has been sent."""
-
-
-class PacedTransport(SerialTransport):
-    """Base of the ports with a paced writer."""
-
-    def __init__(self, description: str, pace: int | None) -> None:
-        super().__init__(description)
-        self._pace = pace
-        """Bit rate of the pacing, None for none."""
-        self._writer: PacedWriter | None = None
-
-    def set_baud(self, baud: int) -> None:
-        """Change the bit rate once the queue is empty."""
-        if self._writer is None:
-            self._change_rate(baud)
-        else:
-            self._writer.when_idle(partial(self._change_rate, baud))
-
-    def _change_rate(self, baud: int) -> None:
-        """Change the bit rate; the queue is empty."""
-        if self._pace is not None:
-            self._pace = baud
-            if self._writer is not None:
-                self._writer.baud = baud
-
-    @abstractmethod
-    def _write(self, data: bytes) -> int:
-        """Write without blocking; return how many bytes were accepted."""
-
-    def _make_writer(self) -> None:
-        self._writer = PacedWriter(self._write, self._pace, self.statistics)
-
-    def send(self, item: bytes) -> bool:
-        """Queue a complete message, or drop it; without an open port it is dropped."""
-        if self._writer is None:
-            self.statistics.dropped += len(item)
-            return False
-        return self._writer.send(item)
-
-    async def drain(self) -> None:
-        """Wait until the queue is empty."""
-        if self._writer is not None:
-            await self._writer.drain()
-
-    def _drop_writer(self) -> None:
-        if self._writer is not None:
-            self._writer.clear()
-            self._writer = None
 
     def _process_received(self, data: bytes) -> None:
         self.statistics.received += len(data)

@@ -154,7 +154,6 @@ class PtyTransport(PacedTransport):
         finally:
             os.close(slave)  # the master reports a hang-up while no peer has it open
         self.description = str(self._symlink) if self._symlink is not None else self._path
-        self._make_writer()
         self._peers = PtyPeers(self._master, self._path)
         asyncio.get_running_loop().add_reader(self._peers.fileno(), self._readable)
 
@@ -187,18 +186,14 @@ class PtyTransport(PacedTransport):
     def _drop_unread(self, peers: PtyPeers) -> None:
         """Drop bytes that a closed peer has not read, and bytes queued for it."""
         if peers.all_left():
-            if self._writer is not None:
-                self._writer.clear()
+            self._clear()
             peers.discard_unread()
 
-    def send(self, item: bytes) -> bool:
-        """Queue a complete message, or drop it; without a peer it is dropped."""
-        if self._peers is not None:
-            self._drop_unread(self._peers)
-            if not self._peers.present:
-                self.statistics.dropped += len(item)
-                return False
-        return super().send(item)
+    def _has_peer(self) -> bool:
+        if self._peers is None:
+            return False
+        self._drop_unread(self._peers)
+        return self._peers.present
 
     def _write(self, data: bytes) -> int:
         if self._peers is None:
@@ -215,7 +210,7 @@ class PtyTransport(PacedTransport):
         if self._peers is None:
             return
         asyncio.get_running_loop().remove_reader(self._peers.fileno())
-        self._drop_writer()
+        self._clear()
         if self._symlink is not None:
             with contextlib.suppress(OSError):
                 if str(self._symlink.readlink()) == self._path:

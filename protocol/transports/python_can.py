@@ -65,7 +65,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         self._idle = asyncio.Event()
         self._idle.set()
 
-    async def _connect(self) -> None:
+    async def _open(self) -> None:
         loop = asyncio.get_running_loop()
         try:
             bus = await self._open_in_thread()
@@ -143,7 +143,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             message.is_remote_frame,
             message.timestamp or None,
         )
-        if self._echoes is not None and self._is_echo(frame):
+        if self._is_echo(frame):
             return
         self.statistics.received += 1
         self._receive(frame)
@@ -155,9 +155,8 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
         now = time.monotonic()
         while self._echoes and now - self._echoes[0][0] > ECHO_S:
             self._echoes.popleft()
-        bare = CanFrame(frame.id, frame.data, frame.extended, frame.remote)
         for index, (_, own) in enumerate(self._echoes):
-            if own == bare:
+            if own == frame:
                 del self._echoes[index]
                 return True
         return False
@@ -192,8 +191,7 @@ class PythonCanTransport(ReconnectingTransport[CanFrame]):
             self._queue.popleft()
             self.statistics.sent += 1
             if self._echoes is not None:
-                bare = CanFrame(frame.id, frame.data, frame.extended, frame.remote)
-                self._echoes.append((time.monotonic(), bare))
+                self._echoes.append((time.monotonic(), frame))
         if self._queue:
             self._timer = loop.call_soon(self._send_queued)
         else:

@@ -7,9 +7,8 @@ import contextlib
 import errno
 import os
 import select
-from abc import abstractmethod
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import ClassVar, Final, cast
 from urllib.parse import urlsplit
 
 import serial
@@ -84,30 +83,10 @@ def _host_and_port(spec: str) -> tuple[str, int]:
     return host, port
 
 
-class _ReconnectingSerial(PacedTransport, ReconnectingTransport[bytes]):
-    """A serial port that may disappear."""
+class TtyTransport(PacedTransport, ReconnectingTransport[bytes]):
+    """A tty opened by its path, through pyserial."""
 
     kind = "serial"
-
-    async def _connect(self) -> None:
-        await self._attach()
-        self._make_writer()
-
-    def _disconnect(self) -> None:
-        self._detach()
-        self._drop_writer()
-
-    @abstractmethod
-    async def _attach(self) -> None:
-        """Open the port or raise TransportError."""
-
-    @abstractmethod
-    def _detach(self) -> None:
-        """Release the port, in any state."""
-
-
-class TtyTransport(_ReconnectingSerial):
-    """A tty opened by its path, through pyserial."""
 
     def __init__(self, path: str, baud: int, pace: int | None) -> None:
         super().__init__(path, pace)
@@ -115,7 +94,7 @@ class TtyTransport(_ReconnectingSerial):
         self._baud = baud
         self._port: serial.Serial | None = None
 
-    async def _attach(self) -> None:
+    async def _open(self) -> None:
         path = Path(self._path)
         if path.exists() and not path.is_char_device():
             raise TransportError(
@@ -126,7 +105,7 @@ class TtyTransport(_ReconnectingSerial):
                 self._port = serial.Serial(self._path, self._baud, timeout=0, write_timeout=0, exclusive=True)
             asyncio.get_running_loop().add_reader(self._port.fileno(), self._readable)
         except (OSError, ValueError) as error:
-            self._detach()
+            self._disconnect()
             raise TransportError(_tty_problem(self._path, self._baud, error)) from None
 
     def _readable(self) -> None:
@@ -165,6 +144,9 @@ class TtyTransport(_ReconnectingSerial):
         if lost:  # it reopens at the new rate
             self._lost(lost)
 
+    def _has_peer(self) -> bool:
+        return self._port is not None
+
     def _write(self, data: bytes) -> int:
         if self._port is None:
             raise OSError(errno.EIO, "port is closed")
@@ -174,12 +156,13 @@ class TtyTransport(_ReconnectingSerial):
             self._lost(error.strerror or str(error))
             raise
 
-    def _detach(self) -> None:
+    def _disconnect(self) -> None:
         if self._port is not None:
             asyncio.get_running_loop().remove_reader(self._port.fileno())
             with contextlib.suppress(OSError):
                 self._port.close()
             self._port = None
+        self._clear()
 
 
 def _hung_up(fd: int) -> bool:
@@ -201,28 +184,10 @@ def _tty_problem(path: str, baud: int, error: Exception) -> str:
     return f"serial {path}: cannot open: {os.strerror(number) if number else error}"
 
 
-class _StreamProtocol(TurnProtocol):
-    """Passes the data of a TCP connection to its transport."""
+class _TcpTransport(TurnProtocol, PacedTransport, ReconnectingTransport[bytes]):
+    """A TCP connection; the protocol of its connection, of which there is one at a time."""
 
-    def __init__(self, owner: _TcpTransport) -> None:
-        super().__init__()
-        self._owner = owner
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if isinstance(transport, asyncio.Transport):
-            detect_lost_peer(transport)
-            self._owner.attach(self, transport)
-
-    def data_received(self, data: bytes) -> None:
-        self._owner.process(self, data)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._owner.on_lost(self, exc)
-
-
-class _TcpTransport(_ReconnectingSerial):
-    """Base of both TCP transports."""
-
+    kind = "serial"
     scheme: ClassVar[str]
 
     def __init__(self, host: str, port: int, pace: int | None) -> None:
@@ -230,29 +195,28 @@ class _TcpTransport(_ReconnectingSerial):
         self._host = host
         self._port = port
         self._stream: asyncio.Transport | None = None
-        self._protocol: _StreamProtocol | None = None
 
-    def attach(self, protocol: _StreamProtocol, stream: asyncio.Transport) -> None:
-        """Use a connection; a second one is rejected."""
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        stream = cast("asyncio.Transport", transport)
         if self._stream is not None:
-            stream.abort()
+            _abandon(stream)
             return
-        self._stream, self._protocol = stream, protocol
+        detect_lost_peer(stream)
+        self._stream = stream
 
-    def process(self, protocol: _StreamProtocol, data: bytes) -> None:
-        """Process bytes of the connection in use."""
-        if protocol is self._protocol:
-            self._process_received(data)
+    def data_received(self, data: bytes) -> None:
+        self._process_received(data)
 
-    def on_lost(self, protocol: _StreamProtocol, error: Exception | None) -> None:
-        """Handle the end of a connection."""
-        if protocol is self._protocol:
-            self._stream = self._protocol = None
-            self._peer_gone(str(error) if error else "closed by the peer")
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stream = None
+        self._peer_gone(str(exc) if exc else "closed by the peer")
 
-    @abstractmethod
     def _peer_gone(self, why: str) -> None:
-        """Handle the loss of the peer."""
+        """Handle the end of the connection."""
+        self._lost(why)
+
+    def _has_peer(self) -> bool:
+        return self._stream is not None
 
     def _write(self, data: bytes) -> int:
         if self._stream is None:
@@ -262,10 +226,17 @@ class _TcpTransport(_ReconnectingSerial):
         self._stream.write(data)
         return len(data)
 
-    def _detach(self) -> None:
+    def _disconnect(self) -> None:
         if self._stream is not None:
-            self._stream.abort()
-            self._stream = self._protocol = None
+            _abandon(self._stream)
+            self._stream = None
+        self._clear()
+
+
+def _abandon(stream: asyncio.Transport) -> None:
+    """Close a connection whose end is not reported."""
+    stream.set_protocol(asyncio.Protocol())
+    stream.abort()
 
 
 class _ConnectTransport(_TcpTransport):
@@ -273,29 +244,26 @@ class _ConnectTransport(_TcpTransport):
 
     scheme = "socket"
 
-    async def _attach(self) -> None:
+    async def _open(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            await loop.create_connection(lambda: _StreamProtocol(self), self._host, self._port)
+            await loop.create_connection(lambda: self, self._host, self._port)
         except (OSError, ValueError) as error:  # an invalid host name raises ValueError
             raise TransportError(
                 f"serial {self.description}: cannot connect: {reason(error)}; start the peer first"
             ) from None
 
-    def _peer_gone(self, why: str) -> None:
-        self._lost(why)
-
 
 class _ListenTransport(_TcpTransport):
-    """A TCP port for one peer at a time; without a peer, bytes are lost as on an open line."""
+    """A TCP port for one peer at a time, which rejects a second one; without a peer, bytes are lost as on an open line."""
 
     scheme = "listen"
     _server: asyncio.Server | None = None
 
-    async def _attach(self) -> None:
+    async def _open(self) -> None:
         loop = asyncio.get_running_loop()
         try:
-            self._server = await loop.create_server(lambda: _StreamProtocol(self), self._host, self._port)
+            self._server = await loop.create_server(lambda: self, self._host, self._port)
         except (OSError, ValueError) as error:
             raise TransportError(
                 f"serial {self.description}: cannot listen: {reason(error)}; choose another host or port"
@@ -304,11 +272,10 @@ class _ListenTransport(_TcpTransport):
         self.description = f"socket://{self._host}:{self._port}"
 
     def _peer_gone(self, why: str) -> None:  # noqa: ARG002 (the peer may come and go)
-        if self._writer is not None:
-            self._writer.clear()
+        self._clear()
 
-    def _detach(self) -> None:
+    def _disconnect(self) -> None:
         if self._server is not None:
             self._server.close()
             self._server = None
-        super()._detach()
+        super()._disconnect()

@@ -145,7 +145,7 @@ enter("the start of a burst is acknowledged on a serial line", "serial", "bursts
 
 @mutant("replies leave faster than the line", "serial", "timing.pace")
 def unpaced(unit: SimulatedUnit) -> None:
-    unit.transport._paced = False
+    unit.transport._pace = None
 
 
 @mutant("replies take half a second", "both", "timing.reply")

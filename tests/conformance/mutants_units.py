@@ -153,7 +153,7 @@ def takes_any_length(unit: SimulatedUnit) -> None:
 
 def unescaped(data: bytes, stack: SerialStack) -> bytes:
     """Send the body as it is between the marks of a SLIP frame."""
-    framing: Any = stack.framing
+    framing: Any = stack.requests.framing
     body = b"".join(framing.bodies(data.strip(framing.end)))
     return framing.end + body + framing.end
 
@@ -329,9 +329,15 @@ def mutants() -> Iterator[UnitMutant]:
             unit,
             "the check has the other byte order",
             one,
-            bodies(lambda body, stack: body[: -stack.check.size] + body[-stack.check.size :][::-1]),
+            bodies(
+                lambda body, stack: (
+                    body[: -stack.requests.check.size] + body[-stack.requests.check.size :][::-1]
+                )
+            ),
         )
-        yield UnitMutant(unit, "no check is sent", one, bodies(lambda body, stack: body[: -stack.check.size]))
+        yield UnitMutant(
+            unit, "no check is sent", one, bodies(lambda body, stack: body[: -stack.requests.check.size])
+        )
         yield UnitMutant(unit, "the check of requests is not looked at", "serial.check.wrong", unchecked)
         yield UnitMutant(
             unit, "one byte of the check is looked at", "serial.check.wrong", only_whole_check_missing
@@ -343,7 +349,7 @@ def mutants() -> Iterator[UnitMutant]:
             one,
             bodies(
                 lambda body, stack: stack.requests.close(
-                    bytes((body[0] ^ 1, body[1] ^ 1)) + body[2 : -stack.check.size], b""
+                    bytes((body[0] ^ 1, body[1] ^ 1)) + body[2 : -stack.requests.check.size], b""
                 )
             ),
         )

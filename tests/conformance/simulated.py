@@ -37,8 +37,7 @@ from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT
-from starhil.protocol.transports.base import Transport
-from starhil.protocol.transports.paced import PacedWriter
+from starhil.protocol.transports.paced import PacedTransport
 from starid.attitude import Attitude
 from tests.emulator.runs import DirectImager
 from tests.protocol.canopen.conftest import import_eds
@@ -61,19 +60,19 @@ class LoopClock:
         return round(self._loop.time() * NANOSECONDS)
 
 
-class MemoryTransport(Transport[Any]):
+class MemoryTransport(PacedTransport):
     """Joins the device to the tester without a wire; bytes take their time."""
 
-    def __init__(self, loop: SimulatedLoop, *, paced: bool) -> None:
-        super().__init__("virtual:memory")
-        self._loop = loop
-        self._paced = paced
+    def __init__(self, *, paced: bool) -> None:
+        super().__init__("virtual:memory", BAUD if paced else None)
         self.out: deque[Any] = deque()
         self.arrived = asyncio.Event()
 
     async def _open(self) -> None:
-        if self._paced:
-            self._writer = PacedWriter(self._write, BAUD, self.statistics)
+        """There is no port."""
+
+    def _has_peer(self) -> bool:
+        return True
 
     def _write(self, data: bytes) -> int:
         self._put(data)
@@ -84,8 +83,8 @@ class MemoryTransport(Transport[Any]):
         self.arrived.set()
 
     def send(self, item: Any) -> bool:
-        if self._paced:
-            return self._writer.send(item)
+        if self._pace is not None:
+            return super().send(item)
         self._put(item)
         return True
 
@@ -107,7 +106,7 @@ class SimulatedPort:
         self._unit = unit
 
     def send(self, item: Any) -> None:
-        self._unit.transport.deliver(item)
+        self._unit.loop.call_soon(self._unit.transport.deliver, item)
 
     def receive(self, timeout_s: float) -> Any:
         transport = self._unit.transport
@@ -223,7 +222,7 @@ class SimulatedUnit:
             profile, self._served, LoopClock(self.loop), self.imager, self.store, FixedTruth(attitude)
         )
         self.requests = Requests(self.device)
-        self.transport = MemoryTransport(self.loop, paced=self.kind == "serial")
+        self.transport = MemoryTransport(paced=self.kind == "serial")
         self.link = LINKS[self.kind](self.requests, self.transport)
         if self._damage is not None:
             self._damage(self)

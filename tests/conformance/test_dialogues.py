@@ -1,4 +1,4 @@
-"""Files in the folder `dialogues` of a unit add cases on CANopen; an error in one is located."""
+"""Files `*_cases.toml` of a unit add cases on CANopen; an error in one is located."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from tests.conformance.simulated import SimulatedUnit
 
 DOCS = (Path(__file__).parents[2] / "docs" / "units.md").read_text(encoding="utf-8")
 EXAMPLE = next(block.split("```")[0] for block in DOCS.split("```toml\n") if block.startswith("[[area]]"))
-AREA = '[[area]]\nname = "modes"\nclause = "ICD 4.2"\n'
+AREA = '[[area]]\nname = "modes"\nlinks = ["canopen"]\nclause = "ICD 4.2"\n'
 OWN = (
     AREA
     + """
-[[area.case]]
-name = "wrong"
+[[area.cases]]
+id = "wrong"
 title = "a value that was not written"
-dialogue = '''
+lines = '''
 set 1017:0 555 u16
 holds 1017:0 1 u16
 set 1017:0 111 u16
@@ -35,36 +35,36 @@ holds 1017:0 2 u16
 
 [[area]]
 name = "nmt"
+links = ["canopen"]
 clause = "ICD 4.3"
 
-[[area.case]]
-name = "boot-up"
+[[area.cases]]
+id = "boot-up"
 title = "this unit boots in a way of its own"
 clause = "ICD 4.4"
-dialogue = "40 00 10 00 > 43 *"
+lines = "40 00 10 00 > 43 *"
 """
 )
 
 
 def case_file(folder: Path, dialogue: str) -> Path:
-    path = folder / "modes.toml"
+    path = folder / "modes_cases.toml"
     path.write_text(
-        f"{AREA}[[area.case]]\nname = 'one'\ntitle = 'One'\ndialogue = '''\nneed 1017\n{dialogue}\n'''\n"
+        f"{AREA}[[area.cases]]\nid = 'one'\ntitle = 'One'\nlines = '''\nneed 1017\n{dialogue}\n'''\n"
     )
     return path
 
 
 def test_dialogues_of_a_unit_are_run_with_the_other_cases(tmp_path: Path) -> None:
     folder = Path(shutil.copytree(find_unit("oresat"), tmp_path / "unit"))
-    (folder / "dialogues").mkdir()
-    (folder / "dialogues" / "modes.toml").write_text(OWN, encoding="utf-8")
-    (folder / "dialogues" / "filter.toml").write_text(EXAMPLE, encoding="utf-8")
+    (folder / "modes_cases.toml").write_text(OWN, encoding="utf-8")
+    (folder / "filter_cases.toml").write_text(EXAMPLE, encoding="utf-8")
     cases = {case.id: case for case in canopen_suite(read_unit(folder))}
     plain = {case.id for case in canopen_suite(read_unit("oresat"))}
     assert cases.keys() - plain == {"canopen.filter.kept", "canopen.modes.wrong"}
     own = [cases[f"canopen.{name}"] for name in ("filter.kept", "nmt.boot-up", "modes.wrong")]
     assert [(case.clause, case.intrusive) for case in own] == [
-        ("ICD 4.2", True),
+        ("ICD 4.5", True),
         ("ICD 4.4", False),
         ("ICD 4.2", False),
     ]
@@ -74,7 +74,7 @@ def test_dialogues_of_a_unit_are_run_with_the_other_cases(tmp_path: Path) -> Non
 
 
 def test_the_lines_after_finally_are_held_after_a_failure_which_is_reported(tmp_path: Path) -> None:
-    path = tmp_path / "modes.toml"
+    path = tmp_path / "modes_cases.toml"
     path.write_text(OWN, encoding="utf-8")
     case = next(case for case in dialogue_cases(path) if case.id == "canopen.modes.wrong")
     with SimulatedUnit("canopen") as simulated:
@@ -105,9 +105,7 @@ def test_the_lines_after_finally_are_held_after_a_failure_which_is_reported(tmp_
 def test_an_error_in_a_line_names_file_case_and_line(line: str, fault: str, tmp_path: Path) -> None:
     with pytest.raises(BenchError) as caught:
         dialogue_cases(case_file(tmp_path, line))
-    assert str(caught.value).startswith(
-        f"{tmp_path}/modes.toml: area.modes.case.one: line 2 of the dialogue: "
-    )
+    assert str(caught.value).startswith(f"{tmp_path}/modes_cases.toml: modes.one: line 2: ")
     assert fault in str(caught.value)
 
 
@@ -115,8 +113,12 @@ def test_an_error_in_a_line_names_file_case_and_line(line: str, fault: str, tmp_
     ("old", "new", "fault"),
     [
         ("clause =", "claus =", "area.modes.claus: unknown key; did you mean clause"),
-        ('"modes"', '"the modes"', "area.the modes.name: string should match pattern"),
-        ("title = 'One'", "", "area.modes.case.one.title: missing"),
+        (
+            '["canopen"]',
+            '["can_open"]',
+            "area.modes.links.0: must be one of 'serial', 'can', 'canopen' (given: 'can_open')",
+        ),
+        ("title = 'One'", "", "area.modes.cases.one.title: missing"),
         ("[[area]]", "[[area]", "Expected ']]'"),
     ],
 )
@@ -130,8 +132,8 @@ def test_an_error_in_a_file_is_located(old: str, new: str, fault: str, tmp_path:
 
 
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(BenchError, match=r"none\.toml: No such file"):
-        dialogue_cases(tmp_path / "none.toml")
+    with pytest.raises(BenchError, match=r"none_cases\.toml: No such file"):
+        dialogue_cases(tmp_path / "none_cases.toml")
 
 
 def test_cases_for_any_unit_are_in_order_of_their_areas() -> None:

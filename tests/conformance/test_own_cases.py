@@ -1,4 +1,4 @@
-"""Files `*_cases.py` beside a definition add cases to those that the definition yields."""
+"""Files `*_cases.py` and `*_cases.toml` beside a definition add cases to those that the definition yields."""
 
 from __future__ import annotations
 
@@ -121,6 +121,56 @@ def test_a_units_own_settings_are_restored_and_otherwise_those_that_can_be_read(
 def test_a_definition_in_one_file_runs_no_files_beside_it(tmp_path: Path) -> None:
     folder = unit_with(tmp_path / "unit", "raise SystemError")
     assert serial_suite(read_unit(folder / "unit.toml"))
+
+
+TEXTS = """
+[texts]
+boots = "telemetry attitude boots=1"
+
+[[area]]
+name = "own"
+clause = "ICD 5"
+links = ["serial"]
+cases = [
+    { id = "right", title = "this unit has booted once", lines = "00 55 (00)*3; silence; sleep 1; drain; {boots}" },
+    { id = "wrong", title = "it has not booted often", lines = "{boots}; telemetry attitude boots=1 boots=7", intrusive = true },
+    { id = "none", title = "a row that the unit lacks", lines = "{no_such_row}" },
+]
+"""
+
+
+def test_cases_in_a_text_file_are_run_on_their_link(tmp_path: Path) -> None:
+    folder = write_unit(tmp_path, "sum")
+    (folder / "own_cases.toml").write_text(TEXTS, encoding="utf-8")
+    cases = [case for case in serial_suite(read_unit(folder)) if case.area == "serial.own"]
+    assert [(case.id, case.title, case.clause, case.intrusive) for case in cases] == [
+        ("serial.own.right", "this unit has booted once", "ICD 5", False),
+        ("serial.own.wrong", "it has not booted often", "ICD 5", True),
+    ]
+    with SimulatedUnit("serial", unit=folder) as simulated:
+        outcomes = run_cases(simulated.probe, cases)
+    assert [(outcome.status, outcome.expected, outcome.seen) for outcome in outcomes] == [
+        ("passed", "", ""),
+        ("failed", "attitude {'boots': 7}", "{'boots': 1}"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (
+            "[[area]]\nname = 1\n",
+            r"area\.0\.name: must be a text .*; .*area\.0\.clause: missing",
+        ),
+        ("area = [", "Invalid"),
+        ("[[row]]", "row: unknown key"),
+    ],
+)
+def test_a_text_file_of_cases_with_errors_is_named(text: str, error: str, tmp_path: Path) -> None:
+    folder = write_unit(tmp_path, "sum")
+    (folder / "own_cases.toml").write_text(text, encoding="utf-8")
+    with pytest.raises(BenchError, match=rf"^[^\n]*own_cases\.toml: [^\n]*{error}[^\n]*$"):
+        serial_suite(read_unit(folder))
 
 
 def test_a_file_that_fails_is_named(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_a_run_stops_where_no_star_sensor_answers(link, echo, message, monkeypat
     ("unit", "change", "fault"),
     [
         ("sagitta", lambda body, _stack: body[:-1] + bytes((body[-1] ^ 1,)), r"check xxh32: computed (.. .. ..) .., received \1 "),
-        ("st16", lambda body, stack: body[: -stack.check.size] + b"\0\0", r"check crc u16 1021h: computed .. .., received 00 00"),
-        ("st16", lambda body, stack: stack.requests.close(body[:1] + bytes((body[1] ^ 1,)) + body[2 : -stack.check.size], b""), "must be"),
+        ("st16", lambda body, stack: body[: -stack.requests.check.size] + b"\0\0", r"check crc u16 1021h: computed .. .., received 00 00"),
+        ("st16", lambda body, stack: stack.requests.close(body[:1] + bytes((body[1] ^ 1,)) + body[2 : -stack.requests.check.size], b""), "must be"),
     ],
     ids=["hash", "crc", "address"],
 )  # fmt: skip

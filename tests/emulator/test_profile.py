@@ -90,6 +90,40 @@ def test_a_calibrated_camera_takes_the_place_of_the_field_of_view(tmp_path):
     assert "focal_px" not in load_profile(back).camera.values()
 
 
+def test_errors_of_the_calibration_belong_to_the_camera(tmp_path):
+    cubestar = load_profile("cubestar").calibration
+    covariance = np.array(cubestar.matrix())
+    assert np.sqrt(np.diag(covariance)).tolist() == pytest.approx(cubestar.sigma)
+    assert covariance[0, 1] == pytest.approx(cubestar.sigma[0] * cubestar.sigma[1])
+    other = write(tmp_path, 'extends = "cubestar"\n[camera]\nfov_deg = 30.0\n')
+    assert load_profile(other).calibration.matrix() is None
+    assert load_profile("cubestar", ["camera.fov_deg=30"]).calibration.matrix() is None
+
+
+def test_a_calibration_written_by_starid_is_used(tmp_path):
+    rows = np.diag(np.arange(9.0)).tolist()
+    written = f"[calibration]\nframes = 3\nsigma = {np.sqrt(np.arange(9.0)).tolist()}\ncovariance = {rows}\n"
+    assert load_profile(write(tmp_path, written)).calibration.matrix() == rows
+
+
+@pytest.mark.parametrize(
+    ("key", "message"),
+    [
+        ("sigma = [1.0]", "calibration.sigma"),
+        ("sigma = [-1.0, 1, 1, 1, 1, 1, 1, 1, 1]", "calibration.sigma"),
+        (f"covariance = {np.ones((9, 8)).tolist()}", "calibration.covariance"),
+        (f"covariance = {np.tri(9).tolist()}", "row 1, column 2 is not that of a covariance matrix"),
+        (f"covariance = {(2.0 - np.eye(9)).tolist()}", "row 1, column 2 is not that of a covariance matrix"),
+        (f"covariance = {(-np.eye(9)).tolist()}", "row 1, column 1 is not that of a covariance matrix"),
+    ],
+)
+def test_a_wrong_calibration_is_named(tmp_path, key, message):
+    path = write(tmp_path, f"[calibration]\n{key}\n")
+    with pytest.raises(EmulatorError) as caught:
+        load_profile(path)
+    assert message in str(caught.value)
+
+
 MOUNTS = {
     "quaternion_xyzw": "quaternion_xyzw = [0.0, 0.0, 0.0, 1.0]",
     "matrix": "matrix = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]",

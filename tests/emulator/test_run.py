@@ -2,8 +2,8 @@
 
 import asyncio
 import csv
+import re
 import resource
-from functools import partial
 
 import pytest
 
@@ -18,11 +18,10 @@ from starhil.emulator.profile import Profile, RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
-from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import ErrorCode
 from starhil.protocol.names import bundled
-from starhil.protocol.transports import open_can
 from tests.emulator.runs import CAMERA, Control, FakeImager, FirstHead, command, read
 
 
@@ -348,8 +347,8 @@ def test_an_address_in_use_on_a_bus_with_a_name_is_rejected(run):
             await second.open()
         await second.close()
 
-    with HubThread() as hub:
-        run(scenario, links=can_links(hub.channel))
+    with hub_thread() as channel:
+        run(scenario, links=can_links(channel))
 
 
 @pytest.mark.parametrize(
@@ -361,10 +360,10 @@ def test_an_address_in_use_on_a_bus_with_a_name_is_rejected(run):
     ],
 )
 def test_auto_is_a_new_hub_if_an_address_is_in_use_on_the_usual_bus(run, monkeypatch, caplog, other, same):
-    with HubThread() as hub:  # its port is free again afterwards
-        usual = hub.port
+    with hub_thread() as channel:  # its port is free again afterwards
+        usual = int(re.split("[:/]", channel)[2])
     monkeypatch.setattr("starhil.protocol.transports.can.kernel_can_is_up", lambda _: False)
-    monkeypatch.setattr("starhil.protocol.transports.can.open_can", partial(open_can, hub_port=usual))
+    monkeypatch.setattr("starhil.protocol.transports.can.DEFAULT_PORT", usual)
 
     async def scenario(first, _line):
         both = [other, can_links("auto", address=6)]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.private_can_bus import hub_thread
 
 
 @pytest.fixture
 def hub():
     """Channel of a CAN hub at a free port."""
-    with HubThread() as own:
-        yield own.channel
+    with hub_thread() as channel:
+        yield channel

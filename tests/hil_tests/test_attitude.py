@@ -12,13 +12,15 @@ from scipy.spatial.transform import Rotation
 from starhil.hil_tests.attitude import (
     Quaternion,
     attitude_error,
+    from_directions,
     from_radec_roll,
+    from_rotation_vector,
     from_vector_part,
     interpolate,
+    rotation_vector,
     to_matrix,
     to_radec_roll,
     unit,
-    wrapped_difference,
 )
 from starhil.hil_tests.errors import BenchError
 
@@ -122,9 +124,16 @@ def test_interpolation_goes_the_short_way_at_constant_rate():
     assert interpolate(first, first, 0.3) == pytest.approx(first)
 
 
-@pytest.mark.parametrize(
-    ("value", "expected", "difference"),
-    [(359.9, 0.1, 0.2), (0.1, 359.9, 0.2), (-179.5, 179.5, 1.0), (10.0, 370.0, 0.0), (90.0, 270.0, 180.0)],
-)
-def test_angles_wrap(value, expected, difference):
-    assert wrapped_difference(value, expected) == pytest.approx(difference, abs=1e-9)
+@given(st.tuples(*3 * [st.floats(-1.8, 1.8)]))
+def test_a_rotation_vector_is_the_axis_times_the_angle(vector):
+    q = from_rotation_vector(vector)
+    assert Rotation.from_quat(q).as_rotvec() == pytest.approx(vector, abs=1e-9)
+    for other in (q, [-part for part in q]):
+        assert rotation_vector(other) == pytest.approx(vector, abs=1e-9)
+
+
+def test_an_attitude_follows_from_two_directions():
+    attitude = from_radec_roll(83.8, -1.2, 30.0)
+    known = (0.6, 0.8, 0.0), (0.0, 0.6, 0.8)
+    seen = [tuple(Rotation.from_quat(attitude).apply(vector)) for vector in known]
+    assert attitude_error(from_directions(seen, known), attitude).total_arcsec < TOLERANCE_ARCSEC

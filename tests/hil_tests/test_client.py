@@ -11,6 +11,7 @@ from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.errors import BadReplyError, BenchError, LinkLostError, NackError, NoReplyError
 from starhil.hil_tests.images import list_files
 from starhil.hil_tests.raw_traffic import send_and_listen
+from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import UnknownNameError
 from starhil.protocol.errors import ProtocolError
@@ -262,13 +263,14 @@ def test_raw_bytes_and_frames_can_be_sent(pair):
     device.telemetry["boot_status"] = {"boot_count": 0x1F}
     if client.core.link.name == "can":
         answer = ("058104" + "01#001F00000000",)
-        assert send_and_listen(client, ("04810104#",), 0.0, answer, PATIENCE_S) == answer
+        sent = [CanFrame(0x04810104)]
     else:
         start, identifier = {Dialect.A: ("7F", "81"), Dialect.B: ("7F", ""), Dialect.C: ("07", "81")}[
             device.dialect
         ]
         answer = (f"1F{start}{identifier}001F1F000000001FFF",)
-        assert send_and_listen(client, ("1F7F", "811FFF"), 0.0, answer, PATIENCE_S) == answer
+        sent = [b"\x1f\x7f", b"\x81\x1f\xff"]
+    assert client.run(send_and_listen(client.core, sent, 0.0, answer, PATIENCE_S)) == answer
 
 
 def test_ports_that_are_not_available_are_rejected_in_one_line():

@@ -82,10 +82,23 @@ def test_a_rejection_and_the_end_of_the_channel_are_reported(channel, answer, me
         client.do("fault")
 
 
-@pytest.mark.parametrize("address", ["unix:/no/such/socket", "127.0.0.1:1"])
+@pytest.mark.parametrize("address", ["unix:/no/such/socket", "127.0.0.1:1", "127.0.0.1:x"])
 def test_a_channel_that_is_not_there_is_reported(address):
     with pytest.raises(BenchError, match=f"control channel {address}: "):
         ControlClient(address)
+
+
+def test_an_ipv6_address_stands_in_brackets(monkeypatch):
+    class ConnectedError(Exception):
+        pass
+
+    def connect(address, _timeout):
+        raise ConnectedError(address)
+
+    monkeypatch.setattr(control.socket, "create_connection", connect)
+    with pytest.raises(ConnectedError) as caught:
+        ControlClient("[::1]:4711")
+    assert caught.value.args == (("::1", 4711),)
 
 
 @pytest.mark.parametrize(("clock", "polls"), [("real", 3), ("stepped", 1)])

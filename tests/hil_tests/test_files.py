@@ -16,7 +16,7 @@ from starhil.hil_tests.load_figures import percentile
 from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pattern
 from starhil.hil_tests.results import FAILED, PASSED, SKIPPED, TestCase, write_junit
 from starhil.hil_tests.truth_log import TruthLogReader
-from starhil.hil_tests.wire_log import CandumpLog, SerialLog
+from starhil.hil_tests.wire_log import WireLog
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.candump import bus_name
 from tests.candump import read_candump
@@ -53,7 +53,7 @@ def test_a_file_that_is_not_a_bmp_is_rejected(data):
 
 
 def test_the_serial_log_shows_time_direction_and_bytes(tmp_path):
-    with SerialLog(tmp_path / "serial.log", now=lambda: 1760000000.5) as log:
+    with WireLog(tmp_path / "serial.log", now=lambda: 1760000000.5) as log:
         log.sent(bytes.fromhex("1F7F801FFF"))
         log.note("step 1")
         log.received(b"\x1f\x7f")
@@ -71,9 +71,7 @@ def test_the_can_log_is_read_back_as_candump_lines(tmp_path):
         CanFrame(0x05850401, b"\x01\x02"),
         CanFrame(0x123, b"\xff", extended=False),
     ]
-    with CandumpLog(
-        tmp_path / "can.log", bus_name("socketcand:127.0.0.1:29536/can7"), now=lambda: 12.25
-    ) as log:
+    with WireLog(tmp_path / "can.log", bus_name("socketcand:127.0.0.1:29536/can7"), now=lambda: 12.25) as log:
         log.note("not in this format")
         for frame in frames:
             log.sent(frame)

@@ -8,37 +8,18 @@ import pytest
 from aiohttp import web
 
 from starhil.hil_tests import latency
+from starhil.hil_tests.async_client import AsyncObcClient
 from starhil.hil_tests.console_viewer import ROWS, view
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.latency import EchoRequester, HubRequester, SerialRequester, Viewers, measure
-from starhil.hil_tests.private_can_bus import HubThread
-from starhil.protocol.can_framing import encode_reply_frames
+from starhil.hil_tests.latency import Echo, Viewers, ask_in_turn, exchange, measure
+from starhil.hil_tests.links import CanHostLink, SerialHostLink
+from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.protocol.icd import load_unit
-from starhil.protocol.messages import Reply, ReplyKind
+from starhil.protocol.messages import ErrorCode
 from tests.hil_tests.fake_device import FakeDevice
 
 ICD = load_unit()
 ROW = ICD.telemetry["quaternion"]
-
-
-def reply_to(destination):
-    """Return a reply of the device on the wire of the hub."""
-    reply = Reply(ReplyKind.TELEMETRY, ROW.id, bytes(ROW.size), destination=destination)
-    (frame,) = encode_reply_frames(reply, 4)
-    data = "".join(f" {byte:02X}" for byte in frame.data)
-    return f"< send {frame.id:08X} {len(frame.data)}{data} >".encode()
-
-
-def test_replies_to_other_nodes_are_ignored():
-    with HubThread() as hub:
-        own, other = HubRequester(hub.channel, ICD), HubRequester(hub.channel, ICD)
-        other._socket.sendall(reply_to(253) * 3)
-        assert own.ask(ROW.name) is None
-        other._socket.sendall(reply_to(253) + reply_to(1))
-        assert own.ask(ROW.name) is not None
-        assert own.ask(ROW.name) is None
-        own.close()
-        other.close()
 
 
 @pytest.fixture
@@ -123,29 +104,58 @@ def test_only_links_that_the_emulator_has_are_measured(processes, without, links
         assert [row.link for row in measure("cubestar", [0.0], 0.05, "thread")[0]] == links
 
 
-def test_a_reply_in_two_parts_takes_until_its_last_byte(device):
-    requester = SerialRequester(device.open_serial(), ICD)
-    large = max(ICD.telemetry.values(), key=lambda row: row.size)
-    assert requester.ask(large.name) > 0.0
-    requester.close()
+def test_a_refusal_has_a_latency_but_no_reply(device):
+    device.refuse[ROW.name] = ErrorCode.BUSY
+
+    async def main():
+        client = AsyncObcClient(SerialHostLink(ICD, device.open_serial()), ICD)
+        await client.start()
+        latency, reply = await exchange(client, ICD.request(ROW), ROW.name)
+        await client.close()
+        assert (0.0 < latency < math.inf, reply) == (True, None)
+
+    asyncio.run(main())
 
 
-def test_an_echo_that_does_not_come_is_none(monkeypatch):
-    requester = EchoRequester(ICD)
-    assert requester.ask(ROW.name) > 0.0
-    requester._process.send_signal(signal.SIGSTOP)
-    monkeypatch.setattr(latency, "REPLY_WITHIN_S", 0.02)
-    assert requester.ask(ROW.name) is None
-    requester.close()
+def test_requests_on_a_lost_bus_have_no_reply():
+    async def main():
+        with hub_thread() as channel:
+            client = AsyncObcClient(CanHostLink(channel), ICD, timeout_s=0.02)
+            await client.start()
+        for _ in range(2):
+            assert await exchange(client, ICD.request(ROW), ROW.name) == (math.inf, None)
+        await client.close()
+
+    asyncio.run(main())
 
 
-def test_a_hub_that_ends_is_reported():
-    with HubThread() as hub:
-        requester = HubRequester(hub.channel, ICD)
-        hub.stop()
-        with pytest.raises(BenchError, match="CAN hub: closed the connection"):
-            requester.ask(ROW.name)
-        requester.close()
+def test_an_echo_that_does_not_come_is_infinite(monkeypatch):
+    async def main():
+        echo = Echo(ICD)
+        await echo.start()
+        assert 0.0 < await echo.ask(ROW) < math.inf
+        echo._process.send_signal(signal.SIGSTOP)
+        monkeypatch.setattr(latency, "REPLY_WITHIN_S", 0.02)
+        assert await echo.ask(ROW) == math.inf
+        await echo.close()
+
+    asyncio.run(main())
+
+
+def test_peers_are_asked_in_turn_with_the_same_rows():
+    asked = []
+
+    def peer(name):
+        async def ask(row):
+            asked.append((name, row))
+            return float(len(asked))
+
+        return ask
+
+    found = asyncio.run(ask_in_turn({"one": peer("one"), "two": peer("two")}, ["a", "b", "c"], 0.1))
+    assert asked[:8] == [(name, row) for row in "abca" for name in ("one", "two")]
+    assert found["one"][:4] == [1.0, 3.0, 5.0, 7.0]
+    assert len(found["one"]) == len(found["two"]) == len(asked) / 2
 
 
 def test_viewers_end_with_the_measurement():

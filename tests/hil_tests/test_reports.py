@@ -17,7 +17,7 @@ from starhil.hil_tests import session_run
 from starhil.hil_tests.conformance import conformance_run
 from starhil.hil_tests.emulator_process import EmulatorProcess
 from starhil.hil_tests.errors import BenchError
-from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.hil_tests.results import write_report
 
 DIES = "import sys; print('ready can={}', flush=True); print('no more sky', file=sys.stderr); sys.exit(7)"
@@ -60,7 +60,7 @@ def test_settings_are_those_of_the_emulator_that_conformance_starts(monkeypatch)
         "parameters.update_rate=3",
     )
     assert str(run_command(*words, "--start").exception) == "enough"
-    assert given["settings"] == ("truth.kind=rate", "parameters.update_rate=3")
+    assert given["settings"] == ["truth.kind=rate", "parameters.update_rate=3"]
     assert "--set needs --start" in str(run_command(*words[:2], "/dev/ttyX", *words[3:]).exception)
 
 
@@ -69,14 +69,14 @@ def test_an_emulator_that_dies_at_the_last_step_fails_the_session_and_its_report
     script = tmp_path / "s.toml"
     script.write_text("[[step]]\nwait_s = 0\n", encoding="ascii")
     junit = tmp_path / "out" / "j.xml"
-    with HubThread() as hub:
-        process = EmulatorProcess([sys.executable, "-c", DIES.format(hub.channel)])
+    with hub_thread() as channel:
+        process = EmulatorProcess([sys.executable, "-c", DIES.format(channel)])
         monkeypatch.setattr(session_run, "_emulator", lambda *_arguments: process)
         run = session_run.SessionRunner.run
         monkeypatch.setattr(
             session_run.SessionRunner, "run", lambda self: (process.process.wait(timeout=60), run(self))[1]
         )
-        words = ("--start", "--can", hub.channel, "--log", tmp_path, "--junit", junit, "--json")
+        words = ("--start", "--can", channel, "--log", tmp_path, "--junit", junit, "--json")
         outcome = run_command("session", script, *words)
     assert outcome.exit_code == 1, outcome.output
     *_, end = json.loads(outcome.stdout)["results"]

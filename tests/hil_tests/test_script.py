@@ -9,8 +9,9 @@ import pytest
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.errors import ScriptError
 from starhil.hil_tests.expect import Variable
-from starhil.hil_tests.script import Command, Read, Sample, Send, load_script
+from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session_run import find_script
+from starhil.hil_tests.steps import Command, Read, Sample, Send
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled
 
@@ -121,15 +122,20 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ("[[step]]\ncommand = 'set_mode'\nwith = { mod = 'standby' }", ["'mod'", "did you mean mode"]),
         ("[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }", ["tracing", "tracking"]),
         ("[[step]]\ncommand = 'set_mode'", ["step 1: with: row 'set_mode' needs the field 'mode'"]),
-        ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["unknown key 'expct'", "did you mean expect"]),
+        ("[[step]]\nread = 'rates'\nexpct = { rate_x = 1 }", ["expct: unknown key", "did you mean expect"]),
         ("[[step]]\nreed = 'rates'", ["exactly one action", "'reed'", "did you mean read"]),
         ("[[step]]\nread = 'rates'\nwait_s = 1", ["has read and wait_s"]),
         ("[[step]]\nname = 'x'", ["has none"]),
-        ("title = 'empty'", ["no step"]),
-        ("stepp = 1\n[[step]]\nwait_s = 1", ["unknown key 'stepp'", "did you mean step?"]),
+        ("title = 'empty'", ["not a session script: has no steps, each under [[step]]; its keys are title"]),
+        ("[[stepp]]\nwait_s = 1", ["has no steps, each under [[step]]; did you mean stepp?"]),
+        (
+            "[[step]]\nread = 'parameter'\nexpect = { value = { vale = 1 } }",  # a field with the name of a condition
+            ["expect.value.vale: unknown key; did you mean value"],
+        ),
+        ("stepp = 1\n[[step]]\nwait_s = 1", ["stepp: unknown key", "did you mean step?"]),
         ("[step]\nwait_s = 1", ["[[step]]"]),
         ("[[step]]\nwait_s = -1", ["at least 0"]),
-        ("[[step]]\nwait_s = 'long'", ["'wait_s' must be a number"]),
+        ("[[step]]\nwait_s = 'long'", ["wait_s: must be a number"]),
         ("[[step]]\nset_parameter = 'exposur'\nvalue = 1", ["exposur", "did you mean exposure"]),
         ("[[step]]\nset_parameter = 'exposure'\nvalue = 1e9", ["exposure", "outside"]),
         (
@@ -141,7 +147,7 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = 'fast' }", ["'rate_x' is a number"]),
         (
             "[[step]]\nread = 'rates'\nexpect = { rate_x = { vale = 1 } }",
-            ["unknown key 'vale'", "did you mean value"],
+            ["expect.rate_x.vale: unknown key", "did you mean value"],
         ),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = {} }", ["is empty"]),
         ("[[step]]\nread = 'rates'\nexpect = { rate_x = { within = 1 } }", ["need 'value'"]),
@@ -155,26 +161,30 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
         ("[[step]]\nread = 'rates'\nrefused = 'invalid_idd'", ["invalid_idd", "did you mean invalid_id"]),
         ("[[step]]\ndownload_image = '../x.png'", ["plain file name"]),
         ("[[step]]\ndownload_image = '..'", ["plain file name"]),
-        ("[truth]\nfile = '../victim.txt'\n[[step]]\nwait_s = 1", ["truth", "'file'", "plain file name"]),
-        ("[truth]\nfile = '/etc/victim'\n[[step]]\nwait_s = 1", ["truth", "'file'", "plain file name"]),
-        ('[truth]\nfile = "a\\u0000b"\n[[step]]\nwait_s = 1', ["truth", "'file'", "plain file name"]),
+        ("[truth]\nfile = '../victim.txt'\n[[step]]\nwait_s = 1", ["truth.file: ", "plain file name"]),
+        ("[truth]\nfile = '/etc/victim'\n[[step]]\nwait_s = 1", ["truth.file: ", "plain file name"]),
+        ('[truth]\nfile = "a\\u0000b"\n[[step]]\nwait_s = 1', ["truth.file: ", "plain file name"]),
         ("[[step]]\ndownload_image = 'x.png'\nsize = 'size_100'", ["size_100", "size_1024"]),
-        ("[[step]]\nsend = 'zz'", ["'send'"]),
+        ("[[step]]\nsend = 'zz'", ["send: must be bytes in hexadecimal"]),
         ("[[step]]\nsend = ['1F', '123#00']", ["not both"]),
         ("[[step]]\nsend = '123#001'", ["not a CAN frame"]),
         ("[[step]]\nread = 'rates'\nlink = 'i2c'", ["i2c", "can"]),
         ("[[step]]\nrestart = 'gently'", ["gently", "kill"]),
-        ("[[step]]\nsample = 'rates'\nevery_s = 1\nfor_s = 1\nat_least = 2", ["from 0 to 1"]),
+        ("[[step]]\nsample = 'rates'\nevery_s = 1\nfor_s = 1\nat_least = 2", ["at_least: must be at most 1"]),
         ("[[step]\n", ["not valid TOML"]),
-        ("[[step]]\nread = 3", ["'read' must be a text"]),
-        ("[[step]]\nread = 'rates'\nexpect = 3", ["'expect' must be a table"]),
-        ("[[step]]\nsend = 3", ["'send' must be a text or a list of texts"]),
-        ("[[step]]\ncommand = 'set_mode'\nwith_hex = 'zz'", ["'with_hex' must be bytes in hexadecimal"]),
+        ("[[step]]\nread = 3", ["read: must be a text"]),
+        ("[[step]]\nread = 'rates'\nexpect = 3", ["expect: must be a table"]),
+        ("[[step]]\nsend = 3", ["send: must be a text or a list of texts"]),
+        ("[[step]]\ncommand = 'set_mode'\nwith_hex = 'zz'", ["with_hex: must be bytes in hexadecimal"]),
         ("step = 3", ["'step' must be an array of tables"]),
-        ("[emulator]\nseed = 'x'\n[[step]]\nwait_s = 1", ["'seed' must be a whole number"]),
+        ("[emulator]\nseed = 'x'\n[[step]]\nwait_s = 1", ["emulator.seed: must be a whole number"]),
         (
             "[truth]\nquaternion_xyzw = [1, 'x']\n[[step]]\nwait_s = 1",
-            ["'quaternion_xyzw' must be a list of 4"],
+            ["truth.quaternion_xyzw.1: must be a number"],
+        ),
+        (
+            "[truth]\nquaternion_xyzw = [1, 0]\n[[step]]\nwait_s = 1",
+            ["truth.quaternion_xyzw: must have at least 4 items, not 2"],
         ),
         ("[[step]]\ncommand = 'xyzzy'", ["no telecommand named 'xyzzy'; `starhil icd list` lists all"]),
         ("[[step]]\nread = 'xyzzy'", ["no telemetry row named 'xyzzy'; `starhil icd list` lists all"]),
@@ -210,7 +220,7 @@ ANGLES = "ra_deg = 1\ndec_deg = 2\nroll_deg = 3\n"
             f"[truth]\nfile = 't.csv'\n{ANGLES}[[step]]\nwait_s = 1",
             ["truth", "give an attitude or a file, not both"],
         ),
-        ("[[step]]\nset_parameter = 'exposure'", ["'value' must be given, but is missing"]),
+        ("[[step]]\nset_parameter = 'exposure'", ["value: missing"]),
         (
             "[[step]]\nread = 'rates'\nexpect = { rate_x = [1, 2] }",
             ["must be a number, true, false or a text, not [1, 2]"],
@@ -236,7 +246,13 @@ def test_every_error_of_a_script_is_reported_with_its_place(load):
             "[[step]]\ncommand = 'set_mode'\nwith = { mode = 'tracing' }"
         )
     lines = caught.value.args
-    assert [line.split(": ")[1] for line in lines] == ["defaults", "step 1", "step 2", "step 2", "step 3"]
+    assert [line.split(": ")[1] for line in lines] == [
+        "defaults.timeout",
+        "step 1",
+        "step 2",
+        "step 2",
+        "step 3",
+    ]
     for line, word in zip(lines, ("timeout_s", "quaternion", "within_s", "rate_x", "tracking"), strict=True):
         assert word in line
 
@@ -269,15 +285,15 @@ def test_every_wrong_field_of_a_step_is_reported(load):
         ),
         (
             "command = 'set_mode'\nwith = { mode = '$mod' }\ntimeout_s = 'x'\nexpect = { a = 1 }\nrefusd = 'busy'",
-            ["with: mode: nothing was captured", "'timeout_s' must be a number", "'expect' needs a step", "'refusd'"],
+            ["with.mode: nothing was captured", "timeout_s: must be a number", "'expect' needs a step", "refusd: "],
         ),
         (
             "read = 'rates'\nwithin_s = 'x'\nexpect = { rat_x = 1, rate_y = { mn = 1 } }\ncapture = { a = 'rate_q' }",
-            ["'within_s' must be a number", "unknown key 'mn'", "capture: row 'rates' has no field 'rate_q'"],
+            ["within_s: must be a number", "mn: unknown key", "capture: row 'rates' has no field 'rate_q'"],
         ),
-        ("sample = { telemetry = 'rates', every_s = -1, fr_s = 3 }", ["'every_s'", "'for_s'", "'fr_s'"]),
-        ("sample = 'ratse'\nevery_s = 1\nfor_s = 1\nfle = 'x'", ["no telemetry row named 'ratse'", "'fle'"]),
-        ("set_parameter = 'exposure'\nvalu = 5\nlink = 'cn'", ["'value' must be given", "'valu'", "'link'"]),
+        ("sample = { telemetry = 'rates', every_s = -1, fr_s = 3 }", ["every_s: ", "for_s: ", "fr_s: "]),
+        ("sample = 'ratse'\nevery_s = 1\nfor_s = 1\nfle = 'x'", ["no telemetry row named 'ratse'", "fle: "]),
+        ("set_parameter = 'exposure'\nvalu = 5\nlink = 'cn'", ["value: missing", "valu: ", "link: "]),
     ],
 )  # fmt: skip
 def test_a_step_with_several_errors_reports_each_once(load, step, said):

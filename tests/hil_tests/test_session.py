@@ -10,6 +10,7 @@ from itertools import pairwise
 from xml.etree import ElementTree as ET
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
@@ -21,7 +22,7 @@ from starhil.hil_tests.interruption import Interrupted
 from starhil.hil_tests.results import junit_cases
 from starhil.hil_tests.script import load_script
 from starhil.hil_tests.session import SessionRunner
-from starhil.hil_tests.session_run import SessionRequest, _emulator, _printer, run_session
+from starhil.hil_tests.session_run import SessionRequest, _emulator, _print_result, run_session
 from starhil.protocol.icd import load_unit
 from starhil.protocol.messages import ErrorCode
 from tests.candump import read_candump
@@ -95,7 +96,7 @@ def test_a_time_in_seconds_keeps_its_fraction_in_the_junit_file(play, device):
 def test_a_message_uses_one_time_unit(play, device, capsys):
     result = play("[[step]]\nread = 'rates'\nmax_latency_s = 0.0\nwithin_s = 0.1\nevery_s = 0.01\n")
     assert result.results[0].detail.startswith("not within 0.1 s: latency 0.")
-    _printer(quiet=False)(result.results[0])
+    _print_result(Console(highlight=False), result.results[0])
     line = capsys.readouterr().out
     assert " s" in line
     assert " ms" not in line
@@ -248,6 +249,18 @@ def test_the_attitude_is_compared_with_the_truth_of_its_time_in_a_file(play, dev
     assert play(text).passed
     device.telemetry["precise_attitude"] = attitude_values(time_of_exposure=100.6)
     assert not play(text).passed
+
+
+def test_a_truth_log_that_is_given_takes_the_place_of_the_truth_of_the_script(device, tmp_path):
+    script, log = tmp_path / "s.toml", tmp_path / "truth.csv"
+    script.write_text(TRUTH + "[[step]]\nread = 'precise_attitude'\nattitude = { within_arcsec = 1 }")
+    device.telemetry["precise_attitude"] = attitude_values()
+    rows = [f"{t}," + ",".join(map(repr, from_radec_roll(10.0, 20.0, 30.0))) for t in (100, 101)]
+    log.write_text("\n".join(["time_of_exposure_s,true_qx,true_qy,true_qz,true_qw", *rows]))
+    with Bench(LinkOptions(serial=device.open_serial()), ICD) as bench:
+        for truth, status in ((None, "passed"), (log, "failed")):
+            runner = SessionRunner(load_script(script, ICD), bench, tmp_path, truth_path=truth)
+            assert runner.run().results[0].status == status
 
 
 @pytest.mark.parametrize("own", ["", "truth.kind=rate"])
@@ -542,6 +555,13 @@ def test_the_command_prints_a_line_for_each_error_of_a_script(tmp_path):
     assert isinstance(outcome.exception, BenchError)
     lines = outcome.exception.args
     assert [line.split(": ")[:2] for line in lines] == [["s.toml", f"step {n}"] for n in (1, 2, 3)]
+
+
+def test_listening_where_no_row_comes_without_a_request_is_rejected_before_the_first_step(tmp_path):
+    script = tmp_path / "s.toml"
+    script.write_text("[[step]]\nwait_s = 0\n[[step]]\nlisten = 'scet'\n")
+    outcome = run_command(script, "--unit", "oresat", "--can", "virtual:none", "--log", tmp_path / "log")
+    assert str(outcome.exception).startswith("s.toml: step 2: listen: unit oresat has only CANopen on CAN")
 
 
 @pytest.mark.parametrize(

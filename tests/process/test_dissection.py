@@ -69,7 +69,7 @@ def talk_canopen(hub: str, folder) -> None:
 
 def test_no_frame_of_sessions_with_a_canopen_node_is_malformed(tmp_path):
     recording = tmp_path / "hub.log"
-    with EmulatorProcess(hub_command(log=recording)) as hub:
+    with EmulatorProcess([*hub_command(), "--log", str(recording)]) as hub:
         channel = hub.ready["can"]
         command = emulator_command(
             serial="off",

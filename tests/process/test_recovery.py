@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import signal
 import time
 import tty
@@ -17,7 +18,7 @@ import pytest
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.errors import BenchError, DeviceError
-from starhil.hil_tests.private_can_bus import HubThread
+from starhil.hil_tests.private_can_bus import hub_thread
 from starhil.hil_tests.raw_traffic import send_and_listen
 from starhil.protocol.can_framing import CanFrame
 from tests.process.conftest import FAST_BAUD
@@ -72,9 +73,9 @@ def test_power_cuts_while_parameters_are_being_stored_lose_none_of_them(own, tmp
                 obc.command("save_parameters")  # answered when it is done
                 kept = value
             obc.set_parameter("exposure", 2000 + turn)
-            save = frame_request(obc.icd.telecommands["save_parameters"].id).hex()
+            save = frame_request(obc.icd.telecommands["save_parameters"].id)
             # the cut comes before, while or after the last one is stored
-            (answered,) = send_and_listen(obc, (save,), rng.random() * 0.01)
+            (answered,) = obc.run(send_and_listen(obc.core, [save], rng.random() * 0.01))
             allowed = {2000 + turn} if answered else {kept, 2000 + turn}
         emulator.restart(signal.SIGKILL)
     emulator.stop()
@@ -106,11 +107,11 @@ def canopen_master(channel: str):
 
 def test_power_cuts_while_canopen_settings_are_being_stored_lose_none_of_them(own):
     rng = random.Random(6)
-    with HubThread() as hub:
-        emulator = own(serial="off", can=hub.channel, extra=["--canopen", str(NODE)])
+    with hub_thread() as channel:
+        emulator = own(serial="off", can=channel, extra=["--canopen", str(NODE)])
         allowed = {1000}
         for turn in range(3):
-            with canopen_master(hub.channel) as (network, sdo):
+            with canopen_master(channel) as (network, sdo):
                 assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed, f"after cut {turn}"
                 kept, last = 2000 + turn, 3000 + turn
                 sdo.download(HEARTBEAT, 0, kept.to_bytes(2, "little"))
@@ -120,7 +121,7 @@ def test_power_cuts_while_canopen_settings_are_being_stored_lose_none_of_them(ow
                 time.sleep(rng.random() * 0.01)  # the cut comes before, while or after this one is stored
             allowed = {kept, last}
             emulator.restart(signal.SIGKILL)
-        with canopen_master(hub.channel) as (_, sdo):
+        with canopen_master(channel) as (_, sdo):
             assert int.from_bytes(sdo.upload(HEARTBEAT, 0), "little") in allowed
 
 
@@ -172,17 +173,16 @@ def test_two_masters_on_one_bus_get_their_own_replies(emulator):
 
 
 def test_the_device_comes_back_by_itself_when_the_hub_does(own):
-    with HubThread() as hub:
-        emulator = own(serial="off", can=hub.channel)
-        port = hub.port
-        with ObcClient.open(can=hub.channel, timeout_s=0.5) as obc:
+    with contextlib.ExitStack() as stack:
+        with hub_thread() as channel:
+            emulator = own(serial="off", can=channel)
+            obc = stack.enter_context(ObcClient.open(can=channel, timeout_s=0.5))
             wait_until(lambda: answers(obc))
-            hub.stop()
-            assert not answers(obc)
-            hub.start(port)
+        assert not answers(obc)
+        with hub_thread(int(re.split("[:/]", channel)[2])):
             wait_until(lambda: answers(obc))
-        assert emulator.running
-        emulator.stop()
+            assert emulator.running
+            emulator.stop()
 
 
 def test_memory_stays_below_its_limit_while_frames_are_solved(emulator, can_obc):

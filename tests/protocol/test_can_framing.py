@@ -342,4 +342,5 @@ def test_candump_lines_have_the_format_of_candump() -> None:
     )
 )
 def test_python_can_reads_the_lines_of_a_candump_log(one: CanFrame) -> None:
-    assert parse_candump(format_candump(one, "can0")) == ("can0", one)
+    channel, read = parse_candump(format_candump(one, "can0"))
+    assert (channel, read, read.timestamp) == ("can0", one, one.timestamp)

@@ -28,7 +28,7 @@ FUZZ_INPUTS = int(os.environ.get("STARHIL_FUZZ_INPUTS", "1500"))
 MARKS = b"\xc0\xdb\x10\x02\x03\x7e\x7d\xde\xad\xaa\x55\r\n$\xff\x00"
 
 
-@pytest.mark.parametrize("name", [name for name, stack in STACKS.items() if stack.check.size])
+@pytest.mark.parametrize("name", [name for name, stack in STACKS.items() if stack.requests.check.size])
 def test_each_flipped_bit_of_a_message_is_flagged_and_the_next_message_read(name: str) -> None:
     stack = STACKS[name]
     request = REQUESTS[name][0]
@@ -73,7 +73,7 @@ def test_message_to_another_address_is_flagged_as_such() -> None:
 
 def test_unknown_class_is_flagged() -> None:
     body = bytes((0x21, 9, 24))
-    sent = SAGITTA.framing.encode(body + SAGITTA.check.compute(body))
+    sent = SAGITTA.requests.framing.encode(body + SAGITTA.requests.check.compute(body))
     assert faults(list(SAGITTA.device().feed(sent, 0.0))) == [FaultKind.UART_PROTOCOL]
 
 
@@ -98,7 +98,7 @@ def test_incomplete_message_is_flagged_after_the_timeout(name: str) -> None:
 def test_overlong_message_is_flagged_once_and_the_next_message_read(name: str) -> None:
     stack = STACKS[name]
     request = REQUESTS[name][0]
-    head = stack.framing.start or stack.framing.end
+    head = stack.requests.framing.start or stack.requests.framing.end
     filler = b"\xff" if name == "length" else b"0"
     receiver = stack.device()
     events = [
@@ -107,7 +107,7 @@ def test_overlong_message_is_flagged_once_and_the_next_message_read(name: str) -
         for event in receiver.feed(head + filler * 99 if _ == 0 else filler * 100, 0.0)
     ]
     assert faults(events) == [FaultKind.UART_OVERLONG]
-    events = receiver.feed(stack.framing.end + stack.encode_request(request), 0.1)
+    events = receiver.feed(stack.requests.framing.end + stack.encode_request(request), 0.1)
     assert events[-1] == request
 
 

@@ -124,7 +124,7 @@ def test_the_host_reads_replies(name: str, reply: Reply) -> None:
     sent = STACKS[name].encode_reply(reply)
     (found,) = [event for byte in sent for event in receiver.feed(bytes((byte,)), 0.0)]
     assert isinstance(found, Reply)
-    if reply.kind is ReplyKind.NACK and "status" not in STACKS[name].reply_header.roles:
+    if reply.kind is ReplyKind.NACK and "status" not in STACKS[name].replies.header.roles:
         assert found.kind is ReplyKind.NACK
         return
     keys = ("kind", "id", "data", "code", "klass", "sequence", "final", "uptime_ns", "time_ns")

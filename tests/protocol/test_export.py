@@ -21,6 +21,7 @@ from space_packet_parser.xtce import definitions, validation
 
 from starhil.protocol.can_framing import CanDeviceReceiver, encode_reply_frames, encode_request_frames
 from starhil.protocol.codec import Field, Row
+from starhil.protocol.cubespace import Dialect
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.export import FOLDER_FORMATS, FORMATS, export, export_folder
@@ -582,6 +583,40 @@ WITHOUT = {
 @cache
 def unit(name: str) -> InterfaceDefinition:
     return load_unit(name)
+
+
+@pytest.mark.parametrize(("name", "dialects"), [("cubestar", "abc"), ("cubestar-gen2", "c")])
+def test_the_replies_in_the_tables_for_people_are_those_of_the_link(name: str, dialects: str) -> None:
+    """Bytes that are the ID, data or error code of a reply are replaced by their names."""
+    telemetry, telecommand, data = 0x80, 0x60, bytes((0xDA,))
+    replies = (
+        Reply(ReplyKind.TELEMETRY, telemetry, data),
+        Reply(ReplyKind.ACK, telecommand),
+        Reply(ReplyKind.NACK, telecommand, code=ErrorCode.INVALID_PARAMETER),
+        Reply(ReplyKind.UNSOLICITED, telemetry, data),
+        Reply(ReplyKind.EVENT, telemetry, data),
+    )
+    code = ErrorCode.INVALID_PARAMETER.to_bytes().hex()
+    names = {"80": "id", "60": "id", "da": "data", code: "code"}
+    stack = build_serial_stack(load_unit(name))
+    tables = export(load_unit(name), "markdown")
+    _, _, *rows = tables[tables.index("| Dialect |") :].split("\n\n")[0].splitlines()
+    assert [row.split(" | ")[0] for row in rows] == [f"| {dialect}" for dialect in dialects]
+    for row, dialect in zip(rows, map(Dialect, dialects), strict=True):
+        shown = stack.in_dialect(dialect)
+        assert shown is not None
+        cells = [
+            " ".join(
+                names.get(byte, byte.upper()) for byte in stack.encode_reply(reply, dialect).hex(" ").split()
+            )
+            if reply.kind in shown.headers
+            else "none"
+            for reply in replies
+        ]
+        assert row == f"| {dialect.value} | {' | '.join(cells)} |"
+    request = stack.encode_request(Request.of(telecommand, data)).hex(" ").split()
+    shown_request = " ".join(names.get(byte, byte.upper()) for byte in request)
+    assert f"A request is {shown_request}, with every byte 1F" in tables
 
 
 @pytest.mark.parametrize("name", UNITS)

@@ -68,7 +68,9 @@ def test_every_reply_is_read_in_pieces_of_any_size_and_amid_noise(name: str) -> 
             noise = rng.randbytes(rng.randrange(6)).translate(
                 bytes(value & 0x3F | 0x20 for value in range(256))
             )
-            sent = (b"" if stack.framing.start else stack.framing.end) + stack.encode_reply(reply)
+            sent = (b"" if stack.requests.framing.start else stack.requests.framing.end) + stack.encode_reply(
+                reply
+            )
             found = [
                 message
                 for start in range(0, len(noise + sent), piece)
@@ -194,7 +196,7 @@ def test_the_c_consumes_an_echo_before_the_reply(c: tuple[str, CDriver]) -> None
 )
 def test_code_of_a_plugin_is_rejected(link: dict[str, Any]) -> None:
     model = SerialLinkModel.model_validate({**link, "request_header": [{"role": "id", "type": "u8"}]})
-    custom: Any = {"mine": lambda: STACKS["nsp"].framing}
+    custom: Any = {"mine": lambda: STACKS["nsp"].requests.framing}
     stack = SerialStack(model, plugin=Plugin(framings=custom, checks={"mine": lambda _data: b""}))
     assert isinstance(model.framing, CustomFraming) or isinstance(model.check, CustomCheck)
     with pytest.raises(ProtocolError, match="'mine' is Python code in the unit's plugin"):

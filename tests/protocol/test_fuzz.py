@@ -88,7 +88,7 @@ def test_serial_device_receiver() -> None:
             if isinstance(event, Request):
                 assert event == Request.of(event.id, event.data)
                 assert len(event.data) < MAX_SIZE
-        assert len(receiver._body) <= MAX_SIZE
+        assert len(receiver._buffer) <= 2 + 2 * MAX_SIZE + 1  # start, doubled bytes, one escape byte
         if number % 100 == 0:
             assert receiver.feed(CUBESPACE.encode_request(GOOD), number * 0.01 + 0.5)[-1] == GOOD
 
@@ -130,7 +130,7 @@ def test_can_device_receiver() -> None:
             if isinstance(event, Request):
                 assert CanId.unpack(frame.id).destination == 4
                 assert len(event.data) <= MAX_SIZE
-        open_messages = receiver._assembler._open
+        open_messages = receiver._open
         assert len(open_messages) <= MAX_OPEN_MESSAGES
         assert all(len(message.data) <= MAX_SIZE + 8 for message in open_messages.values())
 
@@ -149,7 +149,7 @@ def test_can_host_receiver() -> None:
     def target(number: int, data: bytes) -> None:
         for event in receiver.feed(_frames_of(data, seeds, number), number * 0.001):
             assert isinstance(event, (Reply, LinkFault))
-        assert len(receiver._assembler._open) <= MAX_OPEN_MESSAGES
+        assert len(receiver._open) <= MAX_OPEN_MESSAGES
 
     fuzz([frame.data for frame in seeds], target)
 

@@ -303,7 +303,7 @@ CHECKS: dict[str, Callable[[InterfaceDefinition, Path], None]] = {
 
 
 def test_every_format_is_checked() -> None:
-    assert CHECKS.keys() == FORMATS.keys() | FOLDER_FORMATS.keys()
+    assert CHECKS.keys() == {*FORMATS, *FOLDER_FORMATS}
 
 
 @pytest.mark.parametrize("text", HOSTILE, ids=IDS)

@@ -195,7 +195,7 @@ def test_a_client_that_does_not_read_loses_frames_alone_and_memory_is_bounded() 
             for _ in range(1000):
                 await two.reader.readuntil(b">")
         assert hub.statistics.dropped >= 1
-        assert max(client.backlog for client in hub._clients) < BACKLOG_LIMIT + 2 * len(batch)
+        assert max(client.backlog for client in hub.clients) < BACKLOG_LIMIT + 2 * len(batch)
 
     run(scenario)
 
@@ -211,9 +211,9 @@ def test_the_log_is_a_candump_log(tmp_path: Path) -> None:
         assert await two.silent()
 
     run(scenario, log=log, now=lambda: 12.5)
-    assert list(read_candump(log)) == [
-        ("vcan0", CanFrame(0x08AA0401, b"\x01\x02", timestamp=12.5)),
-        ("vcan1", CanFrame(0x123, extended=False, timestamp=12.5)),
+    assert [(bus, frame, frame.timestamp) for bus, frame in read_candump(log)] == [
+        ("vcan0", CanFrame(0x08AA0401, b"\x01\x02"), 12.5),
+        ("vcan1", CanFrame(0x123, extended=False), 12.5),
     ]
 
 
@@ -332,25 +332,13 @@ def test_any_text_is_a_frame_or_a_command_error(text: bytes) -> None:
 # -- a log that cannot be written, an invalid host ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("at", ["write", "flush", "close"])
-def test_a_full_disk_ends_the_log_and_nothing_else(
-    at: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("starhil.protocol.hub.FLUSH_LOG_S", 0.001 if at == "flush" else 3600.0)
-
+def test_a_full_disk_ends_the_log_and_nothing_else(caplog: pytest.LogCaptureFixture) -> None:
     async def scenario(hub: CanHub) -> None:
         one, two = await Peer.join(hub), await Peer.join(hub)
-        batch = 200 if at == "write" else 1  # more than the log holds back, or less
         for number in range(3):
-            one.write(format_send(CanFrame(number, bytes(8))) * batch)
-            for _ in range(batch):
-                assert (await two.frame()).id == number
-            if at == "flush":
-                async with asyncio.timeout(PATIENCE_S):
-                    while not caplog.records:
-                        await asyncio.sleep(0)
-        assert hub.statistics.clients == 2
-        assert len(caplog.records) == (0 if at == "close" else 1)
+            one.write(format_send(CanFrame(number, bytes(8))))
+            assert (await two.frame()).id == number
+        assert len(hub.clients) == 2
 
     run(scenario, log=Path("/dev/full"))
     assert [record.getMessage() for record in caplog.records] == [

@@ -152,7 +152,7 @@ INVALID = [
     ("missing argument", telecommand("", "set_mode"), "action set_mode needs the argument mode"),
     ("member of an argument", telecommand('{ name = "a", type = "u8", argument = "mode", map = { "1" = "trackin" } }', "set_mode"), "'trackin' is not a value of argument mode; did you mean tracking"),
     ("unknown answer", telecommand("", more='answer = ["ack"]'), "answer 'ack': must be echo, reply or row:NAME"),
-    ("answer with no such row", telecommand("", more='answer = ["row:stat"]') + telemetry('{ name = "a", type = "u8" }', "status"), "no telemetry row with this name; did you mean status"),
+    ("answer with no such row", telecommand("", more='answer = ["row:stat"]') + telemetry('{ name = "a", type = "u8" }', "status"), "telecommand command: answer 'row:stat': no telemetry row named 'stat'; did you mean status"),
     ("unknown answer of telemetry", telemetry("", more='answer = ["ecko"]'), "telemetry row: answer 'ecko': must be echo, reply or row:NAME"),
     ("echo on a line that has none", '[link.serial]\nframing = { kind = "cubespace" }\n' + telecommand("", more='answer = ["echo", "reply"]'), "telecommand command: answer 'echo': link.serial with framing cubespace has no echoes"),
     ("echo on CAN", '[link.can]\nkind = "cubespace"\n' + telemetry("", more='answer = ["echo", "reply"]'), "telemetry row: answer 'echo': link.can has no echoes"),

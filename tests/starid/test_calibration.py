@@ -11,7 +11,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from starid.attitude import Attitude, random_attitude
-from starid.calibration import NAMES, Calibration, CalibrationFrame, calibrate
+from starid.calibration import NAMES, Calibration, CalibrationFrame, attitude_covariance, calibrate
 from starid.camera import DEFAULT_CAMERA, Camera
 from starid.camera_file import load_camera, save_camera
 from starid.catalog import StarCatalog, load_catalog
@@ -76,6 +76,35 @@ def test_distortion_of_four_pixels_is_recovered_to_the_noise_floor(sky: StarCata
     assert result.star_count == sum(len(f.xy_px) for f in frames)
     for attitude, truth in zip(result.attitudes, truths, strict=True):
         assert attitude.error_to(truth).roll_arcsec < 60.0
+
+
+@pytest.mark.parametrize("camera", [WIDE, FISHEYE])
+@pytest.mark.parametrize("number", range(len(NAMES)), ids=NAMES)
+def test_an_error_of_the_camera_turns_the_attitude_by_what_its_covariance_says(
+    sky: StarCatalog, camera: Camera, number: int
+) -> None:
+    """Compared with the attitude that fits the stars best, found by `scipy.optimize`, for an error small enough to be linear."""
+    (frame,), (truth,) = simulated(sky, camera, 1, 5, sigma=0.0)
+    sigma = np.random.default_rng(6).uniform(0.05, 0.5, len(frame.xy_px))
+    error = 1e-4 if number < 4 else 1e-6
+    constants = [*camera.focal_px, *camera.centre_px, *camera.distortion]
+    constants[number] += error
+    wrong = dataclasses.replace(
+        camera,
+        focal_px=(constants[0], constants[1]),
+        centre_px=(constants[2], constants[3]),
+        distortion=tuple(constants[4:]),
+    )
+
+    def residuals(turn: np.ndarray) -> np.ndarray:
+        xy, _ = wrong.project(truth.rotated(turn).to_sensor(frame.reference))
+        return ((xy - frame.xy_px) / sigma[:, None]).ravel()
+
+    turn = least_squares(residuals, np.zeros(3), x_scale=1e-6, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    known = np.zeros((9, 9))
+    known[number, number] = error**2
+    found = attitude_covariance(camera, known, frame.xy_px, sigma)
+    np.testing.assert_allclose(found, np.outer(turn, turn), atol=2e-3 * np.abs(turn).max() ** 2)
 
 
 @pytest.mark.parametrize(

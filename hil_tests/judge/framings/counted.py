@@ -4,33 +4,59 @@
     | start | header | data of the row's size  | check | end |        fixed
       DE AD                                             BE EF        NOS3 (generic_star_tracker_device.c)
 
-Start and end may be empty. There is no escaping: the marks may occur in the body.
+Start and end may be empty. There is no escaping, so that the marks may occur in the body, but the bytes of a range may
+be stuffed, each sent as two (Hyperion ST200, libgs hyp_st200.c); the size counts them before:
+
+    | start | body, E to E | M as E and its bits in M |          escape E, mask M
+      F1      41 F0 00 7F F0 03  (the body 41 F0 7F F3)           F0        0F
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 from starhil.hil_tests.judge.framings import Measure, Taken, check_start
 
 
 class Counted:
-    """A body of a known size between marks."""
+    """A body of a known size between marks, stuffed or not."""
 
-    def __init__(self, start: list[int], end: list[int]) -> None:
-        self.start, self.end = bytes(start), bytes(end)
-        self.marks = self.start + self.end or b"\x1f\x7f\xff"
+    def __init__(self, model: Any) -> None:
+        self.start, self.end = bytes(model.start), bytes(model.end)
+        self._escape, special = None, b""
+        self._pairs: dict[int, bytes] = {}
+        if model.stuffing is not None:
+            self._escape, mask = model.stuffing.escape, model.stuffing.mask
+            last = self._escape | mask
+            special = bytes((self._escape, last))
+            self._pairs = {
+                byte: bytes((self._escape, byte & mask)) for byte in range(256) if byte | mask == last
+            }
+        self._originals = {pair: byte for byte, pair in self._pairs.items()}
+        self.marks = self.start + special + self.end or b"\x1f\x7f\xff"
 
     def encode(self, body: bytes) -> bytes:
         """Return the body between its marks."""
-        return self.start + body + self.end
+        return self.start + b"".join(self._pairs.get(byte, bytes((byte,))) for byte in body) + self.end
 
     def take(self, received: bytearray, measure: Measure) -> Taken | None:
-        """Remove a message that must begin at once."""
+        """Remove a message that must begin at once; a byte of the range that is not stuffed makes it junk."""
         check_start(received, self.start)
-        size = measure(bytes(received[len(self.start) :]))
-        if size is None or len(received) < len(self.start) + size + len(self.end):
+        body, position = bytearray(), len(self.start)
+        size = measure(b"")
+        while size is None or len(body) < size:
+            pair = bytes(received[position : position + 2])
+            if not pair or (pair[0] == self._escape and len(pair) < 2):
+                return None
+            if pair[0] in self._pairs and pair not in self._originals:
+                raise ValueError(f"{pair[0]:02x} is not stuffed")
+            body.append(self._originals.get(pair, pair[0]))
+            position += 2 if pair in self._originals else 1
+            size = measure(bytes(body)) if size is None else size
+        whole = position + len(self.end)
+        if len(received) < whole:
             return None
-        line = bytes(received[: len(self.start) + size + len(self.end)])
-        if line[len(self.start) + size :] != self.end:
+        if bytes(received[position:whole]) != self.end:
             raise ValueError(f"no end {self.end.hex()} after {size} bytes")
-        del received[: len(line)]
-        return Taken(line[len(self.start) : len(self.start) + size])
+        del received[:whole]
+        return Taken(bytes(body))

@@ -34,15 +34,15 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
     """
     check_one_format(stack, "C")
     framing = "counted" if stack.link.framing.kind in ("length", "fixed") else stack.link.framing.kind
-    header = max(stack.request_header.size(name) for name in ("", *stack.classes.by_name))
-    marks = len(stack.framing.start) + len(stack.framing.end) + _MARKS
+    header = max(stack.requests.header.size(name) for name in ("", *stack.classes.by_name))
+    marks = len(stack.requests.framing.start) + len(stack.requests.framing.end) + _MARKS
     sizes = {
         "MAX_MESSAGE": stack.max_size,
         "BUFFER": (2 if framing == "delimited" else 1) * stack.max_size + marks,
-        "OVERHEAD": header + stack.check.size,
+        "OVERHEAD": header + stack.requests.check.size,
         "MARKS": marks,
         "HEADER": max(header, 1),
-        "CHECK": max(stack.check.size, 1),
+        "CHECK": max(stack.requests.check.size, 1),
     }
     helpers = fill("c/composed_helpers.c.j2", **_rows(stack), **_headers(stack), **_check(stack)).strip("\n")
     source = "\n".join(
@@ -67,11 +67,11 @@ def link_parts(stack: SerialStack) -> tuple[str, str, str]:
 def _constants(stack: SerialStack) -> dict[str, str]:
     """Return the declarations of the constants that the code uses, by name."""
     found = {
-        "START_SIZE": f"static const size_t START_SIZE = {len(stack.framing.start)}u;",
-        "END_SIZE": f"static const size_t END_SIZE = {len(stack.framing.end)}u;",
-        "CHECK_SIZE": f"static const size_t CHECK_SIZE = {stack.check.size}u;",
-        "start_bytes": f"static const uint8_t start_bytes[] = {{{_bytes(stack.framing.start)}}};",
-        "end_bytes": f"static const uint8_t end_bytes[] = {{{_bytes(stack.framing.end)}}};",
+        "START_SIZE": f"static const size_t START_SIZE = {len(stack.requests.framing.start)}u;",
+        "END_SIZE": f"static const size_t END_SIZE = {len(stack.requests.framing.end)}u;",
+        "CHECK_SIZE": f"static const size_t CHECK_SIZE = {stack.requests.check.size}u;",
+        "start_bytes": f"static const uint8_t start_bytes[] = {{{_bytes(stack.requests.framing.start)}}};",
+        "end_bytes": f"static const uint8_t end_bytes[] = {{{_bytes(stack.requests.framing.end)}}};",
     }
     match stack.link.framing:
         case SlipFraming() as model:
@@ -88,7 +88,7 @@ def _constants(stack: SerialStack) -> dict[str, str]:
     if isinstance(stack.link.check, FletcherCheck):
         macros["MODULUS"] = stack.link.check.modulus
     if isinstance(stack.link.check, CrcCheck):
-        bits = 8 * stack.check.size
+        bits = 8 * stack.requests.check.size
         poly = stack.link.check.poly
         macros |= {
             "CRC_BITS": bits, "CRC_MASK": (1 << bits) - 1, "CRC_REFLECTED": int(stack.link.check.reflect),
@@ -100,8 +100,8 @@ def _constants(stack: SerialStack) -> dict[str, str]:
 def _rows(stack: SerialStack) -> dict[str, Any]:
     """Return the functions of a row's key: tests of its kind, and its sizes."""
     rows = {row_key(stack.classes.classes, row.klass, row.id): row for row in stack.rows}
-    headers = {key: stack.request_header.size(row.klass) for key, row in rows.items()}
-    requests = {key: headers[key] + row.request_size + stack.check.size for key, row in rows.items()}
+    headers = {key: stack.requests.header.size(row.klass) for key, row in rows.items()}
+    requests = {key: headers[key] + row.request_size + stack.requests.check.size for key, row in rows.items()}
     return {
         "tests": {
             "is_row": list(rows),
@@ -119,7 +119,7 @@ def _rows(stack: SerialStack) -> dict[str, Any]:
 
 def _headers(stack: SerialStack) -> dict[str, Any]:
     classes = stack.classes.by_name
-    coded = "class" in stack.request_header.roles
+    coded = "class" in stack.requests.header.roles
 
     def role(name: str | None, default: int, mask: int = -1) -> str:
         if name == "id":
@@ -149,14 +149,14 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
         "packed": packed,
         "class_test": class_test,
         "suffix": lambda field: _suffix(field.order),
-        "requests": stack.request_header,
-        "replies": stack.reply_header,
+        "requests": stack.requests.header,
+        "replies": stack.replies.header,
         "reply_classes": replies,
-        "address": stack.reply_header.defaults.get("address"),
+        "address": stack.replies.header.defaults.get("address"),
         "coded": coded,
         "lengths": {
-            "request_length": _length(stack.request_header),
-            "length_of": _length(stack.reply_header),
+            "request_length": _length(stack.requests.header),
+            "length_of": _length(stack.replies.header),
         },
     }
 
@@ -174,7 +174,7 @@ def _length(header: Header) -> str:
 
 
 def _check(stack: SerialStack) -> dict[str, Any]:
-    model, check = stack.link.check, stack.check
+    model, check = stack.link.check, stack.requests.check
     initial, result = "0u", "state"
     order: Order = getattr(model, "order", None) or stack.byte_order
     kind: str = model.kind

@@ -17,10 +17,11 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.links.can import CanLink
 from starhil.emulator.links.canopen import CanopenLink
 from starhil.emulator.replay import replay
+from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
 from starhil.hil_tests.endurance.shrink import kind_of, shortened
-from starhil.hil_tests.endurance.truth import Error, Motion
+from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import bundled_units
@@ -31,7 +32,7 @@ READ_MODE = {"do": "request", "link": "serial", "row": ["", 160, "telemetry"]}
 
 def life_of(unit, seed, steps=STEPS):
     icd = load_unit(unit)
-    return make_life(icd, unit, links_of(icd), seed, steps)
+    return make_life(unit_of(icd), unit, links_of(icd), seed, steps)
 
 
 @pytest.mark.parametrize("unit", sorted(bundled_units()))
@@ -81,7 +82,7 @@ def test_a_long_life_passes_the_wraps_of_its_counters():
 
 def test_long_lives_last_for_months():
     icd = load_unit("sagitta")
-    life = make_life(icd, "sagitta", links_of(icd), 1, 150, is_long=True)
+    life = make_life(unit_of(icd), "sagitta", links_of(icd), 1, 150, is_long=True)
     assert sum(step["s"] for step in life.steps if step["do"] == "wait") > 49.7 * 86_400.0
     assert not {"power", "fault", "recover"} & {step["do"] for step in life.steps}
 
@@ -262,11 +263,10 @@ def test_a_life_is_shortened_to_the_events_that_matter():
 
 def test_a_late_exposure_is_no_error_along_the_motion():
     motion = Motion(0.0, (0.0, 0.0, 0.0, 1.0), (0.0, 0.01, 0.0))
-    error = Error.between(motion.at(10.0), motion.at(10.3))
-    assert abs(error.y) == pytest.approx(0.003)
-    left = error.along(motion.rate_rad_s, 0.5)
-    assert (left.x, left.y, left.z) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
-    assert abs(error.along(motion.rate_rad_s, 0.1).y) == pytest.approx(0.002)
+    late = motion.at(10.0)
+    assert abs(motion.error(late, 10.3, 0.0)[1]) == pytest.approx(0.003)
+    assert motion.error(late, 10.3, 0.5) == pytest.approx((0.0, 0.0, 0.0), abs=1e-12)
+    assert abs(motion.error(late, 10.3, 0.1)[1]) == pytest.approx(0.002)
 
 
 def test_a_life_with_a_full_disk_is_written_without_a_recording(tmp_path):
@@ -390,7 +390,7 @@ def test_a_life_of_a_unit_without_telecommands_reads_it(tmp_path):
         'reply_header = [{ role = "id", type = "u8" }, { role = "status", type = "u8" }]\n'
     )
     icd = load_unit(tmp_path)
-    life = make_life(icd, str(tmp_path), links_of(icd), 1, 200)
+    life = make_life(unit_of(icd), str(tmp_path), links_of(icd), 1, 200)
     sent = [step for step in life.steps if step["do"] == "request"]
     assert sum(step["row"] == ["", 2, "telemetry"] for step in sent) > 50
     assert "nmt" not in {step["do"] for step in life.steps}

@@ -122,6 +122,9 @@ def layout(**changes) -> CanopenModel:
             "no_field",
         ),
         ({"tpdo": [{"name": "x", "objects": ["6000.nothing"]}]}, "6000.nothing"),
+        ({"tpdo": [{"name": "x", "objects": ["2000.health"]}]}, "PDO x: .*cannot be mapped.*2000h:A4h"),
+        ({"rpdo": [{"name": "x", "objects": ["6001.mode"]}]}, "PDO x: .*cannot be mapped"),
+        ({"tpdo": [{"name": "x", "objects": ["6001.mode"] * 9}]}, "PDO x: .*9 bytes, at most 8"),
         (
             {
                 "object": [{"index": 0x6000, "name": n, "telemetry": "rates"} for n in "ab"],

@@ -61,10 +61,10 @@ def test_an_abort_ends_a_transfer_with_its_code():
     node = Node("oresat")
     with pytest.raises(SdoAbortError) as abort:
         node.run(download(0x4000, 0, b"\x4d"))
-    assert abort.value.code is AbortCode.VALUE_RANGE
+    assert abort.value.code == AbortCode.VALUE_RANGE
     with pytest.raises(SdoAbortError) as abort:
         node.run(download(0x5FFF, 0, bytes(20)))
-    assert abort.value.code is AbortCode.NO_OBJECT
+    assert abort.value.code == AbortCode.NO_OBJECT
 
 
 def test_the_requests_of_a_download_are_known_before_it_is_sent():

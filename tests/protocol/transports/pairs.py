@@ -89,13 +89,8 @@ class CanPair:
         self.errors: list[ProtocolError] = []
 
     async def start(self) -> None:
-        await self.one.start(lambda frame: self.got_one.append(bare(frame)), self.errors.append)
-        await self.two.start(lambda frame: self.got_two.append(bare(frame)), self.errors.append)
-
-
-def bare(frame: CanFrame) -> CanFrame:
-    """The frame without its time."""
-    return CanFrame(frame.id, frame.data, frame.extended, frame.remote)
+        await self.one.start(self.got_one.append, self.errors.append)
+        await self.two.start(self.got_two.append, self.errors.append)
 
 
 @contextlib.asynccontextmanager

@@ -13,10 +13,12 @@ import can
 import pytest
 
 from starhil.protocol.can_framing import CanFrame
-from starhil.protocol.hub import CanHub
+from starhil.protocol.hub import DEFAULT_HOST, CanHub
 from starhil.protocol.transports import TransportError, open_can
+from starhil.protocol.transports.can import new_hub
 from starhil.protocol.transports.hub_client import BACKLOG_LIMIT as HUB_BACKLOG
-from tests.protocol.transports.pairs import FRAMES, HAS_VCAN, CanPair, bare, until
+from starhil.protocol.transports.hub_client import AutoHubTransport
+from tests.protocol.transports.pairs import FRAMES, CanPair, until
 
 
 def test_a_restarted_hub_is_found_again() -> None:
@@ -60,25 +62,24 @@ def test_a_hub_that_stops_reading_neither_blocks_nor_fills_memory() -> None:
             if number % 500 == 0:
                 await asyncio.sleep(0)
         assert transport.statistics.dropped == 1
-        assert transport._connection.transport.get_write_buffer_size() < HUB_BACKLOG + 100_000  # type: ignore[attr-defined]
+        assert transport._writer.transport.get_write_buffer_size() < HUB_BACKLOG + 100_000  # type: ignore[attr-defined]
         await transport.close()
         server.close()
 
     asyncio.run(main())
 
 
-@pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
 def test_auto_starts_a_hub_joins_it_and_takes_over_when_its_owner_leaves() -> None:
     async def main() -> None:
         probe = CanHub(port=0)
         await probe.start()
         port = probe.port
         await probe.close()
-        one, two, three = (open_can("auto", hub_port=port) for _ in range(3))
+        one, two, three = (AutoHubTransport(DEFAULT_HOST, port) for _ in range(3))
         got: list[CanFrame] = []
         await one.start(lambda _: None)
         await two.start(lambda _: None)
-        await three.start(lambda frame: got.append(bare(frame)))
+        await three.start(got.append)
         assert one.description == two.description == f"socketcand:127.0.0.1:{port}/vcan0"
         await one.close()
         await until(lambda: two.statistics.reconnects == three.statistics.reconnects == 1)
@@ -92,16 +93,15 @@ def test_auto_starts_a_hub_joins_it_and_takes_over_when_its_owner_leaves() -> No
 
 FOUNDER = """
 import asyncio
-from starhil.protocol.transports import open_can
+from starhil.protocol.transports.hub_client import AutoHubTransport
 async def main():
-    await open_can("auto", hub_port={port}).start(lambda _: None)
+    await AutoHubTransport("127.0.0.1", {port}).start(lambda _: None)
     print("founded", flush=True)
     await asyncio.Event().wait()
 asyncio.run(main())
 """
 
 
-@pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
 def test_the_bus_survives_the_process_that_started_it(caplog: pytest.LogCaptureFixture) -> None:
     async def main() -> None:
         with socket.create_server(("127.0.0.1", 0)) as probe:
@@ -112,17 +112,17 @@ def test_the_bus_survives_the_process_that_started_it(caplog: pytest.LogCaptureF
         try:
             assert founder.stdout is not None
             assert await founder.stdout.readline() == b"founded\n"
-            heirs = [open_can("auto", hub_port=port) for _ in range(3)]
+            heirs = [AutoHubTransport(DEFAULT_HOST, port) for _ in range(3)]
             bench = open_can(f"socketcand:127.0.0.1:{port}/vcan0")
             got: list[CanFrame] = []
             for transport in (*heirs, bench):
-                await transport.start(lambda frame: got.append(bare(frame)))
-            assert [heir._hub for heir in heirs] == [None] * 3  # type: ignore[attr-defined]
+                await transport.start(got.append)
+            assert [heir._hub for heir in heirs] == [None] * 3
         finally:
             founder.kill()
             await founder.wait()
         await until(lambda: all(each.statistics.reconnects == 1 for each in (*heirs, bench)))
-        assert sum(heir._hub is not None for heir in heirs) == 1  # type: ignore[attr-defined]
+        assert sum(heir._hub is not None for heir in heirs) == 1
         assert heirs[0].send(FRAMES[0])
         await until(lambda: got == [FRAMES[0]] * 3)
         for transport in (bench, *heirs):
@@ -134,10 +134,9 @@ def test_the_bus_survives_the_process_that_started_it(caplog: pytest.LogCaptureF
     assert sum(text.endswith("/vcan0: back") for text in texts) == 4
 
 
-@pytest.mark.skipif(HAS_VCAN, reason="auto takes vcan0 here")
 def test_auto_with_port_0_is_a_private_bus() -> None:
     async def main() -> None:
-        one, two = open_can("auto", hub_port=0), open_can("auto", hub_port=0)
+        one, two = new_hub(), new_hub()
         await one.start(lambda _: None)
         await two.start(lambda _: None)
         assert one.description != two.description
@@ -159,7 +158,7 @@ def test_python_can_joins_the_bus_that_auto_made() -> None:
         await hub.start()
         transport = open_can(f"socketcand:127.0.0.1:{hub.port}/vcan0")
         got: list[CanFrame] = []
-        await transport.start(lambda frame: got.append(bare(frame)))
+        await transport.start(got.append)
         await asyncio.to_thread(send, transport.description)
         await until(lambda: got == [FRAMES[1]])
         await transport.close()

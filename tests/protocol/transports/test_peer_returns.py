@@ -16,7 +16,7 @@ from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.hub import CanHub
 from starhil.protocol.transports import SerialTransport, open_can, open_serial
 from starhil.protocol.transports.base import Transport
-from tests.protocol.transports.pairs import FRAMES, bare, until
+from tests.protocol.transports.pairs import FRAMES, until
 
 SLOW_BAUD = 9600
 QUEUED = (bytes(120),) * 100
@@ -155,7 +155,7 @@ def test_a_line_carries_only_bytes_sent_after_the_peer_returned(kind: str, tmp_p
         await peer.leave()
         await until(lambda: line.statistics.dropped > 0)
         line.send(b"to nobody")
-        await until(lambda: _backlog(line) == 0)
+        await until(lambda: line._backlog == 0)  # type: ignore[attr-defined]
         peer.got.clear()
         await peer.come(line.description)
         await _hears(peer, line)
@@ -164,11 +164,6 @@ def test_a_line_carries_only_bytes_sent_after_the_peer_returned(kind: str, tmp_p
         await line.close()
 
     asyncio.run(main())
-
-
-def _backlog(line: SerialTransport) -> int:
-    writer = line._writer  # type: ignore[attr-defined]
-    return 0 if writer is None else writer.backlog
 
 
 async def _hears(peer: Peer, line: SerialTransport) -> None:
@@ -193,7 +188,7 @@ def test_a_bus_carries_to_a_returned_peer_only_later_frames(kind: str) -> None:
             for sent in (FRAMES[0], FRAMES[2]):
                 got: list[CanFrame] = []
                 peer = open_can(spec)
-                await peer.start(lambda frame, got=got: got.append(bare(frame)))
+                await peer.start(got.append)
                 assert node.send(sent)
                 await until(lambda got=got: len(got) > 0)
                 assert got == [sent]

@@ -89,7 +89,7 @@ def test_unread_bytes_are_not_passed_to_the_next_peer(watched: bool, monkeypatch
                 fill(line)
                 os.write(fd, REQUEST)
                 await until(lambda: bytes(heard) == REQUEST)
-            await until(lambda: line._writer.backlog == 0)  # type: ignore[attr-defined]
+            await until(lambda: line._backlog == 0)  # type: ignore[attr-defined]
             with peer(line) as fd:
                 assert line.send(MESSAGE)
                 assert await next_bytes(fd, len(MESSAGE)) == MESSAGE

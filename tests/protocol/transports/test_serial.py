@@ -15,8 +15,7 @@ import serial
 
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.transports import TransportError, open_serial
-from starhil.protocol.transports.base import Statistics
-from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedWriter
+from starhil.protocol.transports.paced import BACKLOG_LIMIT, PacedTransport
 from tests.conformance.simulated import SimulatedLoop
 from tests.protocol.transports.pairs import DEADLINE_S, SERIAL_KINDS, serial_pair, until
 
@@ -77,26 +76,39 @@ def test_a_paced_message_arrives_whole_with_its_last_byte(kind: str, tmp_path: P
     asyncio.run(main())
 
 
+class Line(PacedTransport):
+    """A line that notes when it is written to, and how much."""
+
+    def __init__(self) -> None:
+        super().__init__("line", 1000)
+        self.written: list[tuple[float, int]] = []
+
+    async def _open(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    def _has_peer(self) -> bool:
+        return True
+
+    def _write(self, data: bytes) -> int:
+        self.written.append((asyncio.get_running_loop().time(), len(data)))
+        return len(data)
+
+
 def test_a_paced_message_is_written_at_the_moment_its_last_byte_ends() -> None:
-    async def main(loop: asyncio.AbstractEventLoop) -> None:
-        written: list[tuple[float, int]] = []
-
-        def write(data: bytes) -> int:
-            written.append((loop.time(), len(data)))
-            return len(data)
-
-        writer = PacedWriter(write, 1000, Statistics())
+    async def main() -> None:
+        line = Line()
         for size in (60, 3):
-            writer.send(bytes(size))
-        await writer.drain()
+            line.send(bytes(size))
+        await line.drain()
         await asyncio.sleep(1.0)
-        writer.send(bytes(10))
-        await writer.drain()
-        assert [size for _, size in written] == [60, 3, 10]
-        assert [moment for moment, _ in written] == pytest.approx([0.60, 0.63, 1.73])
+        line.send(bytes(10))
+        await line.drain()
+        assert [size for _, size in line.written] == [60, 3, 10]
+        assert [moment for moment, _ in line.written] == pytest.approx([0.60, 0.63, 1.73])
 
     loop = SimulatedLoop()
-    loop.run_until_complete(main(loop))
+    loop.run_until_complete(main())
     loop.close()
 
 
@@ -121,7 +133,7 @@ def test_a_peer_that_does_not_read_neither_blocks_nor_fills_memory(kind: str, tm
                     pytest.fail("the peer's buffers never fill")
                 await asyncio.sleep(0)
             assert pair.one.statistics.dropped == 3 * 1024
-            assert pair.one._writer.backlog <= BACKLOG_LIMIT  # type: ignore[attr-defined]
+            assert pair.one._backlog <= BACKLOG_LIMIT  # type: ignore[attr-defined]
             pair.two.send(b"still alive")
             await until(lambda: bytes(pair.got_one) == b"still alive")
 

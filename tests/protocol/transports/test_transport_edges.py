@@ -5,8 +5,8 @@ import asyncio
 import pytest
 
 from starhil.protocol.transports import TransportError, open_can
-from starhil.protocol.transports.hub_client import HubTransport
 from starhil.protocol.transports.serial import open_serial
+from tests.protocol.transports.pairs import until
 
 
 @pytest.mark.parametrize("host", ["127.0.0..1", "x" * 300])
@@ -25,16 +25,7 @@ def test_an_invalid_host_is_reported_in_one_line(kind, host):
     asyncio.run(main())
 
 
-def test_a_hub_that_ends_after_its_last_answer_is_not_joined(monkeypatch):
-    shake = HubTransport._shake_hands
-
-    async def shake_and_see_it_go(self, connection):
-        await shake(self, connection)
-        while connection.transport is not None:
-            await asyncio.sleep(0)
-
-    monkeypatch.setattr(HubTransport, "_shake_hands", shake_and_see_it_go)
-
+def test_a_hub_that_ends_after_its_last_answer_is_lost():
     async def serve(reader, writer):
         writer.write(b"< hi >")
         for _ in range(3):
@@ -43,10 +34,13 @@ def test_a_hub_that_ends_after_its_last_answer_is_not_joined(monkeypatch):
         writer.close()
 
     async def main():
+        errors = []
         async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
             transport = open_can(f"socketcand:127.0.0.1:{server.sockets[0].getsockname()[1]}/vcan0")
-            with pytest.raises(TransportError, match="closed the connection"):
-                await transport.start(lambda _: None)
+            await transport.start(lambda _: None, errors.append)
+            await until(lambda: bool(errors))
+            assert "lost: the hub closed the connection" in str(errors[0])
+            await until(lambda: transport.statistics.reconnects > 1)  # joined again, and lost again
             await transport.close()
 
     asyncio.run(main())

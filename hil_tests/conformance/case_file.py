@@ -1,0 +1,138 @@
+"""Cases written as data: what is sent on a line or bus, and what must come back.
+
+    [texts]
+    clear = "command clear_counters"            # names in braces, besides those of the link
+
+    [[area]]
+    name = "errors"
+    clause = "ICD 4.3"
+    links = ["serial"]                          # default: serial and can; for canopen, see `canopen_dialogue`
+    intrusive = true                            # default: false
+    cases = [
+        { id = "junk", title = "junk sets a flag", lines = "{clear}; 00 55; silence; telemetry status junk=true" },
+    ]
+
+`clause` and `intrusive` of a case replace those of its area; a case with a name in braces that the unit lacks is left out.
+The steps of `lines` are separated by semicolons or stand in lines of their own:
+
+    1F 7F 80 1F FF > 128        raw bytes, and the next answers: telemetry rows by ID
+    1F 7F 03 1F FF > 3!crc      ... or a refusal by an error's name
+    0480HHDD# > 0580DDHH#....   on CAN, frames in the format of cansend, and frames in which `..` is any byte;
+                                HH and DD are the addresses of host and device
+    silence, silence 0.8        nothing comes within a time, s
+    sleep 0.1, drain            wait; discard what was received
+    command clear_counters      a telecommand without values, which must be accepted
+    telemetry status a=1 b=true     a row with these values; of two for one field, the last
+
+`(00)*600` repeats a text. At the end nothing more may come, and the next request must be answered.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from starhil.hil_tests.conformance.case import Case, case_in, check_equal
+from starhil.hil_tests.conformance.link_probe import LinkProbe
+from starhil.hil_tests.errors import BenchError
+from starhil.protocol.errors import reason
+from starhil.protocol.user_file import read_user_text
+from starhil.protocol.validation_messages import problems
+
+CUBESPACE_CASES: Final = Path(__file__).with_name("cubespace_cases.toml")
+REPEATED: Final = re.compile(r"\(([^()]*)\)\*(\d+)")
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class CaseText(_Model):
+    """One case; id, title and clause as in `Case`."""
+
+    id: str
+    title: str
+    lines: str
+    clause: str | None = None
+    intrusive: bool | None = None
+
+
+class AreaText(_Model):
+    """The cases of one area of the protocol."""
+
+    name: str
+    clause: str
+    links: list[Literal["serial", "can", "canopen"]] = ["serial", "can"]
+    intrusive: bool = False
+    cases: list[CaseText]
+
+
+class CaseFile(_Model):
+    """A file of cases."""
+
+    texts: dict[str, str] = {}
+    area: list[AreaText]
+
+    def cases(self, link: str, names: Mapping[str, str]) -> Iterator[Case[LinkProbe]]:
+        """Yield the cases for a link; `names` are its names in braces."""
+        known = {**names, **self.texts}
+        for area in self.area:
+            for item in area.cases if link in area.links else ():
+                with suppress(KeyError):
+                    texts = item.id, item.title, item.clause or area.clause, item.lines
+                    name, title, clause, lines = (text.format(**known) for text in texts)
+                    changes = area.intrusive if item.intrusive is None else item.intrusive
+                    yield case_in(area.name, name, title, partial(hold, lines), clause, intrusive=changes)
+
+
+def read_case_file(path: Path) -> CaseFile:
+    """Read a file of cases.
+
+    Raises BenchError: it is not one; the text names all errors.
+    """
+    try:
+        document = tomllib.loads(read_user_text(path))
+        return CaseFile.model_validate(document)
+    except ValidationError as error:
+        raise BenchError(*(f"{path}: {item}" for item in problems(error, CaseFile, document))) from None
+    except (OSError, ValueError) as error:
+        raise BenchError(f"{path}: {reason(error)}") from None
+
+
+def hold(lines: str, probe: LinkProbe) -> None:
+    """Carry out the steps of a case."""
+    for step in re.split("[;\n]", REPEATED.sub(lambda found: found[1] * int(found[2]), lines.strip())):
+        match step.split():
+            case "silence", *seconds:
+                probe.expect_silence("nothing was requested", float(seconds[0]) if seconds else None)
+            case "sleep", seconds:
+                probe.sleep(float(seconds))
+            case "drain", *_:
+                probe.drain()
+            case "command", name:
+                probe.command(name)
+            case "telemetry", name, *values:
+                wanted = {key: _value(text) for key, _, text in (item.partition("=") for item in values)}
+                seen = probe.telemetry(name)
+                check_equal({key: seen[key] for key in wanted}, wanted, name)
+            case _:
+                sent, _, answers = step.partition(">")
+                probe.exchange(sent, answers.split())
+    probe.expect_silence("no more was requested")
+    # an incomplete message ends at the start of the next one
+    probe.expect_alive()
+
+
+def _value(text: str) -> Any:
+    """Return a number, a flag, or the name of a value."""
+    with suppress(ValueError):
+        return json.loads(text)
+    return text
