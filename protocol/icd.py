@@ -29,7 +29,7 @@ from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageCla
 from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.text_messages import words
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
@@ -93,10 +93,6 @@ def _place(problem: Problem) -> tuple[int | str, ...]:
     if len(location) > 3 and location[2] == "fields":
         return location[:4]
     return location[: 2 if isinstance(location[1 % len(location)], int) else 1]
-
-
-def _order(place: tuple[int | str, ...]) -> tuple[tuple[int, str], ...]:
-    return tuple((step, "") if isinstance(step, int) else (-1, step) for step in place)
 
 
 def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
@@ -169,7 +165,8 @@ class _Reader:
                 if not said:  # later ones may be caused by what was removed
                     self.errors += [f"{file}: {problem}" for problem in found]
                 said = True
-                for place in sorted({_place(problem) for problem in found}, key=_order, reverse=True):
+                places = sorted(map(_place, found), key=lambda place: [f"{step:>9}" for step in place])
+                for place in reversed(dict.fromkeys(places)):  # from the last: the other indices stay
                     self._remove(file, document, place)
         for name, given in tables:
             listed = given if isinstance(given, list) else [] if given is None else [given]
@@ -477,7 +474,7 @@ def _check_link(icd: InterfaceDefinition) -> None:
         for name in serial.framing.unanswered:
             with Located("link.serial.framing.unanswered"):
                 _find("telecommand", name, icd.telecommands)
-    stack = build_serial_stack(icd)
+    stack = SerialStack(icd)
     for row in icd.rows:
         with Located(f"{row.kind} {row.name}"):
             text_form = stack.request_formats.of(row.klass) in stack.text_formats
