@@ -245,7 +245,6 @@ def _message(frame: CanFrame) -> can.Message:
         data=frame.data,
         is_extended_id=frame.extended,
         is_remote_frame=frame.remote,
-        dlc=len(frame.data),
     )
 
 
