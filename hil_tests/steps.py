@@ -353,9 +353,9 @@ class Command(RequestStep):
                 yield f"with: row '{self.row.name}' needs the field '{name}', which is missing"
             elif value is not None and not isinstance(value, Variable):
                 try:
-                    item.to_raw(value, f"with: {self.row.name}.{name}", check=self.refused is None)
+                    item.to_raw(value, check=self.refused is None)
                 except ProtocolError as error:
-                    yield str(error)
+                    yield f"with: {self.row.name}.{name}: {error}"
 
     def run(self, session: Session, link: str) -> Attempt:
         """Send the telecommand."""

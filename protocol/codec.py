@@ -222,29 +222,27 @@ class Field(FieldKeys):
         """Whether a telecommand must give a value."""
         return self.default is None and self.const is None
 
-    def to_raw(
-        self, value: Value, where: str, *, check: bool = True, saturate: bool = False, index: int = 0
-    ) -> int | float | bytes:
+    def to_raw(self, value: Value, *, check: bool = True, saturate: bool = False) -> int | float | bytes:
         """Convert a physical value to the raw value of its slot or bits.
 
-        Raise FieldError if it does not fit.
+        Raise FieldError, which does not name the field, if it does not fit.
         """
         match self.kind:
             case "bytes":
-                return self._bytes_to_raw(value, where, index)
+                return self._bytes_to_raw(value)
             case "text":
                 # what a telecommand has set is read back as it is, and tests may send any bytes
                 encoding = "ascii" if check and not saturate else "latin-1"
-                return self._text_to_raw(value, where, encoding, index)
+                return self._text_to_raw(value, encoding)
             case "flag" | "enum":
-                raw = self._named_to_raw(value, where, check=check, index=index)
+                raw = self._named_to_raw(value, check=check)
                 if check and not saturate and not self.raw_limits[0] <= raw <= self.raw_limits[1]:
-                    raise self._outside(value, where, index)
+                    raise self._outside(value)
                 return raw
             case "float":
-                return self._float_to_raw(value, where, check=check, saturate=saturate, index=index)
+                return self._float_to_raw(value, check=check, saturate=saturate)
             case _:
-                return self._integer_to_raw(value, where, check=check, saturate=saturate, index=index)
+                return self._integer_to_raw(value, check=check, saturate=saturate)
 
     def to_physical(self, raw: Any) -> Value:
         """Convert a raw value to the physical one.
@@ -268,76 +266,76 @@ class Field(FieldKeys):
                 value = raw / self.divisor if self.divisor else raw * self.scale
                 return float(value + self.bias)
 
-    def check_raw(self, raw: Any, where: str, index: int) -> None:
+    def check_raw(self, raw: Any) -> None:
         """Raise FieldError if a received raw value is outside the limits or not finite."""
         match self.kind:
             case "float":
                 value = self.to_physical(raw)
                 if not isinstance(value, float) or not math.isfinite(value):
-                    raise FieldError(f"{where}: {value!r} is not a finite number", index=index)
-                self._check_float(value, where, index)
+                    raise FieldError(f"{value!r} is not a finite number")
+                self._check_float(value)
             case "integer" | "bits" | "flag" | "enum":
                 if self.enum is not None:
-                    self.enum.number(int(raw), where, index=index)
+                    self.enum.number(int(raw))
                 low, high = self.raw_limits
                 if not low <= raw <= high:
-                    raise self._outside(self.to_physical(raw), where, index)
+                    raise self._outside(self.to_physical(raw))
             case _:
                 pass
 
-    def _outside(self, value: object, where: str, index: int) -> FieldError:
+    def _outside(self, value: object) -> FieldError:
         low, high = self.physical_limits
-        return FieldError(f"{where}: {value!r} is outside {limits_text(low, high, self.unit)}", index=index)
+        return FieldError(f"{value!r} is outside {limits_text(low, high, self.unit)}")
 
-    def _check_float(self, value: float, where: str, index: int) -> None:
+    def _check_float(self, value: float) -> None:
         low, high = representable(*self.physical_limits, self.slot.type)
         if not low <= value <= high:
-            raise self._outside(value, where, index)
+            raise self._outside(value)
 
-    def _bytes_to_raw(self, value: Value, where: str, index: int) -> bytes:
+    def _bytes_to_raw(self, value: Value) -> bytes:
         if not isinstance(value, (bytes, bytearray)):
-            raise FieldError(f"{where}: {value!r} is not bytes", index=index)
+            raise FieldError(f"{value!r} is not bytes")
         if len(value) != self.size:
-            raise FieldError(f"{where}: {len(value)} bytes, must be {self.size}", index=index)
+            raise FieldError(f"{len(value)} bytes, must be {self.size}")
         return bytes(value)
 
-    def _text_to_raw(self, value: Value, where: str, encoding: str, index: int) -> bytes:
+    def _text_to_raw(self, value: Value, encoding: str) -> bytes:
         try:
             raw = value.encode(encoding) if isinstance(value, str) else None
         except UnicodeEncodeError:
             raw = None
         if raw is None:
-            raise FieldError(f"{where}: {value!r} is not ASCII text", index=index)
+            raise FieldError(f"{value!r} is not ASCII text")
         if len(raw) > self.size:
-            raise FieldError(f"{where}: {len(raw)} characters, at most {self.size}", index=index)
+            raise FieldError(f"{len(raw)} characters, at most {self.size}")
         return raw.ljust(self.size, b"\0")
 
-    def _named_to_raw(self, value: Value, where: str, *, check: bool, index: int) -> int:
+    def _named_to_raw(self, value: Value, *, check: bool) -> int:
         """Return the number of a flag or of a member of the enumeration."""
         if self.enum is None:
             if isinstance(value, bool) or value in (0, 1):
                 return int(value)
-            raise FieldError(f"{where}: {value!r} is not a flag (true or false)", index=index)
+            raise FieldError(f"{value!r} is not a flag (true or false)")
         low, high = self.type_limits
         if not check and type(value) is int and low <= value <= high:
             return int(value)
-        return self.enum.number(value, where, index=index)
+        return self.enum.number(value)
 
-    def _float_to_raw(self, value: Value, where: str, *, check: bool, saturate: bool, index: int) -> float:
-        number = float(number_of(value, where, index=index))
+    def _float_to_raw(self, value: Value, *, check: bool, saturate: bool) -> float:
+        number = float(number_of(value))
         if math.isfinite(number):
             if saturate:
                 low, high = self.physical_limits
                 number = min(max(number, low), high)
             elif check:
-                self._check_float(number, where, index)
+                self._check_float(number)
         raw = (number - self.bias) / self.scale if self.scaled else number
         if self.slot.type == "f32" and math.isfinite(raw) and abs(raw) > F32_MAX:
-            raise self._outside(value, where, index)
+            raise self._outside(value)
         return raw
 
-    def _integer_to_raw(self, value: Value, where: str, *, check: bool, saturate: bool, index: int) -> int:
-        number = number_of(int(value) if isinstance(value, bool) else value, where, index=index)
+    def _integer_to_raw(self, value: Value, *, check: bool, saturate: bool) -> int:
+        number = number_of(int(value) if isinstance(value, bool) else value)
         low, high = self.raw_limits
         raw: int | float = number
         if self.scaled:
@@ -347,14 +345,14 @@ class Field(FieldKeys):
         elif saturate:
             raw = low if math.isnan(raw) else min(max(raw, low), high)
         if not math.isfinite(raw):
-            raise self._outside(value, where, index)
+            raise self._outside(value)
         whole = round(raw)
         if not self.scaled and whole != raw and not saturate:
-            raise FieldError(f"{where}: {value!r} is not a whole number", index=index)
+            raise FieldError(f"{value!r} is not a whole number")
         if not check:
             low, high = self.type_limits
         if not low <= whole <= high:
-            raise self._outside(value, where, index)
+            raise self._outside(value)
         return whole
 
 
@@ -397,34 +395,18 @@ class Row(RowKeys):
         return {field.name: field for field in self.fields if field.name}
 
     @cached_property
-    def _sent(self) -> list[int]:
-        """Indices of the slots that carry values; the others are padding."""
-        return sorted({field.slot.index for field in self.named_fields.values()})
-
-    @cached_property
     def _runs(self) -> tuple[tuple[Struct, int], ...]:
-        """The layout: a packer for each run of slots of one byte order, and the number of its values."""
+        """The layout: a packer for each run of slots of one byte order, and the number of these slots."""
         runs = []
         for order, slots in groupby(self.slots, key=lambda slot: slot.order):
-            codes = [slot.code if slot.index in self._sent else f"{slot.size}x" for slot in slots]
-            runs.append((Struct(BYTE_ORDERS[order] + "".join(codes)), sum("x" not in code for code in codes)))
+            codes = [slot.code for slot in slots]
+            runs.append((Struct(BYTE_ORDERS[order] + "".join(codes)), len(codes)))
         return tuple(runs)
 
     @cached_property
-    def _bytewise(self) -> tuple[tuple[int, Slot], ...]:
-        """The slots that are packed here, each with its position among the packed values."""
-        return tuple(
-            (position, self.slots[index])
-            for position, index in enumerate(self._sent)
-            if self.slots[index].bytewise
-        )
-
-    @cached_property
-    def _values(self) -> tuple[tuple[str, Field, int], ...]:
-        """Name, field, and position of its slot among the packed values."""
-        return tuple(
-            (name, field, self._sent.index(field.slot.index)) for name, field in self.named_fields.items()
-        )
+    def _bytewise(self) -> tuple[Slot, ...]:
+        """The slots that are packed here."""
+        return tuple(slot for slot in self.slots if slot.bytewise)
 
     def encode(
         self, values: Mapping[str, Value] | None = None, *, check: bool = True, saturate: bool = False
@@ -450,18 +432,21 @@ class Row(RowKeys):
         if unknown:
             name = min(unknown)
             raise FieldError(f"{self.name}.{name}: no such field{remedy(name, self.named_fields)}")
-        raw: list[Any] = [0] * len(self._sent)
-        for index, (name, item, position) in enumerate(self._values):
-            where = f"{self.name}.{name}"
+        raw: list[Any] = [b"" if slot.type == "bytes" else 0 for slot in self.slots]
+        for index, (name, item) in enumerate(self.named_fields.items()):
             value = given.get(name)
             if value is None:
                 if self.kind == "telecommand" and item.required:
-                    raise FieldError(f"{where}: missing value", index=index)
+                    raise FieldError(f"{self.name}.{name}: missing value", index=index)
                 value = item.empty
-            packed: Any = item.to_raw(value, where, check=check, saturate=saturate, index=index)
+            try:
+                packed: Any = item.to_raw(value, check=check, saturate=saturate)
+            except FieldError as error:
+                raise FieldError(f"{self.name}.{name}: {error}", index=index) from None
+            position = item.slot.index
             raw[position] = raw[position] | packed << item.shift if item.width else packed
-        for position, slot in self._bytewise:
-            raw[position] = raw[position].to_bytes(slot.size, slot.order, signed=slot.type.startswith("i"))
+        for slot in self._bytewise:
+            raw[slot.index] = raw[slot.index].to_bytes(slot.size, slot.order, signed=slot.type[0] == "i")
         numbers = iter(raw)
         return b"".join(packer.pack(*islice(numbers, count)) for packer, count in self._runs)
 
@@ -479,25 +464,20 @@ class Row(RowKeys):
         for packer, _ in self._runs:
             raw += packer.unpack_from(data, offset)
             offset += packer.size
-        for position, slot in self._bytewise:
-            raw[position] = int.from_bytes(raw[position], slot.order, signed=slot.type.startswith("i"))
+        for slot in self._bytewise:
+            raw[slot.index] = int.from_bytes(raw[slot.index], slot.order, signed=slot.type[0] == "i")
         values: dict[str, Value] = {}
-        for index, (name, item, position) in enumerate(self._values):
-            number = raw[position]
+        for index, (name, item) in enumerate(self.named_fields.items()):
+            number = raw[item.slot.index]
             if item.width:
                 number = number >> item.shift & (1 << item.width) - 1
             if strict:
-                item.check_raw(number, f"{self.name}.{name}", index)
+                try:
+                    item.check_raw(number)
+                except FieldError as error:
+                    raise FieldError(f"{self.name}.{name}: {error}", index=index) from None
             values[name] = item.to_physical(number)
         return values
-
-    def clipped(self, values: Mapping[str, Value]) -> list[str]:
-        """Return the names of the numbers that telemetry would send as the nearest limit."""
-        return [
-            name
-            for name, item in self.named_fields.items()
-            if item.kind in ("integer", "float") and item.clips(float(values.get(name, item.empty)))
-        ]
 
     def sample(self) -> dict[str, Value]:
         """Return values that show how the row is packed: neighbouring bytes differ, flags alternate."""

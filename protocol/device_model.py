@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Final, TypeVar
 
 from pydantic import ValidationError
 
@@ -27,6 +27,7 @@ from starhil.protocol.values import EnumDefinition, IcdError, Parameter
 
 MODEL_FILE: Final = UNITS_FOLDER / "model.toml"
 
+_Declared = TypeVar("_Declared", QuantityModel, ArgumentModel)
 _NUMBER: Final = re.compile(r"\[(\d+)\]")
 
 PARAMETER: Final = "parameter."
@@ -58,11 +59,7 @@ class DeviceModel:
                 unit="*",
                 doc="A number from the profile's table [health]; default: the temperature, voltage, current or power of the model.",
             )
-        found = self.quantities.get(generic(name))
-        numbers = [int(number) for number in _NUMBER.findall(name)]
-        if found is None or any(not 1 <= number <= (found.count or 0) for number in numbers):
-            return None
-        return found
+        return _numbered(self.quantities.get(generic(name)), name)
 
     def near_quantities(self, name: str) -> str:
         """Return a hint that names similar quantities."""
@@ -70,11 +67,13 @@ class DeviceModel:
 
     def argument(self, action: ActionModel, name: str) -> ArgumentModel | None:
         """Return the declaration of an argument of an action, or None."""
-        numbers = [int(number) for number in _NUMBER.findall(name)]
-        found = next((item for item in action.arguments if item.name == generic(name)), None)
-        if found is None or any(not 1 <= number <= (found.count or 0) for number in numbers):
-            return None
-        return found
+        return _numbered(next((item for item in action.arguments if item.name == generic(name)), None), name)
+
+
+def _numbered(found: _Declared | None, name: str) -> _Declared | None:
+    """Return a declaration if it has the number in the brackets of a name."""
+    highest = 0 if found is None or found.count is None else found.count
+    return found if all(1 <= int(number) <= highest for number in _NUMBER.findall(name)) else None
 
 
 def generic(name: str) -> str:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
-from itertools import accumulate
 from typing import Final, NamedTuple
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.link_schema import HeaderBitModel, HeaderFieldModel
-from starhil.protocol.values import SCALAR_SIZES, IcdError
+from starhil.protocol.link_schema import HeaderFieldModel
+from starhil.protocol.values import IcdError
 
 WRAPPING: Final = frozenset(("ticks", "time", "sequence"))
 """Roles whose values wrap around."""
@@ -19,45 +17,6 @@ NANOSECONDS: Final = 1_000_000_000
 
 class HeaderError(ProtocolError):
     """A header that is invalid for this unit."""
-
-
-class HeaderBit(HeaderBitModel):
-    """Bits of a header field: their keys and their place."""
-
-    default: int
-    shift: int
-
-    @cached_property
-    def mask(self) -> int:
-        """Highest value."""
-        return (1 << self.width) - 1
-
-
-class HeaderField(HeaderFieldModel):
-    """One field of a header: its keys, with the defaults of the unit."""
-
-    default: int
-    order: Order
-    bits: list[HeaderBit]  # type: ignore[assignment]  # read only
-
-    @cached_property
-    def size(self) -> int:
-        """Number of bytes."""
-        return SCALAR_SIZES[self.type.replace("bits", "u")]
-
-    @cached_property
-    def signed(self) -> bool:
-        """Whether the type is signed."""
-        return self.type.startswith("i")
-
-    @property
-    def roles(self) -> tuple[str, ...]:
-        """Roles of the field and of its bits."""
-        return tuple(role for role in (self.role, *(bit.role for bit in self.bits)) if role)
-
-    def in_class(self, klass: str) -> bool:
-        """Return whether messages of a class have this field."""
-        return self.classes is None or klass in self.classes
 
 
 class Envelope(NamedTuple):
@@ -84,13 +43,15 @@ class Header:
         overhead: Mapping[str, int],
         where: str,
     ) -> None:
-        self.fields: Final = tuple(
-            _field(model, byte_order, f"{where}: {number}") for number, model in enumerate(models, 1)
-        )
+        for number, model in enumerate(models, 1):
+            _check_field(model, f"{where}: {number}")
+        self.fields: Final = tuple(models)
+        self.byte_order: Final = byte_order
+        """Byte order of the fields that have none of their own."""
         self._steps: Final = tuple(
             (
-                item.role, item.size, item.order, item.signed, item.const, item.default, item.classes,
-                tuple((bit.role, bit.shift, bit.mask, bit.const, bit.default) for bit in item.bits),
+                item.role, item.size, item.order or byte_order, item.type.startswith("i"), item.const, item.initial,
+                item.classes, tuple((bit.role, shift, bit.mask, bit.const, bit.initial) for bit, shift in item.placed_bits),
             )
             for item in self.fields
         )  # fmt: skip
@@ -106,29 +67,20 @@ class Header:
         """What a length counts: bytes of fixed parts and its offset, and how often header and data."""
         self._sizes: Final[dict[str, int]] = {}
         """Class → size of the header."""
-        self.roles: Final = frozenset(role for field in self.fields for role in field.roles)
-        """Roles that the header carries in any class of messages."""
         self.defaults: Final = {
-            role: default
-            for field in self.fields
-            for role, default in (
-                (field.role, field.default),
-                *((bit.role, bit.default) for bit in field.bits),
-            )
-            if role
+            role: part.initial for field in self.fields for role, part in field.by_role.items()
         }
         """Value of each role for messages that do not set it."""
+        self.roles: Final = frozenset(self.defaults)
+        """Roles that the header carries in any class of messages."""
         self.counts: Final = frozenset(
-            kind
-            for field in self.fields
-            for counts in (field.counts, *(bit.counts for bit in field.bits))
-            for kind in counts
+            kind for field in self.fields for part in field.by_role.values() for kind in part.counts
         )
         """Messages whose `sequence` the sender counts: `reply`, `unsolicited`."""
 
     def roles_in(self, klass: str) -> frozenset[str]:
         """Return the roles that the header carries in messages of a class."""
-        return frozenset(role for field in self.fields if field.in_class(klass) for role in field.roles)
+        return frozenset(role for field in self.fields if field.in_class(klass) for role in field.by_role)
 
     def size(self, klass: str) -> int:
         """Return the size of the header in messages of a class."""
@@ -223,7 +175,7 @@ class Header:
         return data
 
 
-def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderField:
+def _check_field(model: HeaderFieldModel, where: str) -> None:
     if bool(model.bits) != model.type.startswith("bits"):
         raise IcdError(f"{where}: types bits8, bits16 and bits32 have `bits`, the other types have none")
     if model.role in ("ticks", "time") and round(model.scale * NANOSECONDS) < 1:
@@ -235,21 +187,6 @@ def _field(model: HeaderFieldModel, byte_order: Order, where: str) -> HeaderFiel
         raise IcdError(f"{where}: only role sequence has `counts`")
     if model.offset and model.role != "length":
         raise IcdError(f"{where}: only role length has an `offset`")
-    given = {"default": _default(model), "order": model.order or byte_order}
-    field = HeaderField.model_construct(**dict(model) | given | {"bits": _bits(model.bits)})
-    width = sum(bit.width for bit in field.bits)
-    if field.bits and width != 8 * field.size:
-        raise IcdError(f"{where}: the bits add up to {width}, must be {8 * field.size}")
-    return field
-
-
-def _bits(models: Sequence[HeaderBitModel]) -> list[HeaderBit]:
-    shifts = accumulate((model.width for model in models), initial=0)
-    return [
-        HeaderBit.model_construct(**dict(model) | {"default": _default(model), "shift": shift})
-        for model, shift in zip(models, shifts, strict=False)
-    ]
-
-
-def _default(model: HeaderFieldModel | HeaderBitModel) -> int:
-    return model.const if model.const is not None else model.default or 0
+    width = sum(bit.width for bit in model.bits)
+    if model.bits and width != 8 * model.size:
+        raise IcdError(f"{where}: the bits add up to {width}, must be {8 * model.size}")

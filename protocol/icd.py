@@ -95,10 +95,6 @@ def _place(problem: Problem) -> tuple[int | str, ...]:
     return location[: 2 if isinstance(location[1 % len(location)], int) else 1]
 
 
-def _order(place: tuple[int | str, ...]) -> tuple[tuple[int, str], ...]:
-    return tuple((step, "") if isinstance(step, int) else (-1, step) for step in place)
-
-
 def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
     """Return the name of the table at a place."""
     try:
@@ -169,7 +165,8 @@ class _Reader:
                 if not said:  # later ones may be caused by what was removed
                     self.errors += [f"{file}: {problem}" for problem in found]
                 said = True
-                for place in sorted({_place(problem) for problem in found}, key=_order, reverse=True):
+                places = sorted(map(_place, found), key=lambda place: [f"{step:>9}" for step in place])
+                for place in reversed(dict.fromkeys(places)):  # from the last: the other indices stay
                     self._remove(file, document, place)
         for name, given in tables:
             listed = given if isinstance(given, list) else [] if given is None else [given]

@@ -259,7 +259,15 @@ def _of_text(model: FieldModel) -> list[FieldModel]:
     with Located(f"field {model.text!r}"):
         if model.model_fields_set != {"text"}:
             raise IcdError("`text` allows no other keys")
-        return fields_of(model.text)
+        type_, *words = model.text.split() or [""]
+        if not words:
+            raise IcdError("needs a type and a name, such as 'u16 counter'")
+        tables = _bits(words) if type_ == "bits" else _scalars(type_, *words)
+        try:
+            return [FieldModel.model_validate(table) for table in tables]
+        except ValidationError as error:
+            first = error.errors()[0]
+            raise IcdError(f"{first['loc'][-1]}: {wording(first)}") from None
 
 
 def mapped(table: Mapping[str, Scalar | list[Scalar]]) -> tuple[EnumDefinition, Mapping[str, str]]:
@@ -302,22 +310,6 @@ def _default(value: Scalar | None, enum: EnumDefinition | None) -> Scalar | None
     return name
 
 
-def fields_of(text: str) -> list[FieldModel]:
-    """Expand a text to fields.
-
-    Raises IcdError, whose text does not name row and file.
-    """
-    type_, *words = text.split() or [""]
-    if not words:
-        raise IcdError("needs a type and a name, such as 'u16 counter'")
-    tables = _bits(words) if type_ == "bits" else _scalars(type_, *words)
-    try:
-        return [FieldModel.model_validate(table) for table in tables]
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise IcdError(f"{first['loc'][-1]}: {wording(first)}") from None
-
-
 def _scalars(type_: str, name: str, *words: str) -> list[dict[str, Any]]:
     kinds = {"enum": ("enum",), "byte": ("size",), "text": ("size",)}
     keys = kinds.get(type_[:4], ("unit", "scale"))
@@ -327,7 +319,7 @@ def _scalars(type_: str, name: str, *words: str) -> list[dict[str, Any]]:
     for key, word in zip(keys, words, strict=False):
         if word != "-":
             table[key] = word if key in ("enum", "unit") else _number(key, word)
-    return [table | _named(item) for item in _names(name)]
+    return [table | {"name": item} for item in _names(name)]
 
 
 def _bits(words: list[str]) -> list[dict[str, Any]]:
@@ -341,16 +333,14 @@ def _bits(words: list[str]) -> list[dict[str, Any]]:
                 filled.append([])
                 room = 8
             if not 1 <= width <= room:
-                raise IcdError(f"{item}: {width} bits do not fit into the remaining {room} bits of the byte")
-            filled[-1].append(_named(item) | {"width": width})
+                raise IcdError(
+                    f"{item or '-'}: {width} bits do not fit into the remaining {room} bits of the byte"
+                )
+            filled[-1].append({"name": item, "width": width})
             room -= width
     if room:
         filled[-1].append({"width": room})
     return [{"type": "bits8", "bits": bits} for bits in filled]
-
-
-def _named(name: str) -> dict[str, Any]:
-    return {} if name == "-" else {"name": name}
 
 
 def _number(key: str, word: str) -> int | float:
@@ -360,14 +350,15 @@ def _number(key: str, word: str) -> int | float:
         raise IcdError(f"{key}: {word!r} is not a number") from None
 
 
-def _names(pattern: str) -> list[str]:
-    """Expand a pattern with braces to names; the last braces vary fastest."""
+def _names(pattern: str) -> list[str | None]:
+    """Expand a pattern with braces to names; the last braces vary fastest. `-` is no name."""
     parts = [
         [part] if index % 2 == 0 else _choices(part) for index, part in enumerate(_BRACES.split(pattern))
     ]
     if not 1 <= math.prod(map(len, parts)) <= MAX_NAMES:
         raise IcdError(f"{pattern}: must be 1 to {MAX_NAMES} fields")
-    return ["".join(chosen) for chosen in product(*parts)]
+    names = ("".join(chosen) for chosen in product(*parts))
+    return [None if name == "-" else name for name in names]
 
 
 def _choices(text: str) -> list[str]:

@@ -52,8 +52,8 @@ class UnitModel(DefinitionModel):
     definition runs this file."""
 
 
-class BitKeys(DefinitionModel):
-    """Keys that fields and bits have and keep."""
+class FieldKeys(DefinitionModel):
+    """Keys that a field, or a bit, keeps."""
 
     name: Name | None = None
     """Name of the field; a field without a name is sent as zeros."""
@@ -70,11 +70,6 @@ class BitKeys(DefinitionModel):
     """Value that is always sent, and required in a telecommand."""
     doc: str = ""
     """Description."""
-
-
-class FieldKeys(BitKeys):
-    """Keys that a field keeps."""
-
     unit: str = ""
     """Unit of the physical value, converted from or to the unit of the quantity or argument
     (s, ms, us, ns; rad, deg, arcmin, arcsec; rad/s, deg/s …)."""
@@ -92,7 +87,7 @@ class FieldKeys(BitKeys):
     """Provenance; default: the row's."""
 
 
-class _MappedModel(BitKeys):
+class _MappedModel(FieldKeys):
     """Keys of fields and bits that become an enumeration."""
 
     enumeration: str | None = Field(default=None, alias="enum")
@@ -101,7 +96,7 @@ class _MappedModel(BitKeys):
     """Number on the wire → value of the quantity or argument, or a list of values that share the number."""
 
 
-class BitModel(_MappedModel, FieldKeys):
+class BitModel(_MappedModel):
     """One bit or a group of bits, an unsigned number; unused and sent as zeros if it has no name."""
 
     width: Annotated[int, Field(ge=1, le=31)] = 1
@@ -119,7 +114,7 @@ class RepeatModel(DefinitionModel):
     """Number of the first repetition."""
 
 
-class FieldModel(_MappedModel, FieldKeys):
+class FieldModel(_MappedModel):
     """One field of a row; unused and sent as zeros if it has no name. A string is short for `{ text = … }`."""
 
     text: str | None = None

@@ -71,12 +71,8 @@ class HoleMap:
     def __init__(self, arrived: Iterable[int] = ()) -> None:
         self._bits = bytearray(MAP_PARTS * MAP_PART_SIZE)
         for number in arrived:
-            self.add(number)
-
-    def add(self, number: int) -> None:
-        """Mark a packet as arrived; ignore a number beyond the map."""
-        if 0 <= number < MAX_PACKETS:
-            self._bits[number // 8] |= 1 << number % 8
+            if 0 <= number < MAX_PACKETS:
+                self._bits[number // 8] |= 1 << number % 8
 
     def __contains__(self, number: int) -> bool:
         """Return whether a packet has arrived."""

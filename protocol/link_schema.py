@@ -6,13 +6,14 @@ is a list of fields by role; the checksum covers header and data unless `covers`
 
 from __future__ import annotations
 
+from itertools import accumulate
 from typing import Annotated, Final, Literal
 
 from pydantic import Field, WithJsonSchema
 
 from starhil.protocol.conventions import Order
 from starhil.protocol.messages import DEFAULT_TIMEOUT_S, RequestKind
-from starhil.protocol.values import DefinitionModel, Name
+from starhil.protocol.values import SCALAR_SIZES, DefinitionModel, Name
 
 HEX: Final = {"format": "hex"}
 """Schema of numbers that the reference pages show in hexadecimal."""
@@ -282,6 +283,16 @@ class HeaderBitModel(DefinitionModel):
     counts: list[CountedMessage] = []
     """Messages that a `sequence` numbers, beginning with 0 after a start, instead of repeating a request's number."""
 
+    @property
+    def initial(self) -> int:
+        """Value that is sent if the message sets none."""
+        return self.const if self.const is not None else self.default or 0
+
+    @property
+    def mask(self) -> int:
+        """Highest value."""
+        return (1 << self.width) - 1
+
 
 class HeaderFieldModel(DefinitionModel):
     """One field of a header.
@@ -315,6 +326,32 @@ class HeaderFieldModel(DefinitionModel):
     """Classes whose messages have the field; default: all."""
     bits: list[HeaderBitModel] = []
     """Bits, lowest first."""
+
+    @property
+    def initial(self) -> int:
+        """Value that is sent if the message sets none."""
+        return self.const if self.const is not None else self.default or 0
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return SCALAR_SIZES[self.type.replace("bits", "u")]
+
+    @property
+    def placed_bits(self) -> list[tuple[HeaderBitModel, int]]:
+        """The bits, each with its shift."""
+        shifts = accumulate((bit.width for bit in self.bits), initial=0)
+        return list(zip(self.bits, shifts, strict=False))
+
+    @property
+    def by_role(self) -> dict[str, HeaderFieldModel | HeaderBitModel]:
+        """The field and its bits by role, those without left out."""
+        parts: list[HeaderFieldModel | HeaderBitModel] = [self, *self.bits]
+        return {part.role: part for part in parts if part.role}
+
+    def in_class(self, klass: str) -> bool:
+        """Return whether messages of a class have this field."""
+        return self.classes is None or klass in self.classes
 
 
 class FormatModel(DefinitionModel):

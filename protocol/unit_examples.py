@@ -110,11 +110,6 @@ def examine(
     return definition, errors, examples
 
 
-def check_unit(name_or_folder: str | Path, *, run_plugin: bool = True) -> list[str]:
-    """Return all errors in a definition, each with file, row and field; none if the unit can be emulated."""
-    return examine(name_or_folder, run_plugin=run_plugin)[1]
-
-
 def _reply(
     icd: InterfaceDefinition, row: Row, answer: str, request: Request, values: Mapping[str, Value]
 ) -> Reply:

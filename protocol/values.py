@@ -60,7 +60,7 @@ class IcdError(ProtocolError):
 
 
 class Located:
-    """Context of a part of a definition: its name is put in front of the errors that are raised in it."""
+    """Context of a part of a definition, or of a value: its name is put in front of errors that are raised in it."""
 
     def __init__(self, where: str) -> None:
         self._where = where
@@ -69,7 +69,7 @@ class Located:
         pass
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
-        if isinstance(error, IcdError):
+        if isinstance(error, ProtocolError):
             error.args = tuple(f"{self._where}: {text}" for text in error.args)
 
 
@@ -102,7 +102,7 @@ class LengthError(MessageError):
 
 
 class FieldError(MessageError):
-    """A value outside its type, limits or enumeration; the text begins with row.field."""
+    """A value outside its type, limits or enumeration; that of a row begins with row.field."""
 
 
 class DefinitionModel(BaseModel):
@@ -147,11 +147,8 @@ class EnumDefinition(DefinitionModel):
         name = self.names.get(number)
         return number if name is None else FLAGS[name] if self.is_flag else name
 
-    def number(self, value: Value, where: str, *, index: int = 0) -> int:
-        """Return the number of a name, a flag, or a number that has a name.
-
-        Raise FieldError otherwise.
-        """
+    def number(self, value: Value) -> int:
+        """Return the number of a name, a flag, or a number that has a name; raise FieldError otherwise."""
         name = str(value).lower() if isinstance(value, bool) else value
         if isinstance(name, str):
             if name in self.values:
@@ -159,7 +156,7 @@ class EnumDefinition(DefinitionModel):
         elif isinstance(name, (int, float)) and name in self.names:
             return int(name)
         allowed = ", ".join(f"{name} ({number})" for name, number in self.values.items())
-        raise FieldError(f"{where}: {value!r} is not one of {allowed}", index=index)
+        raise FieldError(f"{value!r} is not one of {allowed}")
 
 
 def to_f32(value: float) -> float:
@@ -174,10 +171,10 @@ def representable(low: float, high: float, type_: str) -> tuple[float, float]:
     return (min(low, to_f32(low)), max(high, to_f32(high))) if type_ == "f32" else (low, high)
 
 
-def number_of(value: Value, where: str, *, index: int = 0) -> int | float:
+def number_of(value: Value) -> int | float:
     """Return the value if it is a number; raise FieldError otherwise."""
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise FieldError(f"{where}: {value!r} is not a number", index=index)
+        raise FieldError(f"{value!r} is not a number")
     return value
 
 
@@ -263,24 +260,25 @@ class Parameter(ParameterKeys):
         Numbers are accepted for Booleans (0, 1) and members of enumerations, because set_parameter sends
         numbers.
         """
-        if self.enum is not None:
-            return self.enum.names[self.enum.number(value, self.name)]
-        if self.type == "bool":
-            if isinstance(value, (bool, int, float)) and value in (0, 1):
-                return bool(value)
-            raise FieldError(f"{self.name}: {value!r} is not on or off (1 or 0)")
-        number = number_of(value, self.name)
-        if self.type in INTEGER_RANGES:
-            if not math.isfinite(number) or number != int(number):
-                raise FieldError(f"{self.name}: {number!r} is not a whole number")
-            number = int(number)
-        else:
-            number = float(number)
-        low, high = representable(self.minimum, self.maximum, self.type)
-        if not low <= number <= high:
-            limits = limits_text(self.minimum, self.maximum, self.unit)
-            raise FieldError(f"{self.name}: {number:g} is outside {limits}")
-        return number
+        with Located(self.name):
+            if self.enum is not None:
+                return self.enum.names[self.enum.number(value)]
+            if self.type == "bool":
+                if isinstance(value, (bool, int, float)) and value in (0, 1):
+                    return bool(value)
+                raise FieldError(f"{value!r} is not on or off (1 or 0)")
+            number = number_of(value)
+            if self.type in INTEGER_RANGES:
+                if not math.isfinite(number) or number != int(number):
+                    raise FieldError(f"{number!r} is not a whole number")
+                number = int(number)
+            else:
+                number = float(number)
+            low, high = representable(self.minimum, self.maximum, self.type)
+            if not low <= number <= high:
+                limits = limits_text(self.minimum, self.maximum, self.unit)
+                raise FieldError(f"{number:g} is outside {limits}")
+            return number
 
     def to_number(self, value: Value) -> float:
         """Return the checked value as the number used in set_parameter and the telemetry row `parameter`."""

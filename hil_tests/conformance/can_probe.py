@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from starhil.hil_tests.conformance.case import check
-from starhil.hil_tests.conformance.link_probe import LATE_S, LinkProbe, ProbeTimes, Settings, late
+from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
 from starhil.hil_tests.conformance.ports import CanFrame, Port
 from starhil.hil_tests.judge import can
 from starhil.hil_tests.judge.definition import Unit
@@ -16,8 +16,7 @@ from starhil.hil_tests.raw_traffic import format_frame, matches, parse_frame, pa
 class CanProbe(LinkProbe):
     """Talks to a unit over a CAN bus.
 
-    `host` and `device` are the CAN addresses of the tester and of the device; `unsolicited` has the frames of unsolicited
-    telemetry.
+    `host` and `device` are the CAN addresses of the tester and of the device.
     """
 
     link = "can"
@@ -35,7 +34,6 @@ class CanProbe(LinkProbe):
         super().__init__(bus, unit, times, settings)
         self.host = host
         self.device = device
-        self.unsolicited: list[CanFrame] = []
         self._frames: list[CanFrame] = []
 
     def post_request(self, request: Request, *, answered: bool = True) -> None:  # noqa: ARG002 -- answers name their row
@@ -80,16 +78,8 @@ class CanProbe(LinkProbe):
         self._frames.clear()
         self.unsolicited.clear()
 
-    def unexpected_answer(self, quiet_s: float) -> Answer:
-        """Return an unexpected answer."""
-        self.sleep(quiet_s)
-        return self.next_answer(0.0) if self._frames else Answer("none")
-
-    def _clear_unsolicited(self) -> None:
-        self.unsolicited.clear()
-
     def _unsolicited_answers(self) -> list[Answer]:
-        return can.unsolicited(list(self.unsolicited))
+        return can.unsolicited(self.unsolicited)
 
     def next_frame(self, timeout_s: float | None = None) -> CanFrame | None:
         """Return the next frame of the device that is not unsolicited, or None."""
@@ -100,15 +90,6 @@ class CanProbe(LinkProbe):
                 break
         return self._frames.pop(0) if self._frames else None
 
-    def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next unread answer."""
-        began = self.now()
-        frame = self.next_frame(timeout_s)
-        if frame is not None:
-            return can.read_answer(frame, self.next_frame)
-        frame = self.next_frame(LATE_S)
-        return (
-            Answer("none")
-            if frame is None
-            else late(can.read_answer(frame, self.next_frame), self.now() - began)
-        )
+    def _answer_within(self, seconds: float) -> Answer | None:
+        frame = self.next_frame(seconds)
+        return None if frame is None else can.read_answer(frame, self.next_frame)

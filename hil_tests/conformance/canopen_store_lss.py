@@ -169,6 +169,7 @@ def node_id(probe: CanopenProbe) -> None:
 
 @LSS.case("bit-timing", "configure bit timing", "CiA 305 configure bit timing")
 def bit_timing(probe: CanopenProbe) -> None:
+    """Afterwards the node is reset, which discards the bit rate; some nodes take it at a reset of communication."""
     _select(probe)
     table = {0: 1_000_000, 1: 800_000, 2: 500_000, 3: 250_000, 4: 125_000, 6: 50_000, 7: 20_000, 8: 10_000}
     rates = probe.od.device_information.allowed_baudrates
@@ -181,6 +182,8 @@ def bit_timing(probe: CanopenProbe) -> None:
         answer = _lss(probe, data)
         check(answer is not None and answer[:1] == b"\x13" and answer[1], f"refusal of {data}", answer)
     _wait(probe)
+    probe.command(RESET_NODE)
+    probe.expect_boot_up()
 
 
 @LSS.case("identify", "identify remote slave", "CiA 305 identify remote slave")

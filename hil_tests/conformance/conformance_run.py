@@ -14,12 +14,11 @@ from typing import TYPE_CHECKING, Any, Final
 from starhil.hil_tests.attitude import from_radec_roll
 from starhil.hil_tests.conformance.attitude_cases import TruthSource
 from starhil.hil_tests.conformance.can_probe import CanProbe
-from starhil.hil_tests.conformance.case import Case
+from starhil.hil_tests.conformance.case import Case, CaseFailed
 from starhil.hil_tests.conformance.link_probe import ProbeTimes
-from starhil.hil_tests.conformance.ports import live_can, live_serial
+from starhil.hil_tests.conformance.ports import LivePort
 from starhil.hil_tests.conformance.runner import (
     Outcome,
-    Verdict,
     case_of_run,
     identity_of,
     not_run,
@@ -41,6 +40,7 @@ from starhil.hil_tests.truth_log import TruthLogReader
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import DEFAULT_UNIT
 from starhil.protocol.serial_stack import chosen_dialect
+from starhil.protocol.transports import open_can, open_serial
 from starhil.protocol.values import IcdError
 
 if TYPE_CHECKING:
@@ -216,13 +216,10 @@ def _shown_on_console(
 
     def record_on_both(outcome: Outcome) -> None:
         record(outcome)
-        detail = outcome.seen
-        if outcome.status == FAILED:
-            detail = f"expected {outcome.expected}; seen {outcome.seen}"
         feed.result(
             outcome.title,
             outcome.status,
-            detail,
+            outcome.detail,
             identity=outcome.id,
             seconds=outcome.seconds,
             traffic=outcome.log if outcome.status == FAILED else (),
@@ -241,7 +238,9 @@ def _probes(
     """Open the links one after the other; yield the probe of each, and the name of its port."""
     serial, can = ports.get("serial"), ports.get("can")
     if "serial" in links and serial is not None:
-        port = stack.enter_context(live_serial(serial, request.baud or DEFAULT_BAUD, request.speed))
+        port = stack.enter_context(
+            LivePort(open_serial(serial, baud=request.baud or DEFAULT_BAUD, paced=False), request.speed)
+        )
         baud = DEFAULT_BAUD if request.start and request.baud is None else request.baud
         if baud is not None:  # the bit rate of the line does not change
             baud = round(baud / request.speed)
@@ -251,7 +250,7 @@ def _probes(
             serial,
         )
     if "can" in links and can is not None:
-        bus = stack.enter_context(live_can(can, request.speed))
+        bus = stack.enter_context(LivePort(open_can(can), request.speed))
         host, device = request.host_address, request.device_address
         settings = settings_of(unit)
         probe = CanProbe(bus, unit, host=host, device=device, times=request.times, settings=settings)
@@ -263,7 +262,7 @@ def _probes(
 def _outcome_of_early_end(error: EmulatorProcessError) -> Outcome:
     """Return the outcome for an emulator that ended early; earlier outcomes are kept."""
     case = case_of_run("emulator.end", "the emulator runs until it is ended, and ends cleanly", "starhil run")
-    return Outcome.of(case, Verdict(FAILED, "exit with status 0 on request", str(error)))
+    return Outcome.of(case, CaseFailed("exit with status 0 on request", str(error)))
 
 
 def _start_emulator(request: ConformanceRequest, stack: ExitStack) -> EmulatorProcess:
@@ -314,7 +313,7 @@ def _canopen_probe(request: ConformanceRequest, can: str, stack: ExitStack) -> C
             dictionary = import_od(str(path), node)
         except (canopen.ObjectDictionaryError, ValueError, KeyError) as error:
             raise BenchError(f"{request.eds}: not a valid EDS: {error}") from None
-    return CanopenProbe(stack.enter_context(live_can(can, request.speed)), node, dictionary, text)
+    return CanopenProbe(stack.enter_context(LivePort(open_can(can), request.speed)), node, dictionary, text)
 
 
 def _eds_text(request: ConformanceRequest) -> str:

@@ -100,6 +100,7 @@ class LinkProbe(ABC):
     """Talks to a unit over a link.
 
     `settings` are what a run restores; by default, those that can be read. The run sets `truth` if the true attitude is known.
+    `unsolicited` has the unsolicited telemetry since `drain` or `receive_unsolicited`: messages on serial, frames on CAN.
     """
 
     link: str
@@ -120,6 +121,7 @@ class LinkProbe(ABC):
         self.settings = settings or ReadableSettings()
         self.truth: TruthSource | None = None
         self.log: list[str] = []
+        self.unsolicited: list[Any] = []
         self._prepared = False
 
     @cached_property
@@ -138,28 +140,35 @@ class LinkProbe(ABC):
         """Send raw traffic, and take the answers to it, which must be these; both in the format of `case_file`."""
 
     @abstractmethod
-    def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next unread answer; unsolicited telemetry is put aside."""
+    def _answer_within(self, seconds: float) -> Answer | None:
+        """Return the next unread answer that arrives within a time; unsolicited telemetry is put aside."""
 
-    @abstractmethod
+    def next_answer(self, timeout_s: float | None = None) -> Answer:
+        """Return the next unread answer; none, which names one that comes after the time-out."""
+        began = self.now()
+        answer = self._answer_within(self.times.answer_s if timeout_s is None else timeout_s)
+        if answer is not None:
+            return answer
+        late = self._answer_within(LATE_S)
+        seconds = self.now() - began
+        return Answer("none", fault=f"late: {late} after {seconds:.1f} s; see --time-out" if late else "")
+
     def unexpected_answer(self, quiet_s: float) -> Answer:
         """Return an unexpected answer within a time."""
+        self.sleep(quiet_s)
+        return self._answer_within(0.0) or Answer("none")
 
     def receive_unsolicited(self, seconds: float, after: Callable[[], None] | None = None) -> list[Answer]:
         """Return the messages of unsolicited telemetry that arrive within a time, counted from the end of an action."""
-        self._clear_unsolicited()
+        self.unsolicited.clear()
         if after is not None:
             after()
         self.sleep(seconds)
         return self._unsolicited_answers()
 
     @abstractmethod
-    def _clear_unsolicited(self) -> None:
-        """Discard the messages of unsolicited telemetry."""
-
-    @abstractmethod
     def _unsolicited_answers(self) -> list[Answer]:
-        """Return the messages of unsolicited telemetry since they were discarded."""
+        """Return the messages in `unsolicited`."""
 
     def check_numbers(self, answers: Sequence[Answer]) -> None:
         """Fail the case unless the numbers that the unit has given successive messages are successive."""
@@ -400,11 +409,6 @@ class LinkProbe(ABC):
             self.recover()
             self.drain()
             self.settings.restore(self)
-
-
-def late(answer: Answer, seconds: float) -> Answer:
-    """Return no answer, which names the one that came after the time-out, seconds after it was awaited."""
-    return Answer("none", fault=f"late: {answer} after {seconds:.1f} s; see --time-out")
 
 
 def checked_values(row: Row, data: bytes) -> dict[str, Value]:

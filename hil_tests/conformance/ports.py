@@ -11,9 +11,9 @@ from starhil.hil_tests.errors import LinkLostError
 from starhil.hil_tests.loop_thread import LoopThread
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.errors import ProtocolError
-from starhil.protocol.transports import Transport, open_can, open_serial
+from starhil.protocol.transports import Transport
 
-__all__ = ["CanFrame", "LivePort", "Port", "live_can", "live_serial"]
+__all__ = ["CanFrame", "LivePort", "Port"]
 
 Item = TypeVar("Item")
 
@@ -86,13 +86,3 @@ class LivePort(Generic[Item]):
     async def _close_transport(self) -> None:
         await asyncio.sleep(0)
         await self._transport.close()
-
-
-def live_serial(spec: str, baud: int, speed: float = 1.0) -> LivePort[bytes]:
-    """Return the port for a serial specification, a context manager."""
-    return LivePort(open_serial(spec, baud=baud, paced=False), speed)
-
-
-def live_can(spec: str, speed: float = 1.0) -> LivePort[CanFrame]:
-    """Return the bus for a CAN specification, a context manager."""
-    return LivePort(open_can(spec), speed)

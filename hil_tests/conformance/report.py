@@ -88,7 +88,7 @@ def write_junit_report(path: Path, outcomes: Sequence[Outcome]) -> None:
             outcome.area,
             f"{outcome.id}: {outcome.title}",
             outcome.status,
-            f"expected {outcome.expected}; seen {outcome.seen}" if outcome.status == FAILED else outcome.seen,
+            outcome.detail,
             outcome.seconds,
             "\n".join([f"clause: {outcome.clause}", *outcome.log]),
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from itertools import pairwise
 from typing import Final
@@ -24,9 +24,8 @@ from starhil.hil_tests.conformance.link_probe import (
     LinkProbe,
     checked_values,
 )
-from starhil.hil_tests.conformance.parameter_cases import parameter_cases
 from starhil.hil_tests.judge.definition import Unit
-from starhil.hil_tests.judge.messages import Answer
+from starhil.hil_tests.judge.messages import Answer, Value
 from starhil.hil_tests.judge.rows import Field, Row
 
 FLOOD: Final = 200
@@ -42,6 +41,12 @@ RESTING: Final = 5
 """Number of attempts to read two rows between two measurements."""
 F32_ROUNDING: Final = 1e-6
 CLOCK_S: Final = 1_700_000_000
+OF_LINKS: Final = frozenset({
+    "can_address", "host_address", "serial_dialect", "serial_baud", "canopen_node", "unsolicited_rate", "unsolicited_selection",
+})  # fmt: skip
+"""Parameters that change how a unit is reached, or what it sends unasked: no values are tried."""
+TIGHT: Final = frozenset({"delay_time", "orbit_eccentricity"})
+"""Parameters that may only have the present value, because all others contradict the exposure, the update rate or the orbit."""
 PUBLISHED_IDS: Final = "telemetry 128 to 255, telecommands 0 to 127 (libCubeObc, CTS)"
 
 Run = Callable[[LinkProbe], None]
@@ -69,7 +74,6 @@ def row_cases(
                 yield case_in("fields", f"{row.name}.{name}.{why}", title, run, row, intrusive=True)
     yield from _agreement(unit)
     yield from _settings(unit, marks)
-    yield from parameter_cases(unit)
     yield from _unsolicited(unit)
     yield from _subscriptions(unit)
     yield case_in(
@@ -219,13 +223,29 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
         if row.action in (None, "nothing") or row.action in own:
             title = f"{row.name} is accepted"
             yield case_in("commands", row.name, title, partial(_accepted, row), row, intrusive=True)
-    for command, row, part in unit.reported_data:
+    for command, row, _ in unit.reported_data:
         if command.action in (None, "nothing"):
             title = f"{row.name} reports the bytes set by {command.name}"
-            run = partial(_read_back, command, row, part, marks)
+            run = partial(_set_and_read, command, row, {name: name for name in command.named}, marks)
             alone = sum(other is row for _, other, _ in unit.reported_data) == 1
             name = row.name if alone else f"{row.name}.{command.name}"
             yield case_in("settings", name, title, run, row, intrusive=True)
+    for command in unit.telecommands.values():
+        fields = {_quantity(item): name for name, item in command.named.items() if item.parameter is not None}
+        if command.action != "set_parameters" or not fields or OF_LINKS & {item[0] for item in fields}:
+            continue
+        for row in unit.telemetry.values():
+            places = {
+                fields[_quantity(item)]: name for name, item in row.named.items() if _quantity(item) in fields
+            }
+            if len(places) == len(fields):
+                title = f"{row.name} reports the parameters set by {command.name}"
+                run = partial(_set_and_read, command, row, places, marks)
+                yield case_in("settings", f"{row.name}.{command.name}", title, run, row, intrusive=True)
+
+
+def _quantity(item: Field) -> tuple[object, ...]:
+    return item.parameter, item.unit, item.kind, item.type, item.width, item.scale, item.bias
 
 
 def _accepted(row: Row, probe: LinkProbe) -> None:
@@ -241,16 +261,61 @@ def _accepted(row: Row, probe: LinkProbe) -> None:
                 probe.send_command(row, row.encode({name: limit}))
 
 
-def _read_back(command: Row, row: Row, part: slice, marks: bytes, probe: LinkProbe) -> None:
-    before = probe.data_of(row)[part]
-    rng = random.Random(row.id)  # noqa: S311 -- data, not a secret
-    for turn in range(3):
-        data = command.encode(
-            {name: item.any_value(marks, turn, rng) for name, item in command.named.items()}
-        )
-        probe.send_command(command, data)
-        check_equal(probe.data_of(row)[part], data, f"the bytes of {command.name}")
-    probe.send_command(command, before)
+def _set_and_read(command: Row, row: Row, places: Mapping[str, str], marks: bytes, probe: LinkProbe) -> None:
+    """Set values, and read each one that is accepted in its place in the row.
+
+    Of a telecommand without effect, all fields change at once; parameters change one after the other, and a refusal is no
+    failure, because their values may contradict each other.
+    """
+    if not probe.answers(command):
+        raise CaseSkipped(f"{command.name} is not answered")
+
+    def read() -> dict[str, Value]:
+        seen = probe.values(row)
+        return {name: seen[place] for name, place in places.items()}
+
+    before = read()
+    rng = random.Random(command.id)  # noqa: S311 -- data, not a secret
+    tried = {name: list(_tried(command.named[name], before[name], marks, rng)) for name in places}
+    if command.action == "set_parameters":
+        attempts = [
+            (f"{command.name}.{name}", [before | {name: value} for value in values], 1 if command.named[name].parameter in TIGHT else 2)
+            for name, values in tried.items()
+        ]  # fmt: skip
+    else:
+        turns = range(max(map(len, tried.values())))
+        whole = [{name: values[turn % len(values)] for name, values in tried.items()} for turn in turns]
+        attempts = [(command.name, whole, len(whole))]
+    try:
+        for what, chosen, least in attempts:
+            sent, taken = {command.encode(values) for values in chosen}, 0
+            for data in sorted(sent):
+                answer = probe.ask(command, data)
+                check(answer.kind in ("ack", "nack"), f"an answer to telecommand {command.name}", answer)
+                if answer.kind == "ack":
+                    taken += 1
+                    given = command.decode(data)
+                    wanted = {name: given[name] for name in places}
+                    check_equal(read(), wanted, f"{row.name} after {command.name}")
+            needed = min(least, len(sent))
+            check(taken >= needed, f"{needed} or more values of {what} accepted", taken)
+    finally:
+        probe.ask(command, command.encode(before))
+
+
+def _tried(item: Field, now: Value, marks: bytes, rng: random.Random) -> Iterator[Value]:
+    """Yield the present value and others within the limits: of special bytes, any, both limits, and the next ones."""
+    yield now
+    if item.kind == "flag":
+        yield not now
+    elif item.enum is not None:
+        yield from item.enum
+    else:
+        yield from (item.any_value(marks, turn, rng) for turn in range(3))
+        if item.minimum is not None and item.maximum is not None:
+            low, high = item.limits
+            step = max(1.0, abs(item.scale))
+            yield from (low, high, *(min(max(round(float(now)) + turn, low), high) for turn in (-step, step)))
 
 
 # --- unsolicited telemetry, subscriptions and floods ---

@@ -5,23 +5,18 @@ from __future__ import annotations
 import fnmatch
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
 from starhil.hil_tests.errors import BenchError, LinkLostError
 from starhil.hil_tests.results import FAILED, NOT_RUN, PASSED, SKIPPED
 from starhil.protocol.errors import ProtocolError
 
+T = TypeVar("T")
 
-@dataclass(frozen=True)
-class Verdict:
-    """Outcome of a part of a case."""
-
-    status: str
-    expected: str = ""
-    seen: str = ""
-    link_lost: bool = False
+Ending = CaseFailed | CaseSkipped | None
+"""How a case or a part of it ended; None: it passed."""
 
 
 @dataclass(frozen=True)
@@ -44,10 +39,21 @@ class Outcome:
     """Sent and received traffic, with times."""
 
     @classmethod
-    def of(cls, case: Case[Any], verdict: Verdict, seconds: float = 0.0, log: Sequence[str] = ()) -> Outcome:
+    def of(cls, case: Case[Any], ending: Ending, seconds: float = 0.0, log: Sequence[str] = ()) -> Outcome:
         """Return the outcome of a case."""
-        about = (case.id, case.area, case.title, case.clause, case.intrusive)
-        return cls(*about, verdict.status, verdict.expected, verdict.seen, seconds, tuple(log))
+        match ending:
+            case CaseFailed():
+                result = FAILED, ending.expected, ending.seen
+            case CaseSkipped():
+                result = SKIPPED, "", str(ending)
+            case _:
+                result = PASSED, "", ""
+        return cls(case.id, case.area, case.title, case.clause, case.intrusive, *result, seconds, tuple(log))
+
+    @property
+    def detail(self) -> str:
+        """What was expected and seen, or the reason, in one line; empty if the case passed."""
+        return str(CaseFailed(self.expected, self.seen)) if self.status == FAILED else self.seen
 
     def to_json(self) -> dict[str, Any]:
         """Return the outcome as JSON data, with the log only of a failed case."""
@@ -118,49 +124,39 @@ def run_case(probe: Probe, case: Case[Any]) -> Outcome:
         case.run(probe)
 
     begin = time.perf_counter()
-    verdict = _attempt(probe, run)
-    passed = verdict.status == PASSED
-    ending = _attempt(probe, lambda: probe.end(intrusive=case.intrusive, passed=passed))
-    if ending.status == FAILED and verdict.status != FAILED:
-        verdict = ending
+    _, ending = _attempt(probe, run)
+    _, after = _attempt(probe, lambda: probe.end(intrusive=case.intrusive, passed=ending is None))
+    if isinstance(after, CaseFailed) and not isinstance(ending, CaseFailed):
+        ending = after
     log = tuple(probe.log)
-    if verdict.status == FAILED and not verdict.link_lost:
+    if isinstance(ending, CaseFailed) and not isinstance(ending.__cause__, LinkLostError):
         _attempt(probe, probe.recover)
-    return Outcome.of(case, verdict, time.perf_counter() - begin, log)
+    return Outcome.of(case, ending, time.perf_counter() - begin, log)
 
 
-def _attempt(probe: Probe, act: Callable[[], None]) -> Verdict:
-    """Run a part of a case.
+def _attempt(probe: Probe, act: Callable[[], T]) -> tuple[T | None, Ending]:
+    """Run a part of a case; return its result, and how it ended.
 
     Unexpected frames, such as an empty heartbeat, appear as exceptions in the code that decodes them; they
     fail the case.
     """
     try:
-        act()
-    except CaseFailed as failure:
-        return Verdict(FAILED, failure.expected, failure.seen)
-    except CaseSkipped as reason:
-        return Verdict(SKIPPED, seen=str(reason))
+        return act(), None
+    except (CaseFailed, CaseSkipped) as ending:
+        return None, ending
     except (BenchError, ProtocolError) as error:
-        lost = isinstance(error, LinkLostError)
-        return Verdict(FAILED, "a case that can be carried out", str(error), link_lost=lost)
+        failure = CaseFailed("a case that can be carried out", str(error))
+        failure.__cause__ = error
+        return None, failure
     except (LookupError, ValueError) as error:
         last = next((line for line in reversed(probe.log) if " <- " in line), "nothing")
         seen = f"{last.partition(' <- ')[2] or last} ({type(error).__name__}: {error})"
-        return Verdict(FAILED, "an answer that can be read", seen)
-    return Verdict(PASSED)
+        return None, CaseFailed("an answer that can be read", seen)
 
 
 def identity_of(probe: Probe) -> str:
     """Return what a device reports of its identity; empty if it reports nothing."""
-    found = ""
-
-    def read() -> None:
-        nonlocal found
-        found = probe.identity()
-
-    _attempt(probe, read)
-    return found
+    return _attempt(probe, probe.identity)[0] or ""
 
 
 def run_cases(
@@ -184,15 +180,15 @@ def run_cases(
         on_outcome(outcome)
 
     def report_trouble(what: str, title: str, act: Callable[[], None]) -> None:
-        verdict = _attempt(probe, act)
-        if verdict.status == FAILED:
-            record(Outcome.of(case_of_run(f"{link}.{what}", title), verdict, log=probe.log))
+        _, ending = _attempt(probe, act)
+        if isinstance(ending, CaseFailed):
+            record(Outcome.of(case_of_run(f"{link}.{what}", title), ending, log=probe.log))
 
     if not waiting:
         return outcomes
     link = waiting[0].id.partition(".")[0]
     probe.log.clear()
-    mute = _verdict_if_silent(probe, port, booting=False)
+    mute = _failure_if_silent(probe, port, booting=False)
     intrusive = mute is None and any(item.intrusive for item in waiting)
     if intrusive:
         report_trouble("settings.found", "the settings can be read before the first case", probe.prepare)
@@ -201,7 +197,7 @@ def run_cases(
             outcome = run_case(probe, waiting.pop(0))
             record(outcome)
             if outcome.status == FAILED and waiting:
-                mute = _verdict_if_silent(probe, port, booting=intrusive)
+                mute = _failure_if_silent(probe, port, booting=intrusive)
     finally:
         if intrusive:
             probe.log.clear()
@@ -215,7 +211,7 @@ def run_cases(
 
 def not_run(item: Case[Any], reason: str) -> Outcome:
     """Return the outcome of a case that was not reached."""
-    return Outcome.of(item, Verdict(NOT_RUN, seen=f"not run: {reason}"))
+    return replace(Outcome.of(item, CaseSkipped(f"not run: {reason}")), status=NOT_RUN)
 
 
 def case_of_run(case_id: str, title: str, clause: str = "starhil conformance") -> Case[Any]:
@@ -223,17 +219,10 @@ def case_of_run(case_id: str, title: str, clause: str = "starhil conformance") -
     return Case(case_id, case_id.rpartition(".")[0], title, clause, lambda _probe: None)
 
 
-def _verdict_if_silent(probe: Probe, port: str, *, booting: bool) -> Verdict | None:
-    """Return the verdict on a device that does not answer; None if it answers or the link was lost."""
-    seen: str | None = None
-
-    def listen() -> None:
-        nonlocal seen
-        seen = probe.silence(booting=booting)
-
-    _attempt(probe, listen)
+def _failure_if_silent(probe: Probe, port: str, *, booting: bool) -> CaseFailed | None:
+    """Return the failure of a device that does not answer; None if it answers or the link was lost."""
+    seen, _ = _attempt(probe, lambda: probe.silence(booting=booting))
     if seen is None:
         return None
-    if seen == "nothing":
-        return Verdict(FAILED, "an answer to a request", f"nothing answers on {port}")
-    return Verdict(FAILED, "an answer to a request", f"no valid answer on {port}: {seen}")
+    what = f"nothing answers on {port}" if seen == "nothing" else f"no valid answer on {port}: {seen}"
+    return CaseFailed("an answer to a request", what)

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
-from starhil.hil_tests.conformance.link_probe import LATE_S, LinkProbe, ProbeTimes, Settings, late
+from starhil.hil_tests.conformance.link_probe import LinkProbe, ProbeTimes, Settings
 from starhil.hil_tests.conformance.ports import Port
 from starhil.hil_tests.judge.definition import Unit
 from starhil.hil_tests.judge.messages import Answer, Request
@@ -19,8 +19,6 @@ PAUSE: Final = 1.6
 """Silence after which a message has certainly timed out, as a multiple of the time-out."""
 GAP_S: Final = 0.05
 """Silence after which a message that has begun has no more bytes."""
-SHOWN_BYTES: Final = 48
-"""Number of bytes shown in a line of the log."""
 
 
 class SerialProbe(LinkProbe):
@@ -54,7 +52,6 @@ class SerialProbe(LinkProbe):
         self.sent = b""
         self._line_free = 0.0
         self._answers: deque[Answer] = deque()
-        self._unsolicited: list[Answer] = []
         self.numbered: list[Answer] = []
 
     # --- the line ---
@@ -68,8 +65,7 @@ class SerialProbe(LinkProbe):
         self._line_free = max(self._line_free, self.now()) + seconds
 
     def _note(self, way: str, data: bytes) -> None:
-        more = f" … ({len(data)} bytes)" if len(data) > SHOWN_BYTES else ""
-        self.log.append(f"{self.now():.4f} {way} {data[:SHOWN_BYTES].hex(' ').upper()}{more}")
+        self.log.append(f"{self.now():.4f} {way} {data.hex(' ').upper()}")
 
     def _receive(self, timeout_s: float) -> bool:
         data = self.port.receive(timeout_s)
@@ -81,7 +77,7 @@ class SerialProbe(LinkProbe):
             if answer.number is not None:
                 self.numbered.append(answer)
             if answer.kind == "unsolicited":
-                self._unsolicited.append(answer)
+                self.unsolicited.append(answer)
                 self.raw = self.raw.replace(self.line.telemetry_frame(answer.body, answer.klass), b"", 1)
             else:
                 self._answers.append(answer)
@@ -100,7 +96,7 @@ class SerialProbe(LinkProbe):
         self.raw = b""
         self.line.clear()
         self._answers.clear()
-        self._unsolicited.clear()
+        self.unsolicited.clear()
         self.numbered.clear()
 
     def sleep_past_timeout(self) -> None:
@@ -139,41 +135,25 @@ class SerialProbe(LinkProbe):
         self.send(self.line.post(request, answered=answered))
 
     def next_answer(self, timeout_s: float | None = None) -> Answer:
-        """Return the next unread answer; bytes without an end are a malformed one."""
-        began = self.now()
-        self._await_answer(self.times.answer_s if timeout_s is None else timeout_s)
-        if self._answers:
-            return self._answers.popleft()
-        if not self.line.received:
-            self._await_answer(LATE_S)
-            if self._answers:
-                return late(self._answers.popleft(), self.now() - began)
-        return self._rest()
+        """Return the next unread answer; after none, no answer is awaited any more."""
+        answer = super().next_answer(timeout_s)
+        if answer.kind == "none":
+            self.line.clear()
+        return answer
 
-    def _await_answer(self, seconds: float) -> None:
-        """Receive until there is an answer, and the message that has begun is complete."""
+    def _answer_within(self, seconds: float) -> Answer | None:
+        """Return the next answer, when a message that has begun is complete; bytes without an end are a malformed one."""
         end = self.now() + seconds
         while not self._answers and (left := end - self.now()) > 0:
             self._receive(left)
         self._complete()
-
-    def _rest(self) -> Answer:
-        """Return the bytes without an end, after which no answer is awaited any more."""
-        data = bytes(self.line.received)
-        self.line.clear()
-        return Answer("malformed", data=data) if data else Answer("none")
-
-    def unexpected_answer(self, quiet_s: float) -> Answer:
-        """Return an unexpected answer."""
-        self.sleep(quiet_s)
-        self._complete()
         if self._answers:
             return self._answers.popleft()
-        return self._rest() if self.line.received else Answer("none")
-
-    def _clear_unsolicited(self) -> None:
-        self._unsolicited.clear()
+        rest = bytes(self.line.received)
+        if rest:
+            self.line.clear()
+        return Answer("malformed", data=rest) if rest else None
 
     def _unsolicited_answers(self) -> list[Answer]:
         self._complete()
-        return list(self._unsolicited)
+        return list(self.unsolicited)

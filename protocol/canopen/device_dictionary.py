@@ -352,7 +352,7 @@ class DeviceDictionary(Dictionary):
         else:
             value = row.decode(data)[field.name]
             if isinstance(value, str | bool) and field.enum is not None:
-                value = field.enum.number(value, packed.source)
+                value = field.enum.number(value)
             if not isinstance(value, int | float):
                 raise SdoAbortError(AbortCode.GENERAL, f"{packed.source}: {value!r} is not a number")
             raw = round(value / packed.scale)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+from canopen.objectdictionary import ObjectDictionary, ODVariable
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 
@@ -70,8 +70,6 @@ class Entry:
 
 def type_size(data_type: int | None) -> int | None:
     """Return the size of a CANopen data type in bytes, or None if it varies (strings, DOMAIN)."""
-    if data_type in (datatypes.TIME_OF_DAY, datatypes.TIME_DIFFERENCE):
-        return 6
     packer = ODVariable.STRUCT_TYPES.get(data_type if data_type is not None else -1)
     return None if packer is None else packer.size
 

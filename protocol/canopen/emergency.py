@@ -94,20 +94,19 @@ class EmergencyProducer:
         if application:
             self._history.clear()
 
-    def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> bool:
-        """Report an error unless it is already active; return whether it is new.
+    def raise_error(self, code: int, bits: int, data: bytes = b"", *, key: bytes = b"") -> None:
+        """Report an error unless it is already active.
 
         `bits` are set in the error register, besides the generic one; `data` are up to 5 manufacturer-specific bytes;
         `key` distinguishes errors with the same code: a PDO number, a node ID.
         """
         if (code, key) in self._active:
-            return False
+            return
         self._active[code, key] = bits | ErrorRegister.GENERIC
         self._history.insert(0, code | int.from_bytes(data[:2].ljust(2, b"\0"), "little") << 16)
         del self._history[self._capacity :]
         self._context.report(EventKind.EMERGENCY, code, f"error 0x{code:04X} data {data.hex() or '-'}")
         self._enqueue(code, data)
-        return True
 
     def communication_error(
         self, code: EmergencyCode, data: bytes = b"", *, key: bytes = b"", active: bool = True
@@ -118,20 +117,19 @@ class EmergencyProducer:
         else:
             self.clear_error(code, key=key)
 
-    def clear_error(self, code: int, *, key: bytes = b"") -> bool:
+    def clear_error(self, code: int, *, key: bytes = b"") -> None:
         """Report a cleared error: code 0, and its code in the manufacturer-specific bytes."""
         if self._active.pop((code, key), None) is None:
-            return False
+            return
         self._context.report(EventKind.EMERGENCY, 0, f"error 0x{code:04X} gone")
         self._enqueue(EmergencyCode.RESET, code.to_bytes(2, "little"))
-        return True
 
     @property
     def next_deadline(self) -> float | None:
         """When the next waiting message may be sent."""
         return self._free_at if self._queue and self._context.communicates else None
 
-    def flush(self) -> None:
+    def tick(self) -> None:
         """Send waiting messages, as state and inhibit time allow."""
         while self._queue and self._context.communicates and self._context.now >= self._free_at:
             message = self._queue.popleft()
@@ -148,7 +146,7 @@ class EmergencyProducer:
     def _enqueue(self, code: int, data: bytes) -> None:
         fields = {"code": code, "register": self._register_bits(), "data": data[:5]}
         self._queue.append(MESSAGE.build(fields))
-        self.flush()
+        self.tick()
 
     def _read_history(self, position: int) -> bytes:
         if position >= len(self._history):

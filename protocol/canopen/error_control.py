@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
@@ -48,7 +49,7 @@ class ErrorControl:
         self._producer.writer = self._producer_changed
         self._consumers = [entry for entry in dictionary if entry.key[0] == CONSUMERS and entry.key[1] > 0]
         for entry in self._consumers:
-            entry.writer = self._checker(entry)
+            entry.writer = partial(self._consumer_changed, entry)
         self._monitors: dict[int, Monitor] = {}
         self._toggle = 0
         self._next_heartbeat: float | None = None
@@ -77,10 +78,8 @@ class ErrorControl:
 
     def receive_heartbeat(self, node_id: int, data: bytes) -> None:
         """Process an error control message of another node (heartbeat or boot-up)."""
-        if len(data) != 1:
-            return
         monitor = self._monitors.get(node_id)
-        if monitor is None:
+        if monitor is None or len(data) != 1 or node_id == self._context.node_id:
             return
         if data[0] == 0:
             self._context.report(EventKind.NODE_BOOTED, node_id)
@@ -134,24 +133,23 @@ class ErrorControl:
         if period_ms:
             self._life_deadline = None
 
+    def _consumer_changed(self, entry: Entry, data: bytes) -> None:
+        value = int.from_bytes(data, "little")
+        node_id, period_ms = _consumer(value)
+        others = [_consumer(other.number()) for other in self._consumers if other is not entry]
+        if period_ms and any(other == node_id and period for other, period in others):
+            raise SdoAbortError(AbortCode.INCOMPATIBLE, f"node {node_id} is supervised by another entry")
+        old, old_period_ms = _consumer(entry.number())
+        if old_period_ms and self._monitors.pop(old, None) is not None:
+            self._emergency.clear_error(EmergencyCode.HEARTBEAT, key=bytes([old]))
+        self._watch(value)
+
     def _watch(self, value: int) -> None:
-        node_id, period_ms = value >> 16 & 0xFF, value & 0xFFFF
+        node_id, period_ms = _consumer(value)
         if 1 <= node_id <= 127 and period_ms:
             self._monitors[node_id] = Monitor(period_ms * 1e-3)
 
-    def _unwatch(self, value: int) -> None:
-        node_id, period_ms = value >> 16 & 0xFF, value & 0xFFFF
-        if period_ms and self._monitors.pop(node_id, None) is not None:
-            self._emergency.clear_error(EmergencyCode.HEARTBEAT, key=bytes([node_id]))
 
-    def _checker(self, entry: Entry) -> Callable[[bytes], None]:
-        def changed(data: bytes) -> None:
-            value = int.from_bytes(data, "little")
-            node_id = value >> 16 & 0xFF
-            others = [other.number() for other in self._consumers if other is not entry]
-            if value & 0xFFFF and any(other >> 16 & 0xFF == node_id and other & 0xFFFF for other in others):
-                raise SdoAbortError(AbortCode.INCOMPATIBLE, f"node {node_id} is supervised by another entry")
-            self._unwatch(entry.number())
-            self._watch(value)
-
-        return changed
+def _consumer(value: int) -> tuple[int, int]:
+    """Return node ID and period, ms, of an entry of 1016h."""
+    return value >> 16 & 0xFF, value & 0xFFFF

@@ -8,7 +8,8 @@ from typing import Final
 
 from starhil.protocol.canopen.cob import LSS_SLAVE
 from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind
-from starhil.protocol.errors import ProtocolError
+from starhil.protocol.canopen.storage import StorageError
+from starhil.protocol.canopen.store import ParameterStore
 
 LENGTH: Final = 8
 IDENTITY: Final = 0x1018
@@ -23,6 +24,8 @@ BIT_RATES: Final = {
     8: 10_000,
 }
 """Standard bit timing table: index → bit/s."""
+DEFAULT_BIT_RATE: Final = 1_000_000
+"""Bit rate, bit/s, if LSS has stored none."""
 
 OK: Final = 0
 OUT_OF_RANGE: Final = 1
@@ -55,30 +58,35 @@ class Command(IntEnum):
 class LssSlave:
     """Answers the LSS master, which may set the allowed bit rates, bit/s.
 
-    `store` saves node ID and bit rate, and raises `ProtocolError` if that fails. `on_node_id` and `on_bit_rate` are
-    called with a node ID, or a bit rate and a delay in s, that the node must change to.
+    Node ID and bit rate are pending until the next reset of communication or the command to activate the bit rate; until
+    they are stored, a reset of the node discards them.
+
+    `on_node_id` is called with the ID of a node that had none.
     """
 
     def __init__(
         self,
         context: Context,
+        store: ParameterStore,
         on_node_id: Callable[[int], None],
-        on_bit_rate: Callable[[int, float], None],
-        store: Callable[[int, int], None],
-        bit_rate: int,
-        allowed_bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
+        allowed_bit_rates: frozenset[int],
     ) -> None:
         self._context = context
-        self._on_node_id = on_node_id
-        self._on_bit_rate = on_bit_rate
         self._store = store
+        self._on_node_id = on_node_id
         self._allowed = allowed_bit_rates
-        self.pending_node_id = context.node_id
-        self.pending_bit_rate = bit_rate
+        self._silence: tuple[float, float] | None = None
+        """When the bit rate is switched, and when the node may send again."""
         self.configuring = False
         self._matched = dict.fromkeys((SWITCH_SELECTIVE, IDENTIFY), 0)
         """Number of frames in order that matched."""
         self._scan_position = 0
+        self.restart(context.node_id)
+
+    def restart(self, node_id: int) -> None:
+        """Start with what is stored, or with this node ID and the default bit rate; discard what is only configured."""
+        self.pending_node_id, self.bit_rate = self._store.load_lss() or (node_id, DEFAULT_BIT_RATE)
+        self.pending_bit_rate = self.bit_rate
 
     def receive(self, data: bytes) -> None:
         """Process a frame of the LSS master; ignore any length other than 8."""
@@ -106,6 +114,30 @@ class LssSlave:
             self._fastscan(number, data[5], data[6], data[7])
         elif self.configuring:
             self._configuration(command, data)
+
+    @property
+    def silent(self) -> bool:
+        """Whether the bit rate is being switched."""
+        return self._silence is not None
+
+    @property
+    def next_deadline(self) -> float | None:
+        """When the bit rate is switched or the silence ends; None unless the node is silent."""
+        if self._silence is None:
+            return None
+        switch, end = self._silence
+        return switch if self._context.now < switch else end
+
+    def tick(self) -> None:
+        """Switch the bit rate, and end the silence."""
+        if self._silence is None:
+            return
+        switch, end = self._silence
+        if self._context.now >= switch and self.bit_rate != self.pending_bit_rate:
+            self.bit_rate = self.pending_bit_rate
+            self._context.report(EventKind.BIT_RATE, self.bit_rate)
+        if self._context.now >= end:
+            self._silence = None
 
     @property
     def _unconfigured(self) -> bool:
@@ -171,12 +203,13 @@ class LssSlave:
                 self.pending_bit_rate = bit_rate
             self._send(command, bytes([OK if valid else OUT_OF_RANGE]))
         elif command == Command.ACTIVATE_BIT_TIMING:
-            self._on_bit_rate(self.pending_bit_rate, int.from_bytes(data[1:3], "little") * 1e-3)
+            delay_s = int.from_bytes(data[1:3], "little") * 1e-3
+            self._silence = (self._context.now + delay_s, self._context.now + 2 * delay_s)
         elif command == Command.STORE:
             result = OK
             try:
-                self._store(self.pending_node_id, self.pending_bit_rate)
-            except ProtocolError as error:
+                self._store.save_lss(self.pending_node_id, self.pending_bit_rate)
+            except StorageError as error:
                 self._context.report(EventKind.STORAGE_ERROR, detail=str(error))
                 result = STORAGE_FAILED
             self._send(command, bytes([result]))

@@ -33,7 +33,9 @@ class ReceivePdo(Pdo):
         self.next_deadline = None
 
     def receive(self, data: bytes) -> None:
-        """Process a message; report a wrong length and drop a message that is too short."""
+        """Process a message in OPERATIONAL; report a wrong length and drop a message that is too short."""
+        if self._context.state is not NmtState.OPERATIONAL:
+            return
         detail = bytes([*self._key, len(data)])
         if len(data) < self._size:
             self._error(EmergencyCode.PDO_LENGTH_HIGH, active=False)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
-from starhil.protocol.canopen.dictionary import Deferred, Dictionary
+from starhil.protocol.canopen.cob import SDO_TRANSMIT
+from starhil.protocol.canopen.context import Context, EventKind
+from starhil.protocol.canopen.dictionary import Deferred
 from starhil.protocol.canopen.sdo_transfer import Answers, Protocol, Transfer
 from starhil.protocol.errors import ProtocolError
 
@@ -28,8 +31,8 @@ INITIATE: Final = {
 class SdoServer:
     """Answers the SDO requests of one client (1200h), whose transfer is aborted after a silence of the timeout."""
 
-    def __init__(self, dictionary: Dictionary, timeout_s: float = 1.0) -> None:
-        self._dictionary = dictionary
+    def __init__(self, context: Context, timeout_s: float) -> None:
+        self._context = context
         self._timeout_s = timeout_s
         self._transfer: Transfer | None = None
         """The active transfer, also while its result is awaited."""
@@ -37,9 +40,7 @@ class SdoServer:
         """Its protocol, which has not ended."""
         self._waiting: Answers | None = None
         """Answers to send when its result is known."""
-        self.deadline: float | None = None
-        self.faults: list[str] = []
-        """Texts of unexpected errors in the application, which the node reports as events."""
+        self.next_deadline: float | None = None
 
     @property
     def busy(self) -> bool:
@@ -49,37 +50,37 @@ class SdoServer:
     def reset(self) -> None:
         """Drop the active transfer without an answer."""
         self._transfer = self._protocol = self._waiting = None
-        self.deadline = None
+        self.next_deadline = None
 
-    def finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> Answers:
-        """Answer a download whose result is known; return nothing if the client no longer waits for it."""
+    def finish(self, deferred: Deferred, refusal: SdoAbortError | None) -> None:
+        """Answer a download whose result is known, unless the client no longer waits for it."""
         transfer, answers = self._transfer, self._waiting
         if transfer is None or answers is None or transfer.deferred is not deferred:
-            return []
-        self.reset()
-        return answers if refusal is None else [self._abort(refusal.code, transfer.index, transfer.subindex)]
+            return
+        if refusal is None:
+            self.reset()
+            self._send(answers)
+        else:
+            self._abort(refusal.code, transfer.index, transfer.subindex)
 
-    def tick(self, now: float) -> Answers:
+    def tick(self) -> None:
         """Abort a transfer whose client or result has timed out."""
-        if self._transfer is None or self.deadline is None or now < self.deadline:
-            return []
-        return [self._abort(AbortCode.TIMEOUT, self._transfer.index, self._transfer.subindex)]
+        due = self.next_deadline is not None and self._context.now >= self.next_deadline
+        if due and self._transfer is not None:
+            self._abort(AbortCode.TIMEOUT, self._transfer.index, self._transfer.subindex)
 
-    def receive(self, data: bytes, now: float) -> Answers:
-        """Process the data of one CAN frame and return the data of the answers.
-
-        A length other than 8 is ignored. `now` is the current time, s.
-        """
-        if len(data) != LENGTH:
-            return []
+    def receive(self, data: bytes) -> None:
+        """Process the data of a CAN frame; ignore any length other than 8."""
+        if len(data) != LENGTH or not self._context.communicates:
+            return
         command = data[0]
         streaming = self._transfer is not None and self._transfer.streaming
         if (command >> 5 == 4 and not streaming) or command == ABORT:
             self.reset()
-            return []
+            return
         if not streaming and self._initiates_transfer(command):
             index, subindex = int.from_bytes(data[1:3], "little"), data[3]
-            self._transfer, self._waiting = Transfer(self._dictionary, index, subindex), None
+            self._transfer, self._waiting = Transfer(self._context.dictionary, index, subindex), None
             self._protocol = INITIATE[command >> 5](self._transfer, data)
             data = b""
         else:
@@ -88,15 +89,15 @@ class SdoServer:
         try:
             answers = self._proceed(command, data)
         except SdoAbortError as abort:
-            return [self._abort(abort.code, index, subindex)]
+            self._abort(abort.code, index, subindex)
+            return
         except ProtocolError as error:
-            self.faults.append(f"SDO {index:04X}h:{subindex:02X}h: {error}")
-            return [self._abort(AbortCode.GENERAL, index, subindex)]
-        if self._waiting is not None:
-            self.deadline = now + RESULT_TIMEOUT_S
-        else:
-            self.deadline = now + self._timeout_s if self.busy else None
-        return answers
+            self._context.report(EventKind.FAULT, detail=f"SDO {index:04X}h:{subindex:02X}h: {error}")
+            self._abort(AbortCode.GENERAL, index, subindex)
+            return
+        patience_s = self._timeout_s if self._waiting is None else RESULT_TIMEOUT_S
+        self.next_deadline = self._context.now + patience_s if self.busy else None
+        self._send(answers)
 
     @staticmethod
     def _initiates_transfer(command: int) -> bool:
@@ -119,6 +120,10 @@ class SdoServer:
         self._waiting = answers
         return []
 
-    def _abort(self, code: int, index: int, subindex: int) -> bytes:
+    def _abort(self, code: int, index: int, subindex: int) -> None:
         self.reset()
-        return bytes([ABORT]) + index.to_bytes(2, "little") + bytes([subindex]) + code.to_bytes(4, "little")
+        self._send([struct.pack("<BHBI", ABORT, index, subindex, code)])
+
+    def _send(self, answers: Answers) -> None:
+        for data in answers:
+            self._context.send(SDO_TRANSMIT + self._context.node_id, data)

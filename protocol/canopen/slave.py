@@ -12,16 +12,15 @@ from typing import Final
 
 from starhil.protocol.can_framing import CanFrame
 from starhil.protocol.canopen.abort import SdoAbortError
-from starhil.protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE, SDO_TRANSMIT
+from starhil.protocol.canopen.cob import ERROR_CONTROL, LSS_MASTER, NMT, SDO_RECEIVE
 from starhil.protocol.canopen.context import UNCONFIGURED, Context, EventKind, NmtState, SlaveEvent
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary
 from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.canopen.emergency import EmergencyProducer
 from starhil.protocol.canopen.error_control import ErrorControl
 from starhil.protocol.canopen.lss import BIT_RATES, LssSlave
-from starhil.protocol.canopen.pdo import PdoService, ReceivePdo
+from starhil.protocol.canopen.pdo import PdoService
 from starhil.protocol.canopen.sdo import SdoServer
-from starhil.protocol.canopen.sdo_transfer import Answers
 from starhil.protocol.canopen.storage import APPLICATION, COMMUNICATION, ParameterStorage
 from starhil.protocol.canopen.store import ApplicationStore, ParameterStore
 from starhil.protocol.canopen.sync import SyncService
@@ -49,8 +48,6 @@ class CanopenSlave:
         Object dictionary with at least the communication profile of `communication.add_communication`.
     node_id
         1 to 127, or 255 for a node that waits for LSS; a node ID stored by LSS takes precedence.
-    bit_rate
-        Current bit rate, bit/s; a bit rate stored by LSS takes precedence.
     storage
         Storage of the parameters; the default keeps them only until a restart.
     sdo_timeout_s
@@ -71,7 +68,6 @@ class CanopenSlave:
         dictionary: Dictionary,
         node_id: int,
         *,
-        bit_rate: int = 1_000_000,
         storage: ParameterStorage | None = None,
         sdo_timeout_s: float = 1.0,
         bit_rates: frozenset[int] = frozenset(BIT_RATES.values()),
@@ -86,28 +82,18 @@ class CanopenSlave:
         self.store = ParameterStore(
             context, ParameterStorage() if storage is None else storage, on_save, on_restore
         )
-        stored = self.store.load_lss()
-        if stored is not None:
-            context.node_id, bit_rate = stored
-        self.bit_rate = bit_rate
-        self.lss = LssSlave(
-            context,
-            self._activate_node_id,
-            self._activate_bit_rate,
-            self.store.save_lss,
-            bit_rate,
-            bit_rates,
-        )
+        self._default_node_id = node_id
+        self.lss = LssSlave(context, self.store, self._activate_node_id, bit_rates)
+        context.node_id = self.lss.pending_node_id
         self.emergency = EmergencyProducer(context)
-        self.sdo = SdoServer(dictionary, sdo_timeout_s)
-        self.sync = SyncService(context, self.emergency)
+        self.sdo = SdoServer(context, sdo_timeout_s)
+        self.pdos = PdoService(context, self.emergency)
+        self.sync = SyncService(context, self.emergency, self.pdos.synchronise)
         self.time = TimeConsumer(context)
         self.error_control = ErrorControl(context, self.emergency, self._on_communication_error)
-        self.pdos = PdoService(context, self.emergency)
+        self._timed = (self.sdo, self.error_control, self.sync, self.pdos, self.emergency)
         self._on_reset = on_reset
         self._clock_offset_us = 0
-        self._silence: tuple[float, float] | None = None
-        self._pending_bit_rate = bit_rate
         self._routes: dict[int, list[Handler]] = {}
         self._bind()
 
@@ -134,7 +120,7 @@ class CanopenSlave:
         if frame.extended or frame.remote is not guarding or not (guarding or handlers):
             return []
         self._begin_instant(now)
-        if self._silence is None:
+        if not self.lss.silent:
             if guarding:
                 self.error_control.receive_guarding()
             for handler in tuple(handlers):
@@ -144,30 +130,16 @@ class CanopenSlave:
     def tick(self, now: float) -> list[CanFrame]:
         """Act on the timers that have expired."""
         self._begin_instant(now)
-        if self._context.state is not NmtState.INITIALISING and self._silence is None:
-            self._answer_sdo(self.sdo.tick(now))
-            self.error_control.tick()
-            counter = self.sync.tick()
-            if counter is not None:
-                self.pdos.synchronise(counter)
-            self.pdos.tick()
-            self.emergency.flush()
+        if self._context.state is not NmtState.INITIALISING and not self.lss.silent:
+            for service in self._timed:
+                service.tick()
         return self._collect_frames()
 
     def next_deadline(self) -> float | None:
         """Return the time at which `tick` must be called, on the caller's clock; None if nothing is due."""
-        if self._silence is not None:
-            return self._silence[0] if self._context.now < self._silence[0] else self._silence[1]
-        if self._context.state is NmtState.INITIALISING:
-            return None
-        times = (
-            self.sdo.deadline,
-            self.error_control.next_deadline,
-            self.sync.next_deadline,
-            self.pdos.next_deadline,
-            self.emergency.next_deadline,
-        )
-        return min((time for time in times if time is not None), default=None)
+        if self.lss.silent or self._context.state is NmtState.INITIALISING:
+            return self.lss.next_deadline
+        return min((time for item in self._timed if (time := item.next_deadline) is not None), default=None)
 
     def notify(self, keys: frozenset[tuple[int, int]] | set[tuple[int, int]], now: float) -> list[CanFrame]:
         """Report new values of objects: event-driven TPDOs are sent, acyclic ones wait for SYNC."""
@@ -181,7 +153,7 @@ class CanopenSlave:
     ) -> list[CanFrame]:
         """Report the result of a deferred write: success, or a refusal."""
         self._begin_instant(now)
-        self._answer_sdo(self.sdo.finish(deferred, refusal))
+        self.sdo.finish(deferred, refusal)
         return self._collect_frames()
 
     def raise_emergency(
@@ -204,7 +176,7 @@ class CanopenSlave:
         A `node_id` applies from now on, unless LSS has stored one.
         """
         self._begin_instant(now)
-        self._prepare_node_id(node_id)
+        self._default_node_id = node_id or self._default_node_id
         self._initialise(application=True)
         return self._collect_frames()
 
@@ -217,12 +189,6 @@ class CanopenSlave:
         """Leave the unconfigured state (LSS)."""
         self._context.node_id = node_id
         self._initialise(application=False)
-
-    def _activate_bit_rate(self, bit_rate: int, delay_s: float) -> None:
-        """Stop sending, switch the bit rate after `delay_s`, and resume after another `delay_s` (LSS)."""
-        now = self._context.now
-        self._pending_bit_rate = bit_rate
-        self._silence = (now + delay_s, now + 2 * delay_s)
 
     def _bind(self) -> None:
         clock = self.dictionary.find(*HIGH_RESOLUTION)
@@ -240,7 +206,7 @@ class CanopenSlave:
 
     def _begin_instant(self, now: float) -> None:
         self._context.now = now
-        self._end_silence()
+        self.lss.tick()
         self.dictionary.new_instant()
 
     def _collect_frames(self) -> list[CanFrame]:
@@ -253,21 +219,8 @@ class CanopenSlave:
             self.pdos.trigger(changed)
             self.pdos.tick()
             self._route()
-        for fault in self.sdo.faults:
-            context.report(EventKind.FAULT, detail=fault)
-        self.sdo.faults.clear()
         frames, context.frames = context.frames, []
-        return frames if self._silence is None else []
-
-    def _end_silence(self) -> None:
-        if self._silence is None:
-            return
-        switch, end = self._silence
-        if self._context.now >= switch and self.bit_rate != self._pending_bit_rate:
-            self.bit_rate = self._pending_bit_rate
-            self._context.report(EventKind.BIT_RATE, self.bit_rate)
-        if self._context.now >= end:
-            self._silence = None
+        return [] if self.lss.silent else frames
 
     def _route(self) -> None:
         """Assign a handler of data to each CAN ID; all services except LSS need a node ID."""
@@ -276,19 +229,18 @@ class CanopenSlave:
             return
         handlers: list[tuple[int | None, Handler]] = [
             (NMT, self._on_nmt),
-            (self.sync.can_id, self._on_sync),
+            (self.sync.can_id, self.sync.receive),
             (self.time.can_id, self.time.receive),
-            (SDO_RECEIVE + self.node_id, self._on_sdo),
-            *((ERROR_CONTROL + other, partial(self._on_heartbeat, other)) for other in range(1, 128)),
-            *((pdo.can_id, partial(self._on_pdo, pdo)) for pdo in self.pdos.receiving if pdo.exists),
+            (SDO_RECEIVE + self.node_id, self.sdo.receive),
+            *(
+                (ERROR_CONTROL + other, partial(self.error_control.receive_heartbeat, other))
+                for other in range(1, 128)
+            ),
+            *((pdo.can_id, pdo.receive) for pdo in self.pdos.receiving if pdo.exists),
         ]
         for can_id, handler in handlers:
             if can_id is not None:
                 self._routes.setdefault(can_id, []).append(handler)
-
-    def _on_pdo(self, pdo: ReceivePdo, data: bytes) -> None:
-        if self.state is NmtState.OPERATIONAL:
-            pdo.receive(data)
 
     def _on_nmt(self, data: bytes) -> None:
         if len(data) != 2 or data[1] not in {0, self.node_id}:
@@ -298,23 +250,6 @@ class CanopenSlave:
             self._enter(STATE_COMMANDS[command])
         elif command in {RESET_NODE, RESET_COMMUNICATION}:
             self._reset(application=command == RESET_NODE)
-
-    def _on_sdo(self, data: bytes) -> None:
-        if self._context.communicates:
-            self._answer_sdo(self.sdo.receive(data, self._context.now))
-
-    def _answer_sdo(self, answers: Answers) -> None:
-        for data in answers:
-            self._context.send(SDO_TRANSMIT + self.node_id, data)
-
-    def _on_sync(self, data: bytes) -> None:
-        counter = self.sync.receive(data)
-        if counter is not None:
-            self.pdos.synchronise(counter)
-
-    def _on_heartbeat(self, node_id: int, data: bytes) -> None:
-        if node_id != self.node_id and self.state is not NmtState.INITIALISING:
-            self.error_control.receive_heartbeat(node_id, data)
 
     def _on_communication_error(self) -> None:
         behaviour = self.dictionary.find(*ERROR_BEHAVIOUR).number()
@@ -336,7 +271,7 @@ class CanopenSlave:
             self.sdo.reset()
         elif old is NmtState.STOPPED:
             self.sync.restart_counter()
-            self.emergency.flush()
+            self.emergency.tick()
         if state is NmtState.OPERATIONAL:
             self.pdos.start()
             self.pdos.tick()
@@ -345,17 +280,15 @@ class CanopenSlave:
         kind = EventKind.RESET_NODE if application else EventKind.RESET_COMMUNICATION
         self._context.report(kind)
         if application and self._on_reset is not None:
-            self._prepare_node_id(self._on_reset())
+            self._default_node_id = self._on_reset() or self._default_node_id
         self._initialise(application=application)
-
-    def _prepare_node_id(self, node_id: int | None) -> None:
-        if node_id is not None and self.store.load_lss() is None:
-            self.lss.pending_node_id = node_id
 
     def _initialise(self, *, application: bool) -> None:
         """Load the stored parameters, send the boot-up message, enter PRE-OPERATIONAL."""
         context = self._context
         context.state = NmtState.INITIALISING
+        if application:
+            self.lss.restart(self._default_node_id)
         context.node_id = self.lss.pending_node_id
         self.lss.configuring = False
         self.sdo.reset()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Final
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
@@ -16,11 +17,17 @@ LARGEST_OVERFLOW: Final = 240
 
 
 class SyncService:
-    """Validates SYNC messages, and produces them if bit 30 of 1005h is set."""
+    """Validates SYNC messages, and produces them if bit 30 of 1005h is set.
 
-    def __init__(self, context: Context, emergency: EmergencyProducer) -> None:
+    `on_sync` is called with the counter of each SYNC, 0 if it carries none.
+    """
+
+    def __init__(
+        self, context: Context, emergency: EmergencyProducer, on_sync: Callable[[int], None]
+    ) -> None:
         self._context = context
         self._emergency = emergency
+        self._on_sync = on_sync
         find = context.dictionary.find
         self._cob_id, self._period, self._overflow = find(*COB_ID), find(*PERIOD), find(*OVERFLOW)
         self._cob_id.writer = self._check_cob_id
@@ -41,33 +48,29 @@ class SyncService:
         self._counter = 0
         self._schedule(self._cob_id.number(), self._period.number())
 
-    def receive(self, data: bytes) -> int | None:
-        """Return the counter of a valid SYNC (0 if it carries none), or None.
-
-        Report a wrong length.
-        """
+    def receive(self, data: bytes) -> None:
+        """Act on a SYNC; report a wrong length."""
         if not self._context.communicates:
-            return None
+            return
         wrong = len(data) != (1 if self._overflow.number() else 0)
         self._emergency.communication_error(EmergencyCode.SYNC_LENGTH, bytes([len(data)]), active=wrong)
-        if wrong:
-            return None
-        return data[0] if data else 0
+        if not wrong:
+            self._on_sync(data[0] if data else 0)
 
-    def tick(self) -> int | None:
-        """Produce a SYNC if one is due; return its counter, because the node must act on it too."""
+    def tick(self) -> None:
+        """Produce a SYNC if one is due, and act on it too."""
         now, deadline = self._context.now, self.next_deadline
         if deadline is None or now < deadline:
-            return None
+            return
         period = self._period.number() * 1e-6
         self.next_deadline = max(deadline + period, now)
         if not self._context.communicates:
-            return None
+            return
         overflow = self._overflow.number()
         if overflow:
             self._counter = self._counter % overflow + 1
         self._context.send(self.can_id, bytes([self._counter]) if overflow else b"")
-        return self._counter if overflow else 0
+        self._on_sync(self._counter if overflow else 0)
 
     def restart_counter(self) -> None:
         """Restart the counter at 1, as after leaving STOPPED."""

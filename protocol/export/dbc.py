@@ -8,7 +8,6 @@ have been joined, as is usual in DBC files for transport protocols.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from starhil.protocol.can_framing import (
@@ -47,8 +46,7 @@ class _Signal(NamedTuple):
     unit: str = ""
 
 
-@dataclass(frozen=True)
-class _Message:
+class _Message(NamedTuple):
     """One message of the database."""
 
     can_id: int
@@ -59,11 +57,6 @@ class _Message:
     fields: tuple[Field, ...]
     doc: str
 
-    @property
-    def signals(self) -> list[_Signal]:
-        """The signals of the fields."""
-        return [signal for field in self.fields for signal in _signals(field)]
-
 
 def render(icd: InterfaceDefinition) -> str:
     """Return the text of the database. Raises IcdError for a unit without a CAN link."""
@@ -72,7 +65,7 @@ def render(icd: InterfaceDefinition) -> str:
     host = int(icd.device_parameters["host_address"].default)
     device = int(icd.device_parameters["can_address"].default)
     messages = [message for row in icd.rows for message in _messages(row, icd, host, device)]
-    return fill("dbc.j2", icd=icd, messages=messages, number=number, string=dbc_string)
+    return fill("dbc.j2", icd=icd, messages=messages, signals=_signals, number=number, string=dbc_string)
 
 
 def _messages(row: Row, icd: InterfaceDefinition, host: int, device: int) -> Iterator[_Message]:

@@ -104,10 +104,8 @@ def _has_error_codes(icd: InterfaceDefinition) -> bool:
     serial = icd.link.serial
     if serial is None:
         return icd.link.can is not None
-    roles = {
-        role for field in serial.reply_header for role in (field.role, *(bit.role for bit in field.bits))
-    }
-    return isinstance(serial.framing, CubeSpaceFraming) or "status" in roles
+    has_status = any("status" in field.by_role for field in serial.reply_header)
+    return has_status or isinstance(serial.framing, CubeSpaceFraming)
 
 
 def _errors(icd: InterfaceDefinition) -> Section:
@@ -168,15 +166,13 @@ def _setting(value: object) -> str:
 def _header_cells(field: HeaderFieldModel, order: Order) -> Iterator[tuple[str, str, str, str]]:
     only = f"; in {', '.join(field.classes)}" if field.classes else ""
     type_ = field.type if field.type.endswith("8") else f"{field.type}, {field.order or order}-endian"
-    bits = 0
-    for bit in field.bits:
+    for bit, shift in field.placed_bits:
         yield (
             bit.role or "constant",
-            f"{type_}, bits {bits} to {bits + bit.width - 1}",
+            f"{type_}, bits {shift} to {shift + bit.width - 1}",
             _fixed_value(bit.const, bit.default),
             _counter(bit.counts) or texts_of("role").get(bit.role or "", ""),
         )
-        bits += bit.width
     if not field.bits:
         meaning = texts_of("role").get(field.role or "", "")
         if field.role == "length":

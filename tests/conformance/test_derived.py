@@ -276,6 +276,14 @@ def test_a_late_answer_with_a_sequence_number_is_named_as_late(tmp_path):
     )
 
 
+def test_the_log_has_every_byte_of_a_long_message():
+    case = next(item for item in serial_suite(read_unit("cubestar")) if item.id == "serial.framing.longest")
+    with SimulatedUnit("serial") as simulated:
+        (sent, *_) = run_case(simulated.probe, case).log
+    message = sent.split(" -> ")[1].split()
+    assert (message[:2], message[3:]) == (["1F", "7F"], [*["00"] * 511, "1F", "FF"])
+
+
 def test_a_pause_begins_when_the_line_is_free(tmp_path):
     """At 9600 bits a second, 960 bytes take a second."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -10,7 +11,7 @@ from rich.console import Console
 from starhil.hil_tests.conformance.case import Case, CaseFailed, CaseSkipped
 from starhil.hil_tests.conformance.conformance_run import ConformanceRequest, all_cases
 from starhil.hil_tests.conformance.report import print_outcome, print_summary
-from starhil.hil_tests.conformance.runner import Outcome, Verdict, run_case, run_cases, select_cases
+from starhil.hil_tests.conformance.runner import Outcome, not_run, run_case, run_cases, select_cases
 from starhil.hil_tests.errors import BenchError
 
 
@@ -133,15 +134,10 @@ def test_a_device_that_does_not_answer_ends_the_run(seen, text):
 
 
 OUTCOMES = [
-    Outcome.of(CASES[number], verdict, 0.25)
-    for number, verdict in enumerate(
-        (
-            Verdict("passed"),
-            Verdict("failed", "an answer", "no\x1banswer"),
-            Verdict("skipped", seen="no such row"),
-            Verdict("not run", seen="not run: x"),
-        )
-    )
+    Outcome.of(CASES[0], None, 0.25),
+    Outcome.of(CASES[1], CaseFailed("an answer", "no\x1banswer"), 0.25),
+    Outcome.of(CASES[2], CaseSkipped("no such row"), 0.25),
+    replace(not_run(CASES[3], "x"), seconds=0.25),
 ]
 
 

@@ -14,7 +14,7 @@ from starhil.hil_tests.conformance.suites import can_suite, serial_suite
 from starhil.hil_tests.judge.definition import read_unit
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_examples import check_unit, exchanges
+from starhil.protocol.unit_examples import examine, exchanges
 from tests.conformance.links import LINKS, write_unit
 from tests.conformance.protocol_mutants import Edit, LostAimError, ProtocolMutant, read_mutants
 from tests.conformance.simulated import SimulatedUnit
@@ -49,7 +49,7 @@ def test_each_mechanism_has_at_least_five_mutants() -> None:
 def test_an_error_of_both_ends_fails_a_case(mutant: ProtocolMutant, tmp_path: Path) -> None:
     folder = unit_of(mutant.unit, tmp_path / "unit")
     with mutant.planted():
-        assert bool(check_unit(folder)) is not mutant.hidden, check_unit(folder)
+        assert bool(examine(folder)[1]) is not mutant.hidden, examine(folder)[1]
         unit = read_unit(folder)
         cases = {case.id: case for case in SUITES[mutant.link](unit)}
         failed = []

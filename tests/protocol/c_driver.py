@@ -351,7 +351,7 @@ def c_words(row: Row, values: dict[str, Value]) -> list[str]:
     for name, field in row.named_fields.items():
         value = values[name]
         if isinstance(value, str | bool) and field.enum is not None:
-            value = field.enum.number(value, name)
+            value = field.enum.number(value)
         if isinstance(value, bytes | str):
             words.append(hex_or_none(value if isinstance(value, bytes) else value.encode()))
         else:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from starhil.protocol.export import export
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_examples import check_unit
+from starhil.protocol.unit_examples import examine
 from starhil.protocol.values import IcdError, Section
 from starid.attitude import Attitude
 
@@ -128,7 +128,7 @@ def test_an_unknown_key_hides_what_it_may_cause(tmp_path):
         'unit = { name = "x", version = "1", doc = "x" }\n'
         '[[section]]\nheading = "Frames"\ncolums = 1\ncolumns = ["a", "b"]\nrows = [["1", "2"], ["3"]]\n'
     )
-    assert check_unit(tmp_path) == [
+    assert examine(tmp_path)[1] == [
         f"{tmp_path}/a.toml: section.Frames.colums: unknown key; did you mean columns?"
     ]
 
@@ -148,6 +148,6 @@ def test_errors_speak_of_lists_as_toml_does(tmp_path):
         'conventions = { axes = ["+x", "+y"] }\n'
         '[[section]]\nheading = "Frames"\ncolumns = "a"\nrows = []\n'
     )
-    axes, columns = check_unit(tmp_path)
+    axes, columns = examine(tmp_path)[1]
     assert axes.endswith("conventions.axes: must have at least 3 items, not 2")
     assert columns.endswith("section.Frames.columns: must be a list (given: 'a')")

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 from starhil.emulator.cli.app import build_app
 from starhil.protocol.icd import load_unit
-from starhil.protocol.unit_examples import check_unit
+from starhil.protocol.unit_examples import examine
 from starhil.protocol.values import IcdError
 
 HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'
@@ -177,16 +177,16 @@ def test_a_link_to_a_plugin_beside_the_definition_and_a_link_to_the_unit_are_fol
     written(folder, name="link.py")
     (folder / "link.py").symlink_to("unit.py")
     (tmp_path / "alias").symlink_to("unit")
-    assert check_unit(tmp_path / "alias") == []
+    assert examine(tmp_path / "alias")[1] == []
 
 
 def test_a_pipe_or_a_folder_as_plugin_is_rejected_at_once(tmp_path: Path) -> None:
     folder = written(tmp_path, plugin=None)
     os.mkfifo(folder / "unit.py")
-    assert "unit.py: cannot be read: not a regular file" in check_unit(folder)[0]
+    assert "unit.py: cannot be read: not a regular file" in examine(folder)[1][0]
     (folder / "unit.py").unlink()
     (folder / "unit.py").mkdir()
-    assert "unit.py: cannot be read: Is a directory" in check_unit(folder)[0]
+    assert "unit.py: cannot be read: Is a directory" in examine(folder)[1][0]
 
 
 def test_without_the_plugin_nothing_of_it_runs_and_the_rest_is_checked(tmp_path: Path) -> None:
@@ -305,7 +305,7 @@ SAID = [
 def test_all_errors_of_all_stages_are_listed_at_once(tmp_path: Path) -> None:
     for name, text in MANY.items():
         (tmp_path / name).write_text(text, encoding="utf-8")
-    found = check_unit(tmp_path)
+    found = examine(tmp_path)[1]
     assert [said for said in SAID if not any(said in text for text in found)] == []
     assert len(set(found)) == len(found)
     assert not any("\n" in text for text in found)
@@ -321,13 +321,13 @@ def test_all_errors_of_all_stages_are_listed_at_once(tmp_path: Path) -> None:
 
 def test_a_name_that_no_file_can_define_is_missing(tmp_path: Path) -> None:
     (tmp_path / "unit.toml").write_text(HEAD + ROW + 'include = ["four"]\n', encoding="utf-8")
-    assert check_unit(tmp_path) == [f"{tmp_path}/unit.toml: telemetry row: include: no row named 'four'"]
+    assert examine(tmp_path)[1] == [f"{tmp_path}/unit.toml: telemetry row: include: no row named 'four'"]
 
 
 def test_a_wrong_unit_table_hides_no_other_error(tmp_path: Path) -> None:
     text = HEAD.replace('"1"', "1") + ROW.replace('provenance = "ours"\n', "") + 'fields = ["u9 a"]\n'
     (tmp_path / "unit.toml").write_text(text, encoding="utf-8")
-    version, field = check_unit(tmp_path)
+    version, field = examine(tmp_path)[1]
     assert "unit.version: must be a text" in version
     assert "field 'u9 a': type" in field
 
@@ -335,7 +335,7 @@ def test_a_wrong_unit_table_hides_no_other_error(tmp_path: Path) -> None:
 def test_a_row_needs_no_list_of_fields(tmp_path: Path) -> None:
     row = '[[telecommand]]\nid = 1\nname = "row"\ndoc = "x"\nprovenance = "ours"\naction = "nothing"\n'
     (tmp_path / "unit.toml").write_text(HEAD + row, encoding="utf-8")
-    assert check_unit(tmp_path) == []
+    assert examine(tmp_path)[1] == []
     assert load_unit(tmp_path).telecommands["row"].size == 0
 
 
@@ -352,7 +352,7 @@ FIELDS = 'fields = [{ name = "error", type = "u8", value = "stars.matched" }]\n'
 
 def said_of(folder: Path, text: str) -> list[str]:
     (folder / "unit.toml").write_text(HEAD + text, encoding="utf-8")
-    return [line.removeprefix(f"{folder}/unit.toml: ") for line in check_unit(folder)]
+    return [line.removeprefix(f"{folder}/unit.toml: ") for line in examine(folder)[1]]
 
 
 def test_of_two_types_only_the_one_that_is_given_is_said_to_be_wrong(tmp_path: Path) -> None:

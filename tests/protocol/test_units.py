@@ -8,7 +8,7 @@ from starhil.protocol.device_model import device_model
 from starhil.protocol.icd import load_unit
 from starhil.protocol.names import SKELETON, bundled_units
 from starhil.protocol.plugin import quantity
-from starhil.protocol.unit_examples import check_unit, exchanges
+from starhil.protocol.unit_examples import examine, exchanges
 from starhil.protocol.units_of_measure import factor
 from starhil.protocol.values import FieldError, IcdError
 
@@ -203,7 +203,7 @@ def test_all_errors_are_listed(tmp_path):
         HEAD + telemetry(wrong, "one") + telecommand("", "reboot"), encoding="utf-8"
     )
     (tmp_path / "b.toml").write_text(telemetry(wrong, "two", 2), encoding="utf-8")
-    found = check_unit(tmp_path)
+    found = examine(tmp_path)[1]
     assert len(found) == 3
     assert [text for text in found if "b.toml: telemetry two: field a" in text]
     with pytest.raises(IcdError) as caught:
@@ -216,7 +216,7 @@ def test_unbound_rows_cannot_be_emulated(unit, tmp_path):
         HEAD + telemetry('{ name = "a", type = "u8" }') + telecommand("").replace('action = "nothing"\n', "")
     )
     assert icd.telemetry["row"].size == 1  # but exported and spoken by a client
-    command, row = check_unit(tmp_path)
+    command, row = examine(tmp_path)[1]
     (file,) = tmp_path.glob("*.toml")
     assert command.startswith(f"{file}: telecommand command: no `action`")
     assert row.startswith(f"{file}: telemetry row: field a: no `value`")
@@ -226,7 +226,7 @@ def test_a_row_may_send_zeros_on_purpose(unit, tmp_path):
     icd = unit(
         HEAD + telemetry('"u8 {a,b}", { name = "c", type = "u8", const = 7 }', more='unbound = "zeros"')
     )
-    assert check_unit(tmp_path) == []
+    assert examine(tmp_path)[1] == []
     assert icd.telemetry["row"].encode() == b"\0\0\7"
 
 
@@ -303,7 +303,7 @@ def test_a_quantity_outside_of_a_plugin_is_rejected():
 
 def test_the_skeleton_can_be_emulated(tmp_path):
     (tmp_path / "unit.toml").write_text(SKELETON.read_text(encoding="utf-8"), encoding="utf-8")
-    assert check_unit(tmp_path) == []
+    assert examine(tmp_path)[1] == []
     examples = list(exchanges(load_unit(tmp_path)))
     assert {item.row.name for item in examples} == {
         "set_time",
@@ -326,5 +326,5 @@ def test_every_row_of_a_foreign_unit_names_its_public_source(name):
 
 @pytest.mark.parametrize("name", bundled_units())
 def test_every_shipped_unit_can_be_emulated(name):
-    assert check_unit(name) == []
+    assert examine(name)[1] == []
     assert all(item.request for item in exchanges(load_unit(name)))

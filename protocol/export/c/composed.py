@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from starhil.protocol.checks import reversed_bits
 from starhil.protocol.conventions import Order
-from starhil.protocol.envelope import Header, HeaderField
+from starhil.protocol.envelope import Header
 from starhil.protocol.export.packets import check_one_format, row_key
 from starhil.protocol.export.templates import fill, part_of, text_of
 from starhil.protocol.link_schema import (
@@ -15,6 +15,7 @@ from starhil.protocol.link_schema import (
     DelimitedFraming,
     EscapedFraming,
     FletcherCheck,
+    HeaderFieldModel,
     SlipFraming,
     SumCheck,
     XorCheck,
@@ -126,16 +127,16 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
             return "id & 0xFFu" if coded else "id"
         return "id >> 8" if name == "class" else _number(default & mask)
 
-    def packed(field: HeaderField) -> str:
+    def packed(field: HeaderFieldModel) -> str:
         if field.bits:
             return " | ".join(
-                f"(uint64_t)({role(bit.role, bit.default)}) << {bit.shift}" for bit in field.bits
+                f"(uint64_t)({role(bit.role, bit.initial)}) << {shift}" for bit, shift in field.placed_bits
             )
         if field.role == "length":
             return "request_length(header_size(id), size)"
-        return role(field.role, field.default, (1 << 8 * field.size) - 1)
+        return role(field.role, field.initial, (1 << 8 * field.size) - 1)
 
-    def class_test(field: HeaderField, code: str) -> str:
+    def class_test(field: HeaderFieldModel, code: str) -> str:
         return " || ".join(f"({code}) == {classes[name].code or 0}u" for name in sorted(field.classes or ()))
 
     replies = []
@@ -148,7 +149,7 @@ def _headers(stack: SerialStack) -> dict[str, Any]:
         "number": _number,
         "packed": packed,
         "class_test": class_test,
-        "suffix": lambda field: _suffix(field.order),
+        "suffix": lambda field: _suffix(field.order or stack.byte_order),
         "requests": stack.requests.header,
         "replies": stack.replies.header,
         "reply_classes": replies,

@@ -89,13 +89,13 @@ def _fields(header: Header, codes: Mapping[str, int]) -> Iterator[dict[str, Any]
         yield {
             "role": field.role,
             "size": field.size,
-            "order": field.order,
+            "order": field.order or header.byte_order,
             "const": None if field.role == "address" else field.const,
-            "default": 0 if field.bits else field.default,
+            "default": 0 if field.bits else field.initial,
             "classes": None if field.classes is None else sorted(codes[name] for name in field.classes),
             "includes": sorted(field.includes) if field.role == "length" else [],
             "offset": field.offset,
-            "bits": [(bit.role, bit.mask.bit_length(), bit.default) for bit in field.bits],
+            "bits": [(bit.role, bit.width, bit.initial) for bit in field.bits],
         }
 
 

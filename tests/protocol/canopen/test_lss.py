@@ -167,7 +167,7 @@ def test_activated_bit_timing_keeps_silent_before_and_after(bench):
     assert bench.sdo("40 00 10 00") == ""
     sent = bench.advance(0.25)
     assert bench.events() == [("bit_rate", 500_000)]
-    assert bench.slave.bit_rate == 500_000
+    assert bench.slave.lss.bit_rate == 500_000
     assert min(time for time, _, _ in sent) >= start + 0.2
     assert bench.sdo("40 00 10 00") != ""
 
@@ -178,7 +178,7 @@ def test_a_frame_just_after_the_silence_is_answered_though_no_timer_has_run(benc
     assert lss(bench, "15 64 00") == []  # 100 ms
     bench.now += 0.21
     assert bench.sdo("40 00 10 00") != ""
-    assert bench.slave.bit_rate == 500_000
+    assert bench.slave.lss.bit_rate == 500_000
 
 
 def test_store_survives_the_power_cycle(new_bench):
@@ -190,7 +190,23 @@ def test_store_survives_the_power_cycle(new_bench):
     assert lss(bench, "17") == ["1700000000000000"]
     again = new_bench(storage=storage)
     assert [(frame.id, frame.data) for frame in again.slave.start(0.0)] == [(0x730, b"\0")]
-    assert again.slave.bit_rate == 250_000
+    assert again.slave.lss.bit_rate == 250_000
+
+
+@pytest.mark.parametrize(("stored", "node_id", "bit_rate"), [(False, 0x2C, 1_000_000), (True, 0x30, 250_000)])
+def test_a_reset_of_the_node_discards_what_is_not_stored(bench, stored, node_id, bit_rate):
+    lss(bench, "04 01")
+    if stored:
+        lss(bench, "11 30")
+        lss(bench, "13 00 03")
+        lss(bench, "17")
+    lss(bench, "11 21")
+    lss(bench, "13 00 02")
+    assert bench.nmt(129) == [(0x700 + node_id, b"\0")]
+    bench.node = node_id
+    lss(bench, "04 01")
+    assert lss(bench, "17") == ["1700000000000000"]
+    assert bench.slave.store.load_lss() == (node_id, bit_rate)
 
 
 def test_store_that_fails(new_bench):

@@ -374,7 +374,7 @@ def test_random_frames(new_bench, frames):
     bench.frame(0x7E5, "0400000000000000")
     bench.now += 200.0  # past any silence that an LSS command asked for
     bench.slave.tick(bench.now)
-    bench.slave.lss.pending_node_id = 0x2C
+    bench.slave.store.clear_lss()
     bench.slave.reset_node(bench.now)
     assert bench.slave.state is NmtState.PRE_OPERATIONAL
     assert bench.sdo("40 18 10 02") == "4318100252415453"
