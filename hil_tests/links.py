@@ -15,7 +15,7 @@ from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
 from starhil.protocol.messages import LinkFault, Receiver, Reply, Request
-from starhil.protocol.serial_stack import HostReceiver, build_serial_stack, chosen_dialect
+from starhil.protocol.serial_stack import HostReceiver, SerialStack, chosen_dialect
 from starhil.protocol.transports import Transport, open_can, open_serial
 
 DEFAULT_HOST_ADDRESS: Final = 1
@@ -138,7 +138,7 @@ class SerialHostLink(HostLink[bytes]):
         baud: int = DEFAULT_BAUD,
         log: WireLog | None = None,
     ) -> None:
-        self._stack = build_serial_stack(icd)
+        self._stack = SerialStack(icd)
         host = partial(self._stack.host, chosen_dialect(icd, dialect))
         super().__init__(open_serial(spec, baud=baud, paced=False), f"serial {spec}", log, host)
 

@@ -63,7 +63,7 @@ async def send_and_listen(
     client: AsyncObcClient,
     items: Sequence[bytes | CanFrame],
     listen_s: float,
-    wanted: tuple[str, ...] = (),
+    wanted: Sequence[str] = (),
     timeout_s: float | None = None,
 ) -> tuple[str, ...]:
     """Send bytes (serial) or frames (CAN), and return the answer as one text of bytes, or as frames.

@@ -29,7 +29,7 @@ from starhil.protocol.link_schema import CubeSpaceFraming, LinkModel, MessageCla
 from starhil.protocol.messages import ErrorCode, RequestKind
 from starhil.protocol.names import DEFAULT_UNIT, UNITS_FOLDER, did_you_mean, find_unit
 from starhil.protocol.plugin import Plugin, load_plugin
-from starhil.protocol.serial_stack import build_serial_stack
+from starhil.protocol.serial_stack import SerialStack
 from starhil.protocol.text_messages import words
 from starhil.protocol.user_file import read_user_text
 from starhil.protocol.validation_messages import Problem, problems
@@ -474,7 +474,7 @@ def _check_link(icd: InterfaceDefinition) -> None:
         for name in serial.framing.unanswered:
             with Located("link.serial.framing.unanswered"):
                 _find("telecommand", name, icd.telecommands)
-    stack = build_serial_stack(icd)
+    stack = SerialStack(icd)
     for row in icd.rows:
         with Located(f"{row.kind} {row.name}"):
             text_form = stack.request_formats.of(row.klass) in stack.text_formats

@@ -327,7 +327,7 @@ def identifier() -> str:
     """Options of each algorithm, as the emulator accepts them in `[identifier]`."""
     import importlib
 
-    from starhil.emulator.profile import RunConfig
+    from starhil.emulator.profile_sections import RunConfig
     from starid.interface import ALGORITHMS
 
     parts = []

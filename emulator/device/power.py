@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Final
 
 from starhil.emulator.clock import NANOSECONDS
-from starhil.emulator.profile import PowerConfig, ThermalConfig
+from starhil.emulator.profile_sections import PowerConfig, ThermalConfig
 
 MILLI: Final = 1e-3
 

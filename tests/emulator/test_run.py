@@ -14,7 +14,8 @@ from starhil.emulator.errors import EmulatorError
 from starhil.emulator.launch import RunOptions
 from starhil.emulator.pipeline.imager import WorkerImager
 from starhil.emulator.pipeline.messages import PipelineReady
-from starhil.emulator.profile import Profile, RunConfig
+from starhil.emulator.profile import Profile
+from starhil.emulator.profile_sections import RunConfig
 from starhil.emulator.run import Run
 from starhil.emulator.truth.file import read_truth_file
 from starhil.emulator.truth_log import COLUMNS
