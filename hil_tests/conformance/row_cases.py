@@ -113,7 +113,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
     title = "a telemetry request with data is refused for its length"
     yield case_in("identifiers", "telemetry-with-data", title, with_data, rule(5))
-    beyond = b"\0\0" if unit.telecommand_crc else b"\0"
+    beyond = b"\0\0" if unit.conventions.telecommand_crc else b"\0"
     for row in unit.telecommands.values():
         whole = row.encode()
         tried = {
