@@ -32,7 +32,7 @@ from starhil.emulator.truth.source import TruthStatus
 from starhil.emulator.truth_log import COLUMNS
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
 from starhil.hil_tests.private_can_bus import hub_thread, private_can_bus
-from starhil.hil_tests.raw_traffic import format_frame, parse_frame
+from starhil.hil_tests.raw_traffic import parse_frame
 from starhil.protocol.can_framing import CanFrame, MessageType
 from starhil.protocol.canopen.device_dictionary import build_dictionary
 from starhil.protocol.export import export
@@ -409,7 +409,7 @@ def exchanges(headings: set[str]) -> list[Exchange]:
         for part in block.text.split("$ cansend vcan0 ")[1:]:
             typed, *dump = part.splitlines()
             seen = [dumped(line) for line in dump]
-            assert format_frame(seen[0]) == typed, "candump shows another frame than cansend sent"
+            assert str(seen[0]) == typed, "candump shows another frame than cansend sent"
             found.append(Exchange(f"cansend vcan0 {typed}", seen[0], seen[1:]))
     return found
 
@@ -486,8 +486,8 @@ PAGES = {
 
 def assert_shown(frame: CanFrame, shown: CanFrame, typed: str) -> None:
     """Compare a frame with the one that a page shows, but for what depends on time and noise."""
-    assert (format_frame(frame).partition("#")[0], len(frame.data)) == (
-        format_frame(shown).partition("#")[0],
+    assert (str(frame).partition("#")[0], len(frame.data)) == (
+        str(shown).partition("#")[0],
         len(shown.data),
     ), typed
     assert fixed(frame) == fixed(shown), typed

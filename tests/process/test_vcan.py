@@ -16,7 +16,6 @@ import pytest
 
 from starhil.hil_tests.client import ObcClient
 from starhil.hil_tests.emulator_process import EmulatorProcess, emulator_command
-from starhil.hil_tests.raw_traffic import format_frame
 from tests.candump import parse_candump, read_candump
 from tests.process.conftest import needs_vcan0
 from tests.process.test_sessions import starhil
@@ -69,7 +68,7 @@ def dump():
 
     def _frames() -> list[str]:
         frames = [parse_candump(line)[1] for line in list(lines)]
-        return [format_frame(frame) for frame in frames if frame.extended]
+        return [str(frame) for frame in frames if frame.extended]
 
     def _seen(count: int, within_s: float = PATIENCE_S) -> list[str]:
         deadline = time.monotonic() + within_s
@@ -122,7 +121,7 @@ def test_candump_and_the_bench_log_the_same_frames(unit, dump, tmp_path):
     )
     done = starhil("session", script, "--can", "vcan0", "--log", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
-    logged = [format_frame(frame) for _, frame in read_candump(tmp_path / "can.log") if frame.extended]
+    logged = [str(frame) for _, frame in read_candump(tmp_path / "can.log") if frame.extended]
     assert len(logged) == 2 * 20 + 1 + 8
     assert dump(len(logged)) == logged
 
