@@ -69,6 +69,10 @@ class HostLink(ABC, Generic[Item]):
         """Return the answers of a row on this link; none if no reply may be awaited."""
         return row.answers
 
+    def is_from_device(self, item: Item) -> bool:  # noqa: ARG002 -- nobody else sends on a line
+        """Return whether the device has sent a received item."""
+        return True
+
     async def start(self) -> None:
         """Open the port or join the bus."""
         await self._transport.start(self._on_receive, self._on_transport_error)
@@ -177,3 +181,7 @@ class CanHostLink(HostLink[CanFrame]):
         """Send a request as frames."""
         for frame in encode_request_frames(request, self.host_address, self.device_address):
             self.send(frame)
+
+    def is_from_device(self, item: CanFrame) -> bool:
+        """Return whether the source of a frame is the device."""
+        return item.extended and item.id >> 8 & 0xFF == self.device_address

@@ -95,15 +95,6 @@ def _place(problem: Problem) -> tuple[int | str, ...]:
     return location[: 2 if isinstance(location[1 % len(location)], int) else 1]
 
 
-def _name_at(document: Any, place: tuple[int | str, ...]) -> str | None:
-    """Return the name of the table at a place."""
-    try:
-        name = document[place[0]][place[1]]["name"]
-    except (IndexError, KeyError, TypeError):
-        return None
-    return name if isinstance(name, str) else None
-
-
 class _Reader:
     """Validates the files of a definition, and puts their tables together."""
 
@@ -175,12 +166,14 @@ class _Reader:
     def _remove(self, file: Path, document: Any, place: tuple[int | str, ...]) -> None:
         """Remove what is invalid from a document, and record the names that are missing because of that."""
         *path, last = place
-        named = [name for name in (_name_at(document, place[:2]),) if name is not None]
-        self._broken |= {*named, *(name.removeprefix(SETS) for name in named)}
+        table = document[place[0]][place[1]] if len(place) > 1 else None
+        name = table.get("name") if isinstance(table, dict) else None
+        if isinstance(name, str):
+            self._broken |= {name, name.removeprefix(SETS)}
         if place[0] == CLASS or place == (UNIT,):
             self._broken.add(str(place[0]))
         if len(place) == 2 and place[0] in tuple(RequestKind):
-            self._removed.append((file, RequestKind(place[0]), document[place[0]][last]))
+            self._removed.append((file, RequestKind(place[0]), table))
         for step in path:
             document = document[step]
         del document[last]

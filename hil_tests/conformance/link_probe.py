@@ -26,10 +26,8 @@ SEQUENCE: Final = "sequence"
 
 SETTING_ACTIONS: Final = frozenset({None, "nothing", "set_parameters", "subscribe", "select_unsolicited"})
 """Actions of the device model that repeating a telecommand with the same data does not carry out again."""
-OF_LINKS: Final = frozenset({
-    "can_address", "host_address", "serial_dialect", "serial_baud", "canopen_node", "unsolicited_rate", "unsolicited_selection",
-})  # fmt: skip
-"""Parameters that change how a unit is reached, or what it sends unasked: none is set."""
+UNASKED: Final = frozenset({"unsolicited_rate", "unsolicited_selection"})
+"""Parameters that change what a unit sends unasked."""
 LONG_PAUSE_S: Final = 0.8
 """Pause after which the device has abandoned an incomplete message (after 0.5 s)."""
 LATE_S: Final = 1.0
@@ -80,7 +78,7 @@ class ReadableSettings:
         """Record the settings."""
         kept = SETTING_ACTIONS.union(probe.unit.plugin.actions if probe.unit.plugin is not None else ())
         for command, row, places in probe.unit.reported:
-            if command.action in kept and not changes_link(command):
+            if command.action in kept and not changes_link(probe.unit, command):
                 seen = probe.telemetry(row.name)
                 self._found.append((command, {name: seen[place] for name, place in places.items()}))
 
@@ -90,9 +88,10 @@ class ReadableSettings:
             probe.command(command.name, **values)
 
 
-def changes_link(command: Row) -> bool:
+def changes_link(unit: Unit, command: Row) -> bool:
     """Return whether a telecommand sets how the unit is reached, or what it sends unasked."""
-    return any(item.parameter in OF_LINKS for item in command.named.values())
+    names = {item.parameter for item in command.named.values() if item.parameter is not None}
+    return any(name in UNASKED or unit.device_parameters[name].of_link for name in names)
 
 
 def lively_row(unit: Unit, can_refuse: Callable[[str], bool]) -> Row:

@@ -112,7 +112,7 @@ def _lengths(unit: Unit) -> Iterator[Case[LinkProbe]]:
 
     title = "a telemetry request with data is refused for its length"
     yield case_in("identifiers", "telemetry-with-data", title, with_data, rule(5))
-    beyond = b"\0\0" if unit.telecommand_crc else b"\0"
+    beyond = b"\0\0" if unit.conventions.telecommand_crc else b"\0"
     for row in unit.telecommands.values():
         whole = row.encode()
         tried = {
@@ -223,7 +223,7 @@ def _settings(unit: Unit, marks: bytes) -> Iterator[Case[LinkProbe]]:
     for command, row, places in unit.reported:
         run = partial(_set_and_read, command, row, places, marks)
         name = f"{row.name}.{command.name}"
-        if command.action == "set_parameters" and not changes_link(command):
+        if command.action == "set_parameters" and not changes_link(unit, command):
             title = f"{row.name} reports the parameters set by {command.name}"
             yield case_in("settings", name, title, run, row, intrusive=True)
         elif command.action in (None, "nothing"):

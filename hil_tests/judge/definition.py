@@ -11,9 +11,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from starhil.hil_tests.judge.framings import Framing, Measure, Taken
+from starhil.hil_tests.judge.framings import Measure, Taken
 from starhil.hil_tests.judge.messages import PUBLISHED, Request, Value
 from starhil.hil_tests.judge.rows import PARAMETER, SIZES, Field, Row, single
 from starhil.protocol.definition import InterfaceDefinition
@@ -34,6 +34,8 @@ class Parameter:
     maximum: float
     default: bool | int | float | str
     enum: Mapping[str, int] | None
+    of_link: bool
+    """Whether it changes how the unit is reached."""
 
     @property
     def default_number(self) -> float:
@@ -70,8 +72,6 @@ class Unit:
         Rows that the serial line does not answer.
     errors, device_errors
         Number of each error of a request, and of each cause of the error mode, by name.
-    telecommand_crc
-        Whether a telecommand may be followed by its CRC-8.
     canopen
         Model of `[canopen]`: objects and PDOs; None if the unit has none.
     """
@@ -85,14 +85,12 @@ class Unit:
     device_parameters: Mapping[str, Parameter]
     serial: Any
     can: Any
-    byte_order: Literal["little", "big"]
-    conventions: Any = None
+    conventions: Any
     classes: tuple[Any, ...] = ()
     unanswered: frozenset[str] = frozenset()
     errors: Mapping[str, int] = field(default_factory=dict)
     device_errors: Mapping[str, int] = field(default_factory=dict)
     first_telemetry_id: int | None = None
-    telecommand_crc: bool = False
     plugin: Any = None
     canopen: Any = None
 
@@ -191,7 +189,6 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         device_parameters={item.name: _parameter(item) for item in icd.device_parameters.values()},
         serial=serial,
         can=icd.link.can,
-        byte_order=icd.conventions.byte_order,
         conventions=icd.conventions,
         classes=icd.classes,
         unanswered=frozenset(
@@ -201,7 +198,6 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
         errors=icd.errors,
         device_errors=icd.enum("device_error").values,
         first_telemetry_id=icd.first_telemetry_id,
-        telecommand_crc=icd.conventions.telecommand_crc,
         plugin=icd.plugin,
         canopen=icd.canopen,
     )
@@ -210,7 +206,9 @@ def unit_of(icd: InterfaceDefinition, folder: Path | None = None) -> Unit:
 def _parameter(item: Any) -> Parameter:
     enum = None if item.enum is None else item.enum.values
     limits = item.minimum, item.maximum
-    return Parameter(item.id, item.name, item.type, item.unit, *limits, item.default, enum)
+    return Parameter(
+        item.id, item.name, item.type, item.unit, *limits, item.default, enum, bool(item.profile_key)
+    )
 
 
 def _row(row: Any, icd: InterfaceDefinition) -> Row:
@@ -248,17 +246,7 @@ def _fields(row: Any, icd: InterfaceDefinition) -> Iterator[Field]:
         offset += size
 
 
-def plugin_check(unit: Unit, name: str) -> Any:
-    """Return a check of the unit's plugin."""
-    return unit.plugin.checks[name]
-
-
-def plugin_framing(unit: Unit) -> Framing:
-    """Return the framing of the unit's plugin."""
-    return _PluginFraming(unit)
-
-
-class _PluginFraming:
+class PluginFraming:
     """A framing of a plugin, whose own deframer finds the messages."""
 
     marks = b"\x1f\x7f\xff"

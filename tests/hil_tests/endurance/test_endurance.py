@@ -20,7 +20,7 @@ from starhil.emulator.replay import replay
 from starhil.hil_tests.endurance.attitude_judge import Motion
 from starhil.hil_tests.endurance.life import UNRECORDED, Life, make_life
 from starhil.hil_tests.endurance.oracle import Oracle
-from starhil.hil_tests.endurance.shrink import kind_of, shortened
+from starhil.hil_tests.endurance.violating_life import kind_of, shortened
 from starhil.hil_tests.judge.definition import unit_of
 from starhil.protocol.codec import Row
 from starhil.protocol.icd import load_unit
