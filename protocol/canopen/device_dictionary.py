@@ -24,7 +24,7 @@ from starhil.protocol.canopen.communication import (
 )
 from starhil.protocol.canopen.dictionary import Deferred, Dictionary, Entry, Value, encode, type_size
 from starhil.protocol.canopen.pdo_mapping import Direction, resolve_all
-from starhil.protocol.canopen_schema import CanopenModel, PackedField, PdoModel, PlacedMember, PlacedObject
+from starhil.protocol.canopen_schema import PackedField, PdoModel, PlacedMember, PlacedObject
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, representable
@@ -36,17 +36,17 @@ Named = tuple[Entry, Sequence[str]]
 
 
 class DeviceDictionary(Dictionary):
-    """Object dictionary of a device, built from its interface definition and the indices of its layout.
+    """Object dictionary of a device, built from its interface definition and the layout in it.
 
     Without an application it is only described: nothing may read or write the entries of a device. Raises IcdError for
-    a layout that does not fit the rows.
+    a definition without `[canopen]`, and for a layout that does not fit its rows.
     """
 
-    def __init__(
-        self, icd: InterfaceDefinition, layout: CanopenModel, application: Application | None = None
-    ) -> None:
+    def __init__(self, icd: InterfaceDefinition, application: Application | None = None) -> None:
+        if icd.canopen is None:
+            raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
         self.icd = icd
-        self.layout = layout
+        self.layout = layout = icd.canopen
         self.application = cast("Application", application)
         self.sources: dict[str, set[Key]] = {}
         """Telemetry row → keys of the entries that contain it."""
@@ -361,16 +361,6 @@ class DeviceDictionary(Dictionary):
             raw &= (1 << bits) - 1
         low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if packed.type[0] == "i" else (0, (1 << bits) - 1)
         return min(max(raw, low), high)
-
-
-def build_dictionary(icd: InterfaceDefinition, application: Application | None = None) -> DeviceDictionary:
-    """Build the object dictionary of the device that serves a definition, with the definition's layout.
-
-    Raises IcdError for a definition without `[canopen]`, and for a layout that does not fit its rows.
-    """
-    if icd.canopen is None:
-        raise IcdError(f"unit {icd.name}: has no CANopen node: its definition lacks the table [canopen]")
-    return DeviceDictionary(icd, icd.canopen, application)
 
 
 def _slots(row: Row) -> list[tuple[Slot, list[Field]]]:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from starhil.protocol.canopen.abort import AbortCode, SdoAbortError
 from starhil.protocol.canopen.application import check_status
-from starhil.protocol.canopen.device_dictionary import DeviceDictionary, build_dictionary
+from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
 from starhil.protocol.values import IcdError
@@ -15,7 +17,7 @@ ICD = load_unit()
 
 
 def test_the_subindex_of_every_row_is_its_id():
-    entries = build_dictionary(load_unit()).entries
+    entries = DeviceDictionary(load_unit()).entries
     assert {subindex for index, subindex in entries if index == 0x2000} == {0, *(row.id for row in ICD.rows)}
 
 
@@ -149,7 +151,7 @@ def test_layouts_that_do_not_fit_the_definition(changes, text):
     from starhil.protocol.errors import ProtocolError
 
     with pytest.raises(ProtocolError, match=text):
-        DeviceDictionary(ICD, layout(**changes))
+        DeviceDictionary(replace(ICD, canopen=layout(**changes)))
 
 
 UNIT_HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'
@@ -167,7 +169,7 @@ def test_layouts_that_cannot_be_read(tmp_path, text, reason):
     path = tmp_path / "unit.toml"
     path.write_text(UNIT_HEAD + text, encoding="ascii")
     with pytest.raises(IcdError, match=reason):
-        build_dictionary(load_unit(path))
+        DeviceDictionary(load_unit(path))
 
 
 def test_object_of_two_kinds():
