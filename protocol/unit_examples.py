@@ -8,6 +8,7 @@ from pathlib import Path
 
 from starhil.protocol.can_framing import CanFrame, encode_reply_frames, encode_request_frames
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
+from starhil.protocol.canopen.eds import build_eds
 from starhil.protocol.codec import Row
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.errors import ProtocolError
@@ -103,7 +104,7 @@ def examine(
     if not errors:
         try:
             if definition.canopen is not None:
-                DeviceDictionary(definition)
+                build_eds(DeviceDictionary(definition))
             examples += exchanges(definition)
         except ProtocolError as error:
             errors.append(f"{path}: {error}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import NoReturn, cast
+from typing import Final, NoReturn, cast
 
 from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
 
@@ -28,6 +28,9 @@ from starhil.protocol.canopen_schema import PackedField, PdoModel, PlacedMember,
 from starhil.protocol.codec import Field, Row, Slot
 from starhil.protocol.definition import InterfaceDefinition
 from starhil.protocol.values import IcdError, MessageError, Parameter, representable
+
+LARGEST_SUBINDEX: Final = 254
+"""Highest sub-index of a member (CiA 301: 255 is reserved)."""
 
 Key = tuple[int, int]
 """Index and sub-index."""
@@ -105,11 +108,23 @@ class DeviceDictionary(Dictionary):
         for entry, names in found:
             self._names |= {f"{index:04x}.{name.lower()}": entry for name in names}
         entries = [entry for entry, _ in found]
-        if entries[0].key == (index, 0):
+        if [entry.key for entry in entries] == [(index, 0)]:
             self._names[f"{index:04x}"] = entries[0]
             objects.add_object(entries[0].variable)
-        else:
-            add_record(objects, placed.name, [entry.variable for entry in entries])
+            return entries
+        taken: dict[int, str] = {}
+        for entry in entries:
+            name, subindex = entry.variable.name, entry.key[1]
+            if not 1 <= subindex <= LARGEST_SUBINDEX:
+                raise IcdError(
+                    f"canopen.toml: {index:04X}h: {name} would be sub-index {subindex}, not 1 to 254"
+                )
+            if subindex in taken:
+                raise IcdError(
+                    f"canopen.toml: {index:04X}h: {taken[subindex]} and {name} are both sub-index {subindex}"
+                )
+            taken[subindex] = name
+        add_record(objects, placed.name, [entry.variable for entry in entries])
         return entries
 
     def _mapped(self, model: PdoModel) -> MappedPdo:

@@ -11,6 +11,8 @@ from starhil.protocol.canopen.application import check_status
 from starhil.protocol.canopen.device_dictionary import DeviceDictionary
 from starhil.protocol.canopen_schema import CanopenModel
 from starhil.protocol.icd import load_unit
+from starhil.protocol.names import find_unit
+from starhil.protocol.unit_examples import examine
 from starhil.protocol.values import IcdError
 
 ICD = load_unit()
@@ -145,6 +147,20 @@ def layout(**changes) -> CanopenModel:
             },
             "differ in type",
         ),
+        (
+            {
+                "object": [
+                    {
+                        "index": 0x6000,
+                        "name": "x",
+                        "members": [{"name": n, "subindex": 1, "value": "unix_time.seconds"} for n in "ab"],
+                    }
+                ],
+                "tpdo": [],
+                "rpdo": [],
+            },
+            "6000h: a and b are both sub-index 1",
+        ),
     ],
 )
 def test_layouts_that_do_not_fit_the_definition(changes, text):
@@ -152,6 +168,15 @@ def test_layouts_that_do_not_fit_the_definition(changes, text):
 
     with pytest.raises(ProtocolError, match=text):
         DeviceDictionary(replace(ICD, canopen=layout(**changes)))
+
+
+def test_rows_that_are_no_sub_indices():
+    request = {"object": [{"index": 0x6000, "name": "x", "requests": True}], "tpdo": [], "rpdo": []}
+    for number in (0, 255):
+        row = ICD.telecommands["reset"].model_copy(update={"id": number})
+        icd = replace(ICD, canopen=layout(**request), telecommands={"reset": row})
+        with pytest.raises(IcdError, match=f"6000h: reset would be sub-index {number}, not 1 to 254"):
+            DeviceDictionary(icd)
 
 
 UNIT_HEAD = '[unit]\nname = "x"\nversion = "1"\ndoc = "x"\n'
@@ -170,6 +195,14 @@ def test_layouts_that_cannot_be_read(tmp_path, text, reason):
     path.write_text(UNIT_HEAD + text, encoding="ascii")
     with pytest.raises(IcdError, match=reason):
         DeviceDictionary(load_unit(path))
+
+
+def test_a_check_of_a_unit_finds_what_its_eds_cannot_hold(tmp_path):
+    text = (find_unit("oresat") / "oresat.toml").read_text(encoding="utf-8")
+    path = tmp_path / "oresat.toml"
+    path.write_text(text.replace('name = "active", value', 'name = "total", value'), encoding="utf-8")
+    _, (error,), _ = examine(path)
+    assert "sub-index 2: has the same name as object 3008h, sub-index 1 in EDS: total" in error
 
 
 def test_object_of_two_kinds():
