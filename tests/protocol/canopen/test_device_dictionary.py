@@ -171,6 +171,15 @@ def test_layouts_that_do_not_fit_the_definition(changes, text):
         DeviceDictionary(replace(ICD, canopen=layout(**changes)))
 
 
+@pytest.mark.parametrize("unit", ["cubestar", "oresat"])
+def test_what_can_be_read_of_the_device_is_kept_by_the_device_alone(unit):
+    """So the node has only communication parameters to store."""
+    application = [entry for entry in DeviceDictionary(load_unit(unit)) if entry.key[0] >= 0x2000]
+    kept = {entry.key[1] for entry in application if entry.reader is None and entry.variable.readable}
+    assert len(application) > 50
+    assert kept == {0}
+
+
 def test_rows_that_are_no_sub_indices():
     request = {"object": [{"index": 0x6000, "name": "x", "requests": True}], "tpdo": [], "rpdo": []}
     for number in (0, 255):
